@@ -6,7 +6,6 @@ import pytest
 
 from cathsim_dmc import suite
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
-from cathsim_dmc.physics.effects import userdata_size
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import damping
 from cathsim_dmc.validation.rig import Rig
@@ -34,9 +33,7 @@ def test_three_point_bending_is_that_of_the_beam(on_joint):
 def test_drag_is_that_of_the_correlation_against_the_velocity_of_the_blood():
     rig = Rig("diagnostic_5f_j", rotation=True)
     blood = StillBlood()
-    rig.arena.mjcf_model.size.nuserdata = userdata_size([blood], rig.catheter)
-    rig.compile()
-    damping.fill(rig, blood)
+    rig.compile(blood)
     model, data, rng = rig.model, rig.data, np.random.default_rng(1)
     data.qpos[:], data.qvel[:] = rng.normal(0, 0.1, (2, model.nv))
     flow = np.array([0.3, -0.2, 0.5])

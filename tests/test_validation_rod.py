@@ -63,8 +63,8 @@ def test_twist_is_that_of_gj(device, torsion_joints):
 
 def test_tip_lags_behind_the_base_as_theory_says():
     one = rod.twist_lag()
-    assert abs(one.lag / one.expected_lag - 1) < rod.TWIST_BOUND / 100
-    assert abs(one.rise_time / one.expected_rise_time - 1) < rod.TWIST_BOUND / 100
+    for found, expected in (one.lags, one.rises):
+        assert found == pytest.approx(expected, rel=rod.TWIST_BOUND / 100)
     # The speed servo of the base neither overshoots nor hunts.
     speed = np.diff(one.base) / np.diff(one.time)
     assert speed.max() < 1.001 * MAX_ROTATION_SPEED

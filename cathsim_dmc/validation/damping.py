@@ -5,7 +5,6 @@ The release is compared with the equation of a beam whose material damps as it i
 """
 
 import dataclasses
-import types
 from collections.abc import Iterator
 
 import mujoco
@@ -20,7 +19,6 @@ from cathsim_dmc.entities.posture import joints_along
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
 from cathsim_dmc.physics.drives import hold
-from cathsim_dmc.physics.effects import Effects, Episode, World, userdata_size
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check
@@ -61,13 +59,8 @@ def _swing(time: np.ndarray, curve: np.ndarray) -> tuple[float, float]:
 
 def cantilever(blood: StillBlood | None) -> Rig:
     """A uniform device of which 0.2 m are free, in blood or without any fluid."""
-    length = devices.Discretisation(working_length=_FREE + LINK / 2)
-    rig = Rig(_uniform(), length)
-    if blood is not None:
-        rig.arena.mjcf_model.size.nuserdata = userdata_size([blood], rig.catheter)
-    rig.compile()
-    if blood is not None:
-        fill(rig, blood)
+    rig = Rig(_uniform(), devices.Discretisation(working_length=_FREE + LINK / 2))
+    rig.compile(blood)
     return rig
 
 
@@ -103,26 +96,9 @@ def release(*, blood: bool = True) -> tuple[float, float, float, float]:
     time = rig.model.opt.timestep * np.arange(len(curve))
     beam = _beam(one, length, start, time, blood)
     (mine, decay), (theirs, expected) = (
-        _swing(time, np.array(curve)),
-        _swing(time, beam),
+        _swing(time, each) for each in (np.array(curve), beam)
     )
     return mine, theirs, decay, expected
-
-
-def fill(rig: Rig, blood: StillBlood) -> None:
-    """Lets blood at rest act on the device of a rig that has userdata for it."""
-    links = ids(rig.model, rig.catheter.links)
-    index = types.SimpleNamespace(links=slice(int(links[0]), int(links[-1]) + 1))
-    world = World(
-        rig.model,
-        rig.catheter,
-        index,  # type: ignore[arg-type]
-        0.0,
-        types.SimpleNamespace(qpos=rig.data.qpos[None]),
-        lambda _, name: getattr(rig.model, name),
-        rig.data.userdata[None],
-    )
-    Effects([blood], world).restart(0, Episode(np.zeros(3)), np.random.RandomState(0))
 
 
 def _modes(places: np.ndarray) -> np.ndarray:
@@ -187,27 +163,9 @@ def spin(speed: float) -> tuple[float, float]:
     rig.arena.attach(Sheath(line[:-1], rig.device.outer_radius, rig.lengths.max()))
     rig.compile()
     rig.bend(joints_along(rig.lengths, line))
-    twists = _turned(rig, speed)
-    hinges = np.sort(ids(rig.model, rig.catheter.bends))
-    bends = rig.data.qpos[rig.model.jnt_qposadr[hinges]].reshape(-1, 2)
-    hinges = hinges[::2]
-    brakes = (bends**2).sum(axis=1) * rig.model.jnt_stiffness[hinges]
-    brakes *= rig.device.relaxation_time * speed
-    expected = sum(
-        brakes[hinges > twist].sum() / rig.model.jnt_stiffness[twist]
-        for twist in _twist_hinges(rig)
-    )
-    return float(-twists.sum(axis=1).mean()), float(expected)
-
-
-def _twist_hinges(rig: Rig) -> np.ndarray:
-    return ids(rig.model, rig.catheter.hinges[len(rig.catheter.bends) :])
-
-
-def _turned(rig: Rig, speed: float) -> np.ndarray:
-    """Twists (T, H) of the torsion hinges after the control steps of one turn, rad."""
     drives = hold(rig.model, rig.data)
-    places = rig.model.jnt_qposadr[_twist_hinges(rig)]
+    twist_hinges = ids(rig.model, rig.catheter.hinges[len(rig.catheter.bends) :])
+    places = rig.model.jnt_qposadr[twist_hinges]
     command = np.array([[0.0, speed / MAX_ROTATION_SPEED]])
     twists = []
     steps = round(2 * np.pi / speed / CONTROL_TIMESTEP)
@@ -216,8 +174,17 @@ def _turned(rig: Rig, speed: float) -> np.ndarray:
         drives.follow(command)
         rig.data.ctrl[-2:] = command[0]
         rig.run(CONTROL_TIMESTEP)
-        twists.append(rig.data.qpos[places].copy())
-    return np.array(twists[settling:])
+        twists.append(rig.data.qpos[places].sum())
+    hinges = np.sort(ids(rig.model, rig.catheter.bends))
+    bends = rig.data.qpos[rig.model.jnt_qposadr[hinges]].reshape(-1, 2)
+    hinges = hinges[::2]
+    brakes = (bends**2).sum(axis=1) * rig.model.jnt_stiffness[hinges]
+    brakes *= rig.device.relaxation_time * speed
+    expected = sum(
+        brakes[hinges > twist].sum() / rig.model.jnt_stiffness[twist]
+        for twist in twist_hinges
+    )
+    return -float(np.mean(twists[settling:])), float(expected)
 
 
 def three_point(span: float, link: float, on_joint: bool) -> float:

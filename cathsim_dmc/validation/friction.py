@@ -1,16 +1,14 @@
 """Friction of devices on a wall: sliding, sticking, and pulled round a drum."""
 
-import dataclasses
 from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.contact import FRICTION
-from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics.drives import hold
-from cathsim_dmc.validation import rod
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.pair import PAIR
 from cathsim_dmc.validation.rig import Rig
@@ -42,6 +40,12 @@ CAPSTANS = (
 )
 TENSION = 0.5  # N, dead load on the distal end: far above EI/R² = 0.02 N
 PULL_SPEED = 0.02  # m/s, no load
+_AXIS = DRUM_RADIUS + devices.STEERABLE_5F.outer_radius  # m, radius of the rod's axis
+# Friction acts on the surface of the drum, tension in the axis of the rod.
+_LEVER = DRUM_RADIUS / _AXIS
+# Energy of bending per length over the tension at the end, EI κ² / 2 T, by which the
+# rod is less tense on the drum than beside it.
+_BENT = devices.STEERABLE_5F.shaft.bending_stiffness / (2 * _AXIS**2 * TENSION)
 # Radius, m, of the tube that is bent into an arch about the drum.
 ARCH_RADIUS = 9e-3
 ARCH_RIPPLE = 2.0  # % of the force at the base, its standard deviation
@@ -50,14 +54,13 @@ _LEAD = 0.02  # m of rod between the clamp and the drum; first part of the pull
 _PULL = 0.1  # m
 
 
-def _on_plate(names: tuple[str, ...], load: float) -> tuple[Rig, np.ndarray]:
+def _on_plate(device: Any, load: float) -> tuple[Rig, np.ndarray]:
     """A straight device on a plate, settled under a load, N, on its end.
 
     Returns:
         The rig, and the load of each of its bodies, N.
     """
-    chosen = [rod.straight(name) for name in names]
-    rig = Rig(stack=DeviceStack(chosen)) if len(chosen) > 1 else Rig(chosen[0])
+    rig = Rig(device, straight=True)
     rig.add_plate(rig.device.outer_radius + _DROP)
     rig.compile()
     rig.data.joint(f"{rig.name}/insertion").qpos = 0.09
@@ -71,11 +74,11 @@ def _on_plate(names: tuple[str, ...], load: float) -> tuple[Rig, np.ndarray]:
     return rig, loads
 
 
-def slid(names: tuple[str, ...], load: float, speed: float) -> tuple[float, float]:
+def slid(device: Any, load: float, speed: float) -> tuple[float, float]:
     """Pulls a device over a plate.
 
     Args:
-        names: of the device, or of coaxial ones.
+        device: see `Rig`.
         load: of its end on the plate, N.
         speed: m/s.
 
@@ -83,7 +86,7 @@ def slid(names: tuple[str, ...], load: float, speed: float) -> tuple[float, floa
         Coefficient of friction that acts, pull over load; standard deviation of the
         pull over its mean.
     """
-    rig, _ = _on_plate(names, load)
+    rig, _ = _on_plate(device, load)
     rig.data.actuator(f"{rig.name}/insertion").ctrl[0] = -speed / MAX_PUSH_SPEED
     rig.run(_SLID / speed)
     pull = []
@@ -94,9 +97,9 @@ def slid(names: tuple[str, ...], load: float, speed: float) -> tuple[float, floa
     return mean / load, float(np.std(pull)) / abs(mean)
 
 
-def creep(names: tuple[str, ...]) -> float:
+def creep(device: Any) -> float:
     """Speed (m/s) of devices that stick, pulled sideways at half the limit."""
-    rig, loads = _on_plate(names, CREEP_LOAD)
+    rig, loads = _on_plate(device, CREEP_LOAD)
     rig.data.xfrc_applied[:, 0] = 0.5 * FRICTION * loads
     rig.run(0.5 * _SETTLED)
     before = rig.head_position
@@ -104,44 +107,36 @@ def creep(names: tuple[str, ...]) -> float:
     return float(np.linalg.norm(rig.head_position - before)) / _SETTLED
 
 
-@dataclasses.dataclass(frozen=True)
-class Capstan:
+class Capstan(NamedTuple):
     """A rod pulled round a drum.
 
     Attributes:
         friction: Coulomb coefficient.
         angle: by which the drum turns the force in the rod, rad.
-        travel: (n,), way of the base, m.
-        ratio: (n,), tension at the base over that at the end.
-        mean: of the ratio in steady sliding.
+        mean: ratio of the tensions at the base and at the end, in steady sliding.
         free: the same without friction. Bending and straightening the rod dissipates
             a little, by however much it is wrapped.
-        lever: radius of the drum over that of the rod's axis: friction acts on the
-            surface, tension in the axis.
-        bent: energy of bending per length over the tension at the end, EI κ² / 2 T,
-            by which the rod is less tense on the drum than beside it.
+        travel: (n,), way of the base, m.
+        ratio: (n,), of the tensions.
     """
 
     friction: float
     angle: float
-    travel: np.ndarray
-    ratio: np.ndarray
-    mean: float
-    free: float
-    lever: float = 1.0
-    bent: float = 0.0
+    mean: float = np.nan
+    free: float = 1.0
+    travel: np.ndarray = np.zeros(1)
+    ratio: np.ndarray = np.zeros(1)
 
     @property
     def expected(self) -> float:
         """Ratio of the tensions of this rod with the friction that was set."""
-        exponent = self.friction * self.angle * self.lever
-        return float(self.bent + (1 - self.bent) * np.exp(exponent))
+        return float(_BENT + (1 - _BENT) * np.exp(self.friction * self.angle * _LEVER))
 
     @property
     def acting(self) -> float:
         """Coefficient of friction that the exponent shows."""
-        ratio = (self.mean - (self.free - 1) - self.bent) / (1 - self.bent)
-        return float(np.log(ratio) / (self.angle * self.lever))
+        ratio = (self.mean - (self.free - 1) - _BENT) / (1 - _BENT)
+        return float(np.log(ratio) / (self.angle * _LEVER))
 
     def check(self) -> Check:
         """The coefficient that acts against the one that was set.
@@ -171,24 +166,16 @@ def capstan(friction: float, wrap: float = np.pi) -> Capstan:
     Raises:
         RuntimeError: if the rod sticks to the drum.
     """
-    device = rod.straight("steerable_5f")
-    angle, travel, ratio = _pulled(device, friction, wrap)
-    _, far, free = _pulled(device, 0.0, wrap)
-    axis = DRUM_RADIUS + device.outer_radius
-    return Capstan(
-        friction=friction,
-        angle=angle,
-        travel=travel,
-        ratio=ratio,
-        mean=float(ratio[travel > _LEAD].mean()),
-        free=float(free[far > _LEAD].mean()),
-        lever=DRUM_RADIUS / axis,
-        bent=device.shaft.bending_stiffness / (2 * axis**2 * TENSION),
-    )
+    angle, *pulled = _pulled(friction, wrap)
+    means = [
+        float(ratio[travel > _LEAD].mean())
+        for travel, ratio in (pulled, _pulled(0.0, wrap)[1:])
+    ]
+    return Capstan(friction, angle, *means, *pulled)
 
 
 def _pulled(
-    device: devices.Device, friction: float, wrap: float, tube: float | None = None
+    friction: float, wrap: float, tube: float | None = None
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Pulls a rod round a drum about a line along y.
 
@@ -199,11 +186,11 @@ def _pulled(
     Returns:
         Angle of the wrap, rad; way of the base (n,), m; ratio of the tensions (n,).
     """
-    radius = DRUM_RADIUS + device.outer_radius
-    length = 2 * _LEAD + _PULL + wrap * radius
+    length = 2 * _LEAD + _PULL + wrap * _AXIS
     fine = devices.Discretisation(working_length=length)
-    rig = Rig(device, fine, friction=friction, stroke=_PULL)
-    middle = np.array([radius, 0, _PULL - rig.lengths.sum() + _LEAD])
+    options = {"friction": friction, "stroke": _PULL}
+    rig = Rig("steerable_5f", fine, straight=True, **options)
+    middle = np.array([_AXIS, 0, _PULL - rig.lengths.sum() + _LEAD])
     half = np.array([length, 0.02, length])  # around the whole rod
 
     def clearance(blocks: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -216,7 +203,7 @@ def _pulled(
     rig.add_wall(clearance, middle - half, middle + half, friction)
     rig.compile()
     middles = np.cumsum(rig.lengths) - rig.lengths / 2
-    heading = np.clip((middles - _LEAD) / radius, 0.0, wrap)
+    heading = np.clip((middles - _LEAD) / _AXIS, 0.0, wrap)
     rig.data.joint(f"{rig.name}/insertion").qpos = _PULL
     hold(rig.model, rig.data)
     rig.bend(np.stack([0 * heading[1:], np.diff(heading)], axis=-1))
@@ -243,34 +230,29 @@ def _pulled(
 
 def arch_ripple() -> float:
     """Deviation over mean of the force that draws a device round an arch."""
-    device = rod.straight("steerable_5f")
-    _, travel, ratio = _pulled(device, FRICTION, np.pi, ARCH_RADIUS)
+    _, travel, ratio = _pulled(FRICTION, np.pi, ARCH_RADIUS)
     sliding = ratio[travel > _LEAD]
     return float(sliding.std() / sliding.mean())
 
 
 def checks(pulled: list[Capstan]) -> Iterator[Check]:
     """Friction on devices, sliding and sticking; capstans are put into `pulled`."""
-    for name, names in (("steerable_5f", ("steerable_5f",)), ("pair", PAIR)):
+    for what, device in (("steerable_5f", "steerable_5f"), ("pair", PAIR)):
         for load in LOADS:
-            found = [slid(names, load, speed) for speed in SPEEDS]
+            found = [slid(device, load, speed) for speed in SPEEDS]
             acting, ripples = zip(*found, strict=True)
             worst = max(acting, key=lambda one: abs(one - FRICTION))
-            label = f"{name} sliding under {load:g} N"
-            note = ", ".join(
-                f"{one:.4f} at {1e3 * speed:g} mm/s"
-                for speed, one in zip(SPEEDS, acting, strict=True)
-            )
-            acts = f"{label}: friction that acts"
+            name = f"{what} sliding under {load:g} N"
+            each = zip(acting, SPEEDS, strict=True)
+            note = ", ".join(f"{one:.4f} at {1e3 * v:g} mm/s" for one, v in each)
+            acts = f"{name}: friction that acts"
             yield Check.deviation(acts, worst, FRICTION, ACTING_BOUND, "", note)
-            label += ": ripple of the pull"
-            yield Check.at_most(label, 100 * max(ripples), RIPPLE_BOUND, "%")
-        label = (
-            f"{name} under {CREEP_LOAD:g} N, pulled sideways at half the limit: creep"
-        )
-        yield Check.at_most(label, 1e3 * creep(names), CREEP_BOUND, "mm/s")
-    label = f"drawn round an arch under {TENSION:g} N: ripple of the force"
-    yield Check.at_most(label, 100 * arch_ripple(), ARCH_RIPPLE, "%")
-    for friction, wrap in CAPSTANS:
-        pulled.append(capstan(friction, wrap))
+            name += ": ripple of the pull"
+            yield Check.at_most(name, 100 * max(ripples), RIPPLE_BOUND, "%")
+        name = f"{what} under {CREEP_LOAD:g} N, pulled sideways at half the limit: "
+        yield Check.at_most(f"{name}creep", 1e3 * creep(device), CREEP_BOUND, "mm/s")
+    name = f"drawn round an arch under {TENSION:g} N: ripple of the force"
+    yield Check.at_most(name, 100 * arch_ripple(), ARCH_RIPPLE, "%")
+    for case in CAPSTANS:
+        pulled.append(capstan(*case))
         yield pulled[-1].check()

@@ -15,7 +15,7 @@ from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation import pressed, rod, sliding, theory, two_rods
 from cathsim_dmc.validation.checks import Check, Report
-from cathsim_dmc.validation.rig import Rig, half_circle, in_order
+from cathsim_dmc.validation.rig import Rig, half_circle
 
 PAIR = ("wire_035_glide", "berenstein_5f")
 PROTRUSIONS = (0.0, 0.02, 0.05, 0.10)  # m, of the wire out of the catheter
@@ -42,30 +42,10 @@ TWIST_BOUND = 1.0  # °, of the last frame there
 SINGLE_TWIST_BOUND = 2.0
 
 
-def straightened(names: Sequence[str]) -> DeviceStack:
-    """The devices without their pre-shaped tips."""
-    return DeviceStack([rod.straight(name) for name in names])
-
-
-def sections(entity: DeviceStack, gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lengths and EI of the uniform sections of the free rod, from the clamp on.
-
-    The carriage holds link 0 by its middle, as in `Rig.sections`.
-    """
-    length = float(entity.link_lengths.sum() - entity.link_lengths[0] / 2)
-    tips = [device.tip_length for device in entity.devices]
-    places = np.unique(np.minimum([0.0, length, *gaps, *(gaps + tips)], length))
-    middles = (places[1:] + places[:-1]) / 2
-    bending = theory.profile(entity.devices, gaps, middles)[0].sum(axis=0)
-    return np.diff(places)[::-1], bending[::-1]
-
-
-def cantilevers(protrusion: float) -> list[rod.Cantilever]:
-    """The pair, straightened, with the wire out by so much (m), loaded at its end."""
-    gaps, entity = np.array([0.0, protrusion]), straightened(PAIR)
-    rig = Rig(stack=entity, gaps=gaps)
-    rig.compile()
-    return rod.bent(rig, *sections(entity, gaps), END_ANGLES)
+def in_order(angles: np.ndarray) -> np.ndarray:
+    """Angles (n - 1, 2) about x and y of the joints of a chain as its hinges lie."""
+    first = [posture.x_first(joint) for joint in range(1, len(angles) + 1)]
+    return np.where(np.array(first)[:, None], angles, angles[:, ::-1]).ravel()
 
 
 def free_curve(chosen: Sequence[Device], gaps: ArrayLike, length: float) -> np.ndarray:
@@ -99,13 +79,12 @@ def turned(names: Sequence[str], gaps: Sequence[float]) -> tuple[float, float, f
         EI-weighted curvature, as fractions of the displacement of the end; deviation of
         the last link's direction from that of 0°, rad.
     """
-    entity = DeviceStack(names)
-    rig = Rig(stack=entity)
+    rig = Rig(names)
     rig.compile()
     rows = []
     for turn in TURNS:
         rotation = np.full(len(names), turn)
-        chain_fields.write_still(entity, rig.model, np.asarray(gaps), rotation)
+        chain_fields.write_still(rig.catheter, rig.model, np.asarray(gaps), rotation)
         rig.data.qpos[:] = rig.model.qpos_spring
         mujoco.mj_kinematics(rig.model, rig.data)
         axis = rig.data.xmat[rig.tip_body].reshape(3, 3)[:, 2].copy()
@@ -113,7 +92,7 @@ def turned(names: Sequence[str], gaps: Sequence[float]) -> tuple[float, float, f
     back = Rotation.from_euler("z", -TURNS[:, None])
     ends, axes = (back.apply(each) for each in np.moveaxis(np.array(rows), 1, 0))
     length = float(rig.lengths.sum())
-    curve = free_curve(entity.devices, gaps, length)
+    curve = free_curve(rig.catheter.devices, gaps, length)
     moved = float(np.linalg.norm(curve - (0.0, 0.0, length)))
     angle = np.linalg.norm(np.cross(axes, axes[0]), axis=-1).max()
     away = [np.linalg.norm(ends - one, axis=-1).max() for one in (ends[0], curve)]
@@ -151,45 +130,27 @@ def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float,
     return float(found[-1]), float(found[-2] - taken[0, -1])
 
 
-def free_ends(names: Sequence[str], leads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ends (n, 3) of the unloaded chain and of the curve, as the wire slides, m.
-
-    Args:
-        names: of wire and catheter.
-        leads: (n,), by how much the wire is ahead of the catheter, m; negative where it
-            is behind.
-    """
-    entity = DeviceStack(names)
+def smoothness() -> Check:
+    """Steps of the unloaded end as the wire slides at 10 mm/s, against the curve's."""
+    # By how much the wire is ahead of the catheter, m; negative where it is behind.
+    leads = np.arange(-0.06, 0.06, sliding.SPEED * CONTROL_TIMESTEP)
+    entity = DeviceStack(sliding.SLIDING_PAIR)
     stack, length = entity.stack, float(entity.link_lengths.sum())
     gaps = np.stack([np.maximum(-leads, 0.0), np.maximum(leads, 0.0)], axis=-1)
     turns = np.zeros((len(leads), 2, len(stack.spans)))
     angles = np.real(stack.rest_angles(stack.overlap(gaps), turns))
     # All shapes lie in one plane here.
-    heading = np.concatenate([np.zeros((len(leads), 1)), np.cumsum(angles, -1)], -1)
-    x = (np.sin(heading) * stack.link_lengths).sum(-1)
-    z = (np.cos(heading) * stack.link_lengths).sum(-1)
-    curve = [free_curve(entity.devices, gap, length) for gap in gaps]
-    return np.stack([x, 0 * x, z], axis=-1), np.array(curve)
-
-
-def smoothness() -> Check:
-    """Steps of the free end as the wire slides at 10 mm/s, against the curve's."""
-    leads = np.arange(-0.06, 0.06, sliding.SPEED * CONTROL_TIMESTEP)
-    ends = free_ends(sliding.SLIDING_PAIR, leads)
-    chain, curve = (np.linalg.norm(np.diff(e, axis=0), axis=-1).max() for e in ends)
+    heading = np.cumsum(np.pad(angles, ((0, 0), (1, 0))), axis=-1)
+    links = stack.link_lengths * np.stack([np.sin(heading), np.cos(heading)])
+    curve = [free_curve(entity.devices, gap, length)[::2] for gap in gaps]
+    chain, curve = (
+        np.linalg.norm(np.diff(ends, axis=0), axis=-1).max()
+        for ends in (links.sum(axis=-1).T, curve)
+    )
     name = "free end while the wire slides at 10 mm/s: largest step over the curve's"
     note = f"{1e3 * chain:.2f} mm in 40 ms, the curve's {1e3 * curve:.2f} mm, over "
     note += f"{len(leads)} steps"
     return Check.at_most(name, chain / curve, STEP_BOUND, "", note)
-
-
-def buckling(end: str) -> rod.Buckling:
-    """Critical load of the shafts of the pair, one in the other."""
-    entity = straightened(PAIR)
-    # Up to the last of the long links: beyond lie the tips.
-    last = int(np.argmin(entity.link_lengths >= entity.link_lengths[0])) - 1
-    stiffness = sum(device.shaft.bending_stiffness for device in entity.devices)
-    return rod.column(Rig(stack=entity), end, last, stiffness)
 
 
 def _shape_checks() -> Iterator[Check]:
@@ -221,21 +182,21 @@ def _shape_checks() -> Iterator[Check]:
         yield Check.at_most(name, value, bound, "°")
 
 
-def _checks(data: dict[str, Any], findings: dict[str, Any]) -> Iterator[Check]:
+def _checks(data: dict[str, Any]) -> Iterator[Check]:
     for protrusion in PROTRUSIONS:
         what = f"wire out by {1e3 * protrusion:.0f} mm" if protrusion else "pair"
-        yield from (one.check(what) for one in cantilevers(protrusion))
+        bent = rod.cantilevers(PAIR, END_ANGLES, gaps=(0.0, protrusion))
+        yield from (one.check(what) for one in bent)
     yield from _shape_checks()
     yield from two_rods.checks()
     for end in ("sliding", "fixed"):
-        yield buckling(end).check("buckling load of the pair")
+        yield rod.buckling(end, device=PAIR).check("buckling load of the pair")
     yield smoothness()
     yield from pressed.checks(PAIR)
-    yield from sliding.checks(data, findings)
+    yield from sliding.checks(data)
 
 
 def validate_pair() -> Report:
     """Runs every check of coaxial devices."""
     data: dict[str, Any] = {}
-    findings: dict[str, Any] = {}
-    return Report("pair", list(_checks(data, findings)), findings, data)
+    return Report("pair", list(_checks(data)), data=data)

@@ -1,7 +1,6 @@
 """Devices pressed on a wall and pushed along it: rest, contacts, repeated steps."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -67,22 +66,17 @@ def pressed(
     return float(depth.mean()), float(np.ptp(depth))
 
 
-class Jam(NamedTuple):
-    """A pair pushed into the dead end of a tube until its drive gives way."""
-
-    push_force: float  # at the end, N
-    penetration: float  # 99th percentile of the deepest contact of a physics step, m
-    forces: tuple[float, float]  # least and largest of the largest contact, N
-
-
-def jam(pair: tuple[str, str]) -> Jam:
-    """Pushes both devices at full speed to the end of their stroke, and on.
+def jam(pair: tuple[str, str]) -> tuple[float, float, float, float]:
+    """Pushes both devices into the dead end of a tube until their drives give way.
 
     Args:
         pair: Names of guidewire and catheter.
+
+    Returns:
+        Push force at the end, N; 99th percentile of the deepest contact of a physics
+        step, m; least and largest of the largest contact, N.
     """
-    options = {"devices": pair, "random": 1, "observation": "tracking"}
-    environment = in_tube(JAM_TUBE, **options)
+    environment = in_tube(JAM_TUBE, devices=pair, random=1, observation="tracking")
     task = environment.task
     way = task.scene.catheter.stroke / (MAX_PUSH_SPEED * CONTROL_TIMESTEP)
     rows = []
@@ -95,7 +89,7 @@ def jam(pair: tuple[str, str]) -> Jam:
     environment.close()
     depth, force = np.hstack(rows[-round(_END / CONTROL_TIMESTEP) :])
     deep = float(np.percentile(depth, 99))
-    return Jam(push, deep, (float(force.min()), float(force.max())))
+    return push, deep, float(force.min()), float(force.max())
 
 
 def checks(pair: tuple[str, str]) -> Iterator[Check]:
@@ -104,64 +98,45 @@ def checks(pair: tuple[str, str]) -> Iterator[Check]:
     name = f"pressed by {LOADS[0]:g} to {LOADS[-1]:g} N: ripple of the depth"
     note = f"depth {1e3 * depths[0]:.2f} to {1e3 * depths[-1]:.2f} mm"
     yield Check.at_most(name, 1e3 * max(ripples), RIPPLE, "mm", note)
-    jammed = jam(pair)
+    push, deep, least, largest = jam(pair)
     name = "pair jammed in a dead end: 99th percentile of the penetration"
-    note = f"pushed with {jammed.push_force:.1f} N, largest contact "
-    note += "{:.2f} to {:.2f} N".format(*jammed.forces)
-    yield Check.at_most(name, 1e3 * jammed.penetration, DEPTH, "mm", note)
+    note = f"pushed with {push:.1f} N, largest contact {least:.2f} to {largest:.2f} N"
+    yield Check.at_most(name, 1e3 * deep, DEPTH, "mm", note)
 
 
-def push(task: str) -> dict[str, float]:
-    """Pushes the device of a task, its tip straight, then curled.
-
-    Returns:
-        "contacts" with the wall for each link that has one; share of the control steps
-        that were done again ("repeated"); 99th percentile ("deep") and largest
-        ("deepest") of the deepest contact of a physics step, m; largest "force" of a
-        contact, N.
-    """
-    environment = suite.load(suite.DOMAIN, task, {"random": 0, "goal_radius": 1e-6})
-    play = environment.task
-    data = environment.physics.data.ptr
-    catheter = play.scene.catheter
-    links, contacts, force, depth = 0, 0, 0.0, []
-    for curl in _CURLS:
-        environment.reset()
-        wall = environment.physics.model.ptr.geom("wall").id
-        action = np.zeros(environment.action_spec().shape)
-        motors = len(catheter.tip_motors)
-        action[:motors] = np.resize(curl, motors)
-        action[list(catheter.translations)] = 1.0
-        for _ in range(_PUSHES):
-            environment.step(action)
-            found = forces.Contacts.from_sensor(play.stepper.contact_rows[0])
-            depth.append(found.penetration.max(-1, initial=0.0))
-            force = max(force, float(found.magnitude.max(initial=0.0)))
-            geoms = data.contact.geom
-            geoms = geoms[(geoms == wall).any(axis=1)]
-            contacts += len(geoms)
-            links += len(np.unique(geoms)) - bool(len(geoms))
-    repeated = play.rollout.repeated.sum() / (len(_CURLS) * _PUSHES)
-    environment.close()
-    deep = np.concatenate(depth)
-    deep = deep[deep > 0.0]
-    return {
-        "contacts": contacts / max(links, 1),
-        "repeated": float(repeated),
-        "deep": float(np.percentile(deep, 99)),
-        "deepest": float(deep.max()),
-        "force": force,
-    }
-
-
-def push_checks(pushed: list[dict]) -> Iterator[Check]:
-    """Pushes the devices of `TASKS`; what `push` finds is put into `pushed`."""
+def push_checks() -> Iterator[Check]:
+    """Pushes the devices of `TASKS`, their tips straight, then curled."""
     for task in TASKS:
-        one, name = push(task), f"{task}, full push"
-        pushed.append({"task": task, **one})
-        note = f"{one['contacts']:.2f} contacts for each link that has one"
-        again = f"{name}: control steps done again"
-        yield Check.at_most(again, 100 * one["repeated"], REPEATED, "%", note)
-        deep, note = 1e3 * one["deepest"], f"99th percentile {1e3 * one['deep']:.3f} mm"
-        yield Check.at_most(f"{name}: deepest penetration", deep, DEEPEST, "mm", note)
-        yield Check.at_most(f"{name}: largest contact", one["force"], HARDEST, "N")
+        environment = suite.load(suite.DOMAIN, task, {"random": 0, "goal_radius": 1e-6})
+        play = environment.task
+        data, catheter = environment.physics.data.ptr, play.scene.catheter
+        links, contacts, force, depth = 0, 0, 0.0, []
+        for curl in _CURLS:
+            environment.reset()
+            wall = environment.physics.model.ptr.geom("wall").id
+            action = np.zeros(environment.action_spec().shape)
+            motors = len(catheter.tip_motors)
+            action[:motors] = np.resize(curl, motors)
+            action[list(catheter.translations)] = 1.0
+            for _ in range(_PUSHES):
+                environment.step(action)
+                found = forces.Contacts.from_sensor(play.stepper.contact_rows[0])
+                depth.append(found.penetration.max(-1, initial=0.0))
+                force = max(force, float(found.magnitude.max(initial=0.0)))
+                geoms = data.contact.geom
+                geoms = geoms[(geoms == wall).any(axis=1)]
+                contacts += len(geoms)
+                links += len(np.unique(geoms)) - bool(len(geoms))
+        again = 100 * float(play.rollout.repeated.sum()) / (len(_CURLS) * _PUSHES)
+        environment.close()
+        name, note = f"{task}, full push: ", "contacts for each link that has one"
+        note = f"{contacts / max(links, 1):.2f} {note}"
+        yield Check.at_most(
+            f"{name}control steps done again", again, REPEATED, "%", note
+        )
+        deep = 1e3 * np.concatenate(depth)
+        note = f"99th percentile {np.percentile(deep[deep > 0.0], 99):.3f} mm"
+        yield Check.at_most(
+            f"{name}deepest penetration", deep.max(), DEEPEST, "mm", note
+        )
+        yield Check.at_most(f"{name}largest contact", force, HARDEST, "N")

@@ -1,7 +1,8 @@
 """Test rigs: the catheter of the tasks, with their settings, under known loads."""
 
 import dataclasses
-from collections.abc import Callable
+import types
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -14,14 +15,18 @@ from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.collision import fields
-from cathsim_dmc.entities import devices, posture
+from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.physics import chain_fields
+from cathsim_dmc.physics.blood import StillBlood
+from cathsim_dmc.physics.effects import Effects, Episode, World, userdata_size
+from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
+from cathsim_dmc.validation import theory
 
 RESTING_TIME = 0.4  # s
 
@@ -31,12 +36,6 @@ def half_circle(radius: float, start: float, pieces: int) -> np.ndarray:
     angle = np.linspace(0.0, np.pi, pieces + 1)
     arc = np.stack([1 - np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
     return radius * arc + (0, 0, start)
-
-
-def in_order(angles: np.ndarray) -> np.ndarray:
-    """Angles (n - 1, 2) about x and y of the joints of a chain as its hinges lie."""
-    first = [posture.x_first(joint) for joint in range(1, len(angles) + 1)]
-    return np.where(np.array(first)[:, None], angles, angles[:, ::-1]).ravel()
 
 
 def tube(length: float, radius: float, bend: float = 0.0) -> Anatomy:
@@ -111,39 +110,39 @@ class Rig:
     Attributes:
         arena: to which a test adds its own fixtures before `compile`.
         catheter: with `origin` at the middle of link 0.
+        gaps: (K,) m, from the ends of the devices at rest to that of the chain.
     """
 
     def __init__(
         self,
-        device: str | devices.Device = "steerable_5f",
+        device: str | devices.Device | Sequence[str | devices.Device] = "steerable_5f",
         discretisation: devices.Discretisation | None = None,
         *,
+        straight: bool = False,
+        gaps: Sequence[float] | None = None,
         stroke: float = 0.1,
-        rotation: bool = False,
         friction: float = FRICTION,
-        stack: DeviceStack | None = None,
-        gaps: np.ndarray | None = None,
+        **options: Any,
     ):
         """Makes the device.
 
         Args:
-            device: Name or device, if it is a single one.
+            device: Name or device, or a sequence of coaxial ones.
             discretisation: Default of the tasks if None.
+            straight: Whether devices lack their pre-shaped tips.
+            gaps: (K,) m; 0 if None.
             stroke: Longest insertion, m.
-            rotation: Whether its base turns.
             friction: Coulomb coefficient.
-            stack: Coaxial devices in its place.
-            gaps: (K,) m, from the end of each of them, at rest, to that of the chain; 0
-                if None.
+            **options: Of the entity, such as `rotation` of a single device.
         """
-        self.catheter = stack or Catheter(
-            devices.get(device),
-            discretisation,
-            stroke=stroke,
-            rotation=rotation,
-            friction=friction,
-        )
-        self._gaps = np.zeros(len(stack.devices)) if stack and gaps is None else gaps
+        single = isinstance(device, str | devices.Device)
+        chosen = [devices.get(one) for one in ([device] if single else device)]
+        if straight:
+            chosen = [dataclasses.replace(one, tip_shape=()) for one in chosen]
+        kind, made = (Catheter, chosen[0]) if single else (DeviceStack, chosen)
+        options |= {"stroke": stroke, "friction": friction}
+        self.catheter = kind(made, discretisation, **options)
+        self.gaps = np.zeros(len(chosen)) if gaps is None else np.array(gaps)
         self.device = self.catheter.device
         self.arena = AngiographyArena(self.catheter.density)
         self.arena.mjcf_model.option.timestep = self.catheter.timestep
@@ -153,19 +152,19 @@ class Rig:
 
     @property
     def sections(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Lengths (2,), EI (2,) and GJ (2,) of the free rod, shaft and tip.
+        """Lengths, EI and GJ (S,) of uniform sections of the free rod from the clamp.
 
         The carriage holds link 0 by its middle: the first joint stands for the rod
         from there to the middle of link 1.
         """
-        tip = self.device.tip_length
-        shaft = self.lengths.sum() - tip - self.lengths[0] / 2
-        both = (self.device.shaft, self.device.tip)
-        return (
-            np.array([shaft, tip]),
-            np.array([section.bending_stiffness for section in both]),
-            np.array([section.torsional_stiffness for section in both]),
+        length = float(self.lengths.sum() - self.lengths[0] / 2)
+        tips = [device.tip_length for device in self.catheter.devices]
+        places = np.unique(
+            np.minimum([0, length, *self.gaps, *self.gaps + tips], length)
         )
+        middles = (places[1:] + places[:-1]) / 2
+        found = theory.profile(self.catheter.devices, self.gaps, middles).sum(axis=1)
+        return np.diff(places)[::-1], found[0, ::-1], found[1, ::-1]
 
     def add_wall(self, measure: Callable, low, high, friction: float = FRICTION):
         """Adds a wall that sensors read.
@@ -191,8 +190,11 @@ class Rig:
 
         self.add_wall(measure, (-0.05, -0.05, -0.5), (0.05, height, 0.5))
 
-    def compile(self) -> None:
-        """Compiles the model; fixtures are added before."""
+    def compile(self, blood: StillBlood | None = None) -> None:
+        """Compiles the model, in blood or in vacuum; fixtures are added before."""
+        if blood is not None:
+            size = self.arena.mjcf_model.size
+            size.nuserdata = userdata_size([blood], self.catheter)
         physics = mjcf.Physics.from_mjcf_model(self.arena.mjcf_model)
         self._physics = physics  # owns model and data
         self.model = physics.model.ptr
@@ -201,7 +203,21 @@ class Rig:
         self.head = self.model.site(f"{self.name}/head").id
         self.tip_body = self.model.body(f"{self.name}/link_{len(self.lengths) - 1}").id
         if isinstance(self.catheter, DeviceStack):
-            chain_fields.write_still(self.catheter, self.model, self._gaps)
+            chain_fields.write_still(self.catheter, self.model, self.gaps)
+        if blood is not None:
+            links = ids(self.model, self.catheter.links)
+            index = types.SimpleNamespace(links=slice(int(links[0]), links[-1] + 1))
+            world = World(
+                self.model,
+                self.catheter,
+                index,  # type: ignore[arg-type]
+                0.0,
+                types.SimpleNamespace(qpos=self.data.qpos[None]),
+                lambda _, name: getattr(self.model, name),
+                self.data.userdata[None],
+            )
+            random = np.random.RandomState(0)
+            Effects([blood], world).restart(0, Episode(np.zeros(3)), random)
         mujoco.mj_forward(self.model, self.data)
 
     def qpos(self, joint: str) -> float:

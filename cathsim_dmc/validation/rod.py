@@ -1,11 +1,11 @@
 """`cathsim validate rod`: bending, buckling and twist of the device against theory."""
 
-import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from scipy.signal import lfilter
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import (
@@ -62,49 +62,27 @@ class Cantilever(NamedTuple):
         return Check.at_most(name, 100 * self.deviation, CANTILEVER_BOUND, "%", note)
 
 
-def straight(device: str | devices.Device) -> devices.Device:
-    """The device without its pre-shaped tip."""
-    return dataclasses.replace(devices.get(device), tip_shape=())
-
-
 def cantilevers(
-    device: str | devices.Device = "steerable_5f",
+    device: str | Sequence[str] = "steerable_5f",
     end_angles: Sequence[float] = END_ANGLES,
     *,
     plane: float = np.pi / 4,
     discretisation: devices.Discretisation | None = None,
+    gaps: Sequence[float] | None = None,
     **rest: float,
 ) -> list[Cantilever]:
-    """Loads the end of a straight device across and compares it with the elastica.
+    """Loads the end of straight devices across and compares it with the elastica.
 
     Args:
-        device: its shape at rest is taken as straight.
+        device: see `Rig`, as are `discretisation` and `gaps`.
         end_angles: of the elastica's end, degrees; they set the forces.
         plane: direction of the force about the axis, rad. π/4 bends both hinges of
             every joint.
-        discretisation: default of the tasks if None.
         **rest: how it settles under each force, see `Rig.settle`.
     """
-    rig = Rig(straight(device), discretisation)
+    rig = Rig(device, discretisation, straight=True, gaps=gaps)
     rig.compile()
     lengths, bending, _ = rig.sections
-    return bent(rig, lengths, bending, end_angles, plane, **rest)
-
-
-def bent(
-    rig: Rig,
-    lengths: np.ndarray,
-    bending: np.ndarray,
-    end_angles: Sequence[float],
-    plane: float = np.pi / 4,
-    **rest: float,
-) -> list[Cantilever]:
-    """The same for a compiled rig that stands for a rod of S sections.
-
-    Args:
-        lengths: (S,) from the clamp on, m.
-        bending: (S,) their EI, N·m².
-    """
     across = np.array([np.cos(plane), np.sin(plane), 0.0])
     total, unloaded = float(np.sum(lengths)), rig.head_position
     results = []
@@ -128,7 +106,7 @@ def bent(
 class Buckling(NamedTuple):
     """Southwell plot of a column."""
 
-    end: str  # "sliding" or "fixed", see `theory.buckling_load`
+    end: str  # "sliding" or "fixed", see `buckling`
     length: float  # of the column, m
     load: np.ndarray  # (n,), axial loads, N
     deflection: np.ndarray  # (n,), additional deflection under the axial load, m
@@ -144,14 +122,9 @@ class Buckling(NamedTuple):
         return Check.deviation(name, *loads, BUCKLING_BOUND, "N", note)
 
 
-def buckling(end: str, joints: int | None = None) -> Buckling:
-    """Measures the critical load of the shaft, or of so many links of it."""
-    rig = Rig(straight("steerable_5f"))
-    last = joints or len(rig.lengths) - rig.device.tip_links - 1
-    return column(rig, end, last, rig.device.shaft.bending_stiffness)
-
-
-def column(rig: Rig, end: str, last: int, stiffness: float) -> Buckling:
+def buckling(
+    end: str, joints: int | None = None, device: str | Sequence[str] = "steerable_5f"
+) -> Buckling:
     """Measures the critical load of a clamped-guided chain by a Southwell plot.
 
     The carriage clamps link 0; a guide that cannot turn holds another link by its
@@ -160,15 +133,26 @@ def column(rig: Rig, end: str, last: int, stiffness: float) -> Buckling:
     1/P_cr (Southwell 1932).
 
     Args:
-        rig: not compiled yet.
         end: "sliding" lets the guide move sideways, "fixed" holds it on the axis.
-        last: link that the guide holds.
-        stiffness: EI of the rod up to there, N·m².
+        joints: between the two links; None for the whole shaft.
+        device: see `Rig`.
     """
+    rig = Rig(device, straight=True)
+    # Links of the tips are shorter than those of the shaft.
+    last = joints or int(np.argmin(rig.lengths > rig.lengths[0] - 1e-9)) - 1
     middles = np.cumsum(rig.lengths) - rig.lengths / 2
-    length = middles[last] - middles[0]
-    expected = theory.buckling_load(length, stiffness, end)
-    _add_guide(rig, last, end)
+    length, stiffness = middles[last] - middles[0], float(rig.sections[1][0])
+    # Euler's load of a column whose end keeps its direction.
+    expected = (4 if end == "fixed" else 1) * np.pi**2 * stiffness / length**2
+    root = rig.arena.mjcf_model
+    place = middles[last] - rig.lengths[last] / 2 - rig.lengths.sum()
+    guide = root.worldbody.add("body", name="guide", pos=(0, 0, place))
+    guide.add("inertial", pos=(0, 0, 0), mass=1e-3, diaginertia=(1e-9, 1e-9, 1e-9))
+    for axis in np.eye(3)[[2, 0, 1] if end == "sliding" else [2]]:
+        guide.add("joint", type="slide", axis=axis)
+    solver = {"solref": (0.008, 1.0), "solimp": (0.999, 0.9999, 1e-4, 0.5, 2)}
+    held = rig.catheter.links[last]
+    root.equality.add("weld", body1=guide, body2=held, **solver)
     rig.compile()
     link = rig.model.body(f"{rig.name}/link_{last}").id
     middle = rig.model.body(f"{rig.name}/link_{(last + 1) // 2}").id
@@ -190,22 +174,8 @@ def column(rig: Rig, end: str, last: int, stiffness: float) -> Buckling:
     return Buckling(end, length, loads, additional, 1 / slope, expected)
 
 
-def _add_guide(rig: Rig, index: int, end: str) -> None:
-    root = rig.arena.mjcf_model
-    origin = float(np.sum(rig.lengths[:index]) - rig.lengths.sum())
-    guide = root.worldbody.add("body", name="guide", pos=(0, 0, origin))
-    guide.add("inertial", pos=(0, 0, 0), mass=1e-3, diaginertia=(1e-9, 1e-9, 1e-9))
-    for axis in "zxy" if end == "sliding" else "z":
-        along = np.eye(3)["xyz".index(axis)]
-        guide.add("joint", name=f"guide_{axis}", type="slide", axis=along)
-    solver = {"solref": (0.008, 1.0), "solimp": (0.999, 0.9999, 1e-4, 0.5, 2)}
-    held = rig.catheter.links[index]
-    root.equality.add("weld", body1=guide, body2=held, **solver)
-
-
 def twist_under_torque(
-    device: str | devices.Device = "steerable_5f",
-    torsion_joints: int = TORSION_JOINTS,
+    device: str = "steerable_5f", torsion_joints: int = TORSION_JOINTS
 ) -> tuple[float, float]:
     """Torque (N·m) on the end of the straight device that GJ turns by `TWIST`.
 
@@ -226,11 +196,24 @@ class TwistLag(NamedTuple):
     time: np.ndarray  # (n,), s
     base: np.ndarray  # (n,), angle of the base, rad
     tip: np.ndarray  # (n,), angle of the tip, rad
-    expected: np.ndarray  # (n,), angle of the tip by theory, for that of the base, rad
-    lag: float  # of the tip in steady rotation, rad
-    expected_lag: float  # rad
-    rise_time: float  # in which the lag reaches 1 - 1/e of its final value, s
-    expected_rise_time: float  # s, for the measured motion of the base
+    expected: np.ndarray  # (n,), lag of the tip by theory, rad
+
+    @property
+    def lags(self) -> tuple[float, float]:
+        """Lag in steady rotation, simulated and expected, rad."""
+        both = self.base - self.tip, self.expected
+        return tuple(float(lag[-50:].mean()) for lag in both)  # type: ignore
+
+    @property
+    def rises(self) -> tuple[float, float]:
+        """Times (s) at which the lags first meet 1 - 1/e of their final values."""
+        found = []
+        for lag in (self.base - self.tip, self.expected):
+            level = (1 - np.exp(-1)) * lag[-50:].mean()
+            index = int(np.argmax(lag >= level))
+            both = slice(index - 1, index + 1)
+            found.append(float(np.interp(level, lag[both], self.time[both])))
+        return found[0], found[1]
 
 
 def twist_lag() -> TwistLag:
@@ -255,32 +238,17 @@ def twist_lag() -> TwistLag:
         base = rig.qpos("rotation")
         rows.append((base, base + _twist(rig)))
     base, tip = np.array(rows).T
-    time = timestep * np.arange(len(base))
     decay = np.exp(-timestep / (brake * compliance + rig.device.relaxation_time))
     # The motor takes some 20 ms to its speed; the lag is driven by what it does.
-    lag, speed = np.zeros(len(base)), np.diff(base) / timestep
-    for index, final in enumerate(brake * compliance * speed):
-        lag[index + 1] = final + (lag[index] - final) * decay
-    rises = _rise_time(time, base - tip), _rise_time(time, lag)
-    steady = float((base - tip)[-50:].mean())
-    expected = float(brake * compliance * speed[-50:].mean())
-    return TwistLag(time, base, tip, base - lag, steady, expected, *rises)
+    final = brake * compliance * np.diff(base) / timestep
+    lag = lfilter([1 - decay], [1, -decay], final)
+    return TwistLag(timestep * np.arange(len(base)), base, tip, np.append(0.0, lag))
 
 
-def _rise_time(time: np.ndarray, curve: np.ndarray) -> float:
-    """Time (s) at which a rising curve first meets 1 - 1/e of its end."""
-    level = (1 - np.exp(-1)) * curve[-50:].mean()
-    index = int(np.argmax(curve >= level))
-    both = slice(index - 1, index + 1)
-    return float(np.interp(level, curve[both], time[both]))
-
-
-def _torsion_rig(
-    device: str | devices.Device, torsion_joints: int
-) -> tuple[Rig, float]:
+def _torsion_rig(device: str, torsion_joints: int) -> tuple[Rig, float]:
     """A straight device whose base turns, and its compliance Σ(l/GJ), rad/N·m."""
     discretisation = devices.Discretisation(torsion_joints=torsion_joints)
-    rig = Rig(straight(device), discretisation, rotation=True)
+    rig = Rig(device, discretisation, straight=True, rotation=True)
     rig.compile()
     lengths, _, torsional = rig.sections
     return rig, float((lengths / torsional).sum())
@@ -328,45 +296,37 @@ def slip_force() -> float:
     return np.inf
 
 
-def _drive_checks() -> Iterator[Check]:
-    """Holds, moves and slips under load."""
+def _checks(data: dict[str, Any]) -> Iterator[Check]:
+    """Checks of the rod; measurements for the figure are put into `data`."""
+    data["cantilevers"] = cantilevers()
+    yield from (one.check() for one in data["cantilevers"])
+    worst, device = max(
+        (cantilevers(name, (45.0,), **LIBRARY_REST)[0].deviation, name)
+        for name in devices.DEVICES
+    )
+    name = "cantilever, worst device of the library, end at 45°"
+    yield Check.at_most(name, 100 * worst, CANTILEVER_BOUND, "%", device)
+    data["columns"] = [buckling("sliding"), buckling("fixed")]
+    yield from (one.check("buckling load") for one in data["columns"])
+    for device in ("steerable_5f", "wire_035_amplatz"):
+        torque, angle = twist_under_torque(device)
+        name = f"twist under end torque, {device}"
+        note = f"{angle:.4f} rad under {1e6 * torque:.3g} µN·m"
+        yield Check.deviation(name, angle, TWIST, TWIST_BOUND, "rad", note)
+    data["lag"] = lag = twist_lag()
+    name = "lag of the tip behind the turning base"
+    yield Check.deviation(name, *lag.lags, TWIST_BOUND, "rad")
+    yield Check.deviation("rise time of that lag", *lag.rises, TWIST_BOUND, "s")
     driven = Driven()
     driven.move(0.4, 0.0, 0.0)
-    held, name = (
-        driven.move(10.0, 0.0, JAM),
-        f"drive, command 0, {JAM:g} N for 10 s: way",
-    )
-    yield Check.at_most(name, 1e3 * abs(held), HOLD_BOUND, "mm")
+    held = 1e3 * abs(driven.move(10.0, 0.0, JAM))
+    name = f"drive, command 0, {JAM:g} N for 10 s: way"
+    yield Check.at_most(name, held, HOLD_BOUND, "mm")
     driven.move(0.4, 1.0, JAM)
     moved, name = driven.move(1.0, 1.0, JAM), f"drive, full speed against {JAM:g} N"
     yield Check.deviation(name, moved, MAX_PUSH_SPEED, SPEED_BOUND, "m/s")
     name = "drive, force at which the clamp slips"
     yield Check.deviation(name, slip_force(), MAX_PUSH_FORCE, SLIP_BOUND, "N")
-
-
-def _checks(data: dict[str, Any]) -> Iterator[Check]:
-    """Checks of the rod; measurements for the figure are put into `data`."""
-    data["cantilevers"] = cantilevers()
-    yield from (one.check() for one in data["cantilevers"])
-    worst, name = max(
-        (cantilevers(name, (45.0,), **LIBRARY_REST)[0].deviation, name)
-        for name in devices.DEVICES
-    )
-    label = "cantilever, worst device of the library, end at 45°"
-    yield Check.at_most(label, 100 * worst, CANTILEVER_BOUND, "%", name)
-    data["columns"] = [buckling("sliding"), buckling("fixed")]
-    yield from (one.check("buckling load") for one in data["columns"])
-    for name in ("steerable_5f", "wire_035_amplatz"):
-        torque, angle = twist_under_torque(name)
-        note = f"{angle:.4f} rad under {1e6 * torque:.3g} µN·m"
-        label = f"twist under end torque, {name}"
-        yield Check.deviation(label, angle, TWIST, TWIST_BOUND, "rad", note)
-    data["lag"] = lag = twist_lag()
-    label = "lag of the tip behind the turning base"
-    yield Check.deviation(label, lag.lag, lag.expected_lag, TWIST_BOUND, "rad")
-    found = lag.rise_time, lag.expected_rise_time
-    yield Check.deviation("rise time of that lag", *found, TWIST_BOUND, "s")
-    yield from _drive_checks()
     yield from damping.checks()
 
 

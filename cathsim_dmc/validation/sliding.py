@@ -39,18 +39,12 @@ STRAIGHT_LAG = 45.0  # °, of the end in a straight tube
 WHIP = 3.0  # least rate of turning of the end in a bend, in that of the base
 
 
-def slide() -> list[dict[str, Any]]:
-    """Slides two devices through each other in a vessel.
-
-    Returns:
-        Of each part of the script its "name"; "largest_step" of the end of the chain in
-        a control step and "moved", by which it moved in the part, m; "peak_force" of a
-        contact, N; "warnings" of MuJoCo.
-    """
+def slide() -> Iterator[Check]:
+    """Slides two devices through each other in a vessel."""
     options = {"devices": SLIDING_PAIR, "random": 0, "observation": "tracking"}
     environment = suite.load(suite.DOMAIN, SLIDING_TASK, options)
     environment.reset()
-    play, parts = environment.task, []
+    play, warnings = environment.task, 0
     for name, wire, catheter, turn, duration in SCRIPT:
         action = np.array([wire, 0.0, catheter, 0.0]) / MAX_PUSH_SPEED
         action[3] = turn / MAX_ROTATION_SPEED
@@ -60,18 +54,17 @@ def slide() -> list[dict[str, Any]]:
                 break
             heads.append(play.readings.head)
             peak = max(peak, float(play.wall_force.peak_max))
+        warnings = int(environment.physics.data.ptr.warning.number.sum())
+        if name == SCRIPT[0][0]:
+            continue
         steps = np.linalg.norm(np.diff(heads, axis=0), axis=-1)
-        parts.append(
-            {
-                "name": name,
-                "largest_step": float(steps.max(initial=0.0)),
-                "moved": float(np.linalg.norm(heads[-1] - heads[0])),
-                "peak_force": peak,
-                "warnings": int(environment.physics.data.ptr.warning.number.sum()),
-            }
-        )
+        name = f"sliding, {name}: largest step of the end in 40 ms"
+        note = f"moves by {1e3 * np.linalg.norm(heads[-1] - heads[0]):.1f} mm, largest "
+        note += f"contact {peak:.3f} N, {warnings} warnings"
+        largest = 1e3 * steps.max(initial=0.0)
+        yield Check.at_most(name, largest, LARGEST_STEP, "mm", note)
+    yield Check.at_most("sliding, warnings", warnings, 0, "", "of MuJoCo")
     environment.close()
-    return parts
 
 
 class Torque(NamedTuple):
@@ -83,6 +76,8 @@ class Torque(NamedTuple):
         tip: (T,), rad.
         ratio: A/K, rad, of the torque A by which the shape resists at most, EI κ α, 0
             in a straight tube, and the torsional stiffness K of the whole device.
+            Without friction the end follows a base that turns on until, at a ratio
+            above 1, it whips round.
     """
 
     name: str
@@ -91,30 +86,20 @@ class Torque(NamedTuple):
     ratio: float
 
     @property
-    def lag(self) -> np.ndarray:
-        """(T,), of the end behind the base, rad."""
-        return self.base - self.tip
+    def lag(self) -> float:
+        """Largest of the end behind the base, rad."""
+        return float(np.abs(self.base - self.tip).max())
 
     @property
     def whips(self) -> float:
         """Largest rate of turning of the end over that of the base."""
         return float(np.abs(np.diff(self.tip)).max() / np.diff(self.base).mean())
 
-    @property
-    def expected_lag(self) -> float:
-        """Largest lag without friction, rad, and without the tube's clearance.
 
-        With the shape gathered at the end, K (β - φ) = A sin φ; as the base turns on,
-        the end follows until 1 + A/K cos φ = 0, and then whips round.
-        """
-        return float(np.sqrt(self.ratio**2 - 1) if self.ratio > 1 else self.ratio)
-
-
-def turn(bent: bool, **options: Any) -> Torque:
+def turn(bent: bool) -> Torque:
     """Advances a pre-shaped catheter through a tube and turns its base slowly."""
     size = (STRAIGHT_TUBE, TUBE_RADIUS), (BENT_TUBE / 2, TUBE_RADIUS, BEND_RADIUS)
-    options = {"devices": (TURNED,), "observation": "tracking", **options}
-    environment = in_tube(size[bent], **options)
+    environment = in_tube(size[bent], devices=(TURNED,), observation="tracking")
     play, device = environment.task, get(TURNED)
     # Until its bend lies at the far end of the half circle.
     ahead = 0.05 + np.pi * BEND_RADIUS - play.scene.placement.start_depth
@@ -133,34 +118,13 @@ def turn(bent: bool, **options: Any) -> Torque:
     return Torque(name, *np.array(rows).T, ratio=shape * compliance)
 
 
-def checks(data: dict[str, Any], findings: dict[str, Any]) -> Iterator[Check]:
-    """Runs the devices; puts the turned ones into `data`, figures into `findings`."""
-    findings["sliding"] = parts = slide()
-    for part in parts[1:]:
-        name = f"sliding, {part['name']}: largest step of the end in 40 ms"
-        note = f"moves by {1e3 * part['moved']:.1f} mm, largest contact "
-        note += f"{part['peak_force']:.3f} N, {part['warnings']} warnings"
-        yield Check.at_most(name, 1e3 * part["largest_step"], LARGEST_STEP, "mm", note)
-    warnings = parts[-1]["warnings"]
-    yield Check.at_most("sliding, warnings", warnings, 0, "", "of MuJoCo")
+def checks(data: dict[str, Any]) -> Iterator[Check]:
+    """Runs the devices; puts the turned ones into `data`."""
+    yield from slide()
     straight, bent = data["turned"] = [turn(False), turn(True)]
-    lag = float(np.degrees(np.abs(straight.lag).max()))
-    name, note = (
-        "torque in a straight tube, lag of the end",
-        "friction alone holds it back",
-    )
-    yield Check.at_most(name, lag, STRAIGHT_LAG, "°", note)
+    name = "torque in a straight tube, lag of the end"
+    note = "friction alone holds it back"
+    yield Check.at_most(name, np.degrees(straight.lag), STRAIGHT_LAG, "°", note)
     name = "torque in a half circle, fastest turning of the end over the base's"
     note = f"A/K = {bent.ratio:.1f}: above 1 it whips"
     yield Check.at_least(name, bent.whips, WHIP, "", note)
-    findings["torque"] = {
-        one.name: {
-            "largest lag, °": float(np.degrees(one.lag.max())),
-            "largest lag without friction and clearance, °": float(
-                np.degrees(one.expected_lag)
-            ),
-            "fastest turning of the end over the base's": one.whips,
-            "shape over torsional stiffness, rad": one.ratio,
-        }
-        for one in (straight, bent)
-    }

@@ -1,4 +1,4 @@
-"""Closed forms for slender rods: elastica, column, and EI of a device along it.
+"""Closed forms for slender rods: elastica, and EI of a device along it.
 
 A rod is a sequence of uniform sections, from the clamp to the free end, given by
 their lengths (m) and bending stiffnesses EI (N·m²). SI units throughout.
@@ -13,9 +13,6 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from cathsim_dmc.entities.device import Device
-
-# Loads of Euler in those of a column whose end is free to move sideways.
-GUIDES = {"sliding": 1, "fixed": 4}
 
 
 class Elastica(NamedTuple):
@@ -61,15 +58,6 @@ def elastica(lengths: ArrayLike, stiffnesses: ArrayLike, end_angle: float) -> El
     force = brentq(lambda f: shape(f)[0, 0], 0.5 * low, 20 * low, xtol=1e-12 * low)
     rows = shape(force)
     return Elastica(force, rows[:, 2:] - rows[0, 2:], rows[:, 0])
-
-
-def buckling_load(length: float, stiffness: float, end: str = "sliding") -> float:
-    """Euler's load (N) of a uniform column of EI (N·m²), clamped at its start.
-
-    The end keeps its direction. "sliding": it is free to move sideways (π²EI/L²);
-    "fixed": it is not (4π²EI/L²).
-    """
-    return GUIDES[end] * np.pi**2 * stiffness / length**2
 
 
 def profile(

@@ -5,7 +5,7 @@ twists on a fine grid; it shares no code with the model but the devices' data.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -21,7 +21,7 @@ from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check
-from cathsim_dmc.validation.rig import Rig, half_circle, in_order, in_tube
+from cathsim_dmc.validation.rig import Rig, half_circle, in_tube
 
 _FINE = 0.5e-3  # m
 BEND_RADIUS = 0.04  # m, of half a circle in which the pairs are held
@@ -148,9 +148,9 @@ def simulate(
         rotation: (K,), of their bases, rad.
         beyond: free length of the chain after the half circle, m; None where all is.
     """
-    entity = DeviceStack(names)
-    rig = Rig(stack=entity)
+    rig = Rig(names)
     rig.compile()
+    entity: Any = rig.catheter
     stack, rods = entity.stack, entity.rods
     fields = chain_fields.ChainFields(rig.model, entity)
     arrays = [getattr(rig.model, name) for name in chain_fields.FIELDS]
@@ -159,8 +159,7 @@ def simulate(
         start = stack.nodes[0] - beyond - np.pi * BEND_RADIUS
         line = np.vstack([[[0, 0, 0]], half_circle(BEND_RADIUS, start, 1999)])
         line = np.vstack([line, line[-1:] - (0, 0, 1)])
-        angles = posture.joints_along(rig.lengths, line)
-        rig.data.qpos[fields.qpos] = in_order(angles)
+        rig.bend(posture.joints_along(rig.lengths, line))
         # Joints before the end of the half circle and at it do not move.
         held = 2 * int((stack.nodes[1:-1] > beyond - 1e-6).sum())
         start = int(rig.model.jnt_dofadr[rig.model.joint(f"{rig.name}/bend_x_1").id])

@@ -114,7 +114,7 @@ def _short_columns(ax, columns):
 
 def _lag(ax, lag):
     behind = lag.base - lag.tip
-    ax.plot(lag.time, lag.base - lag.expected, color=THEORY, label="theory")
+    ax.plot(lag.time, lag.expected, color=THEORY, label="theory")
     ax.plot(
         lag.time[::12], behind[::12], ".", color=SIMULATED, markersize=4,
         label="simulated",
