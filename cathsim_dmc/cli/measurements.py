@@ -15,8 +15,6 @@ def validate(
         Literal["rod", "pair", "wall", "vessel", "forces", "bench"], conf.Positional
     ],
     /,
-    anatomy: Annotated[tuple[str, ...], conf.arg(aliases=("--phantom",))] = (),
-    convergence: bool = True,
     data: Path | None = None,
     json: Json = False,
 ) -> int:
@@ -25,9 +23,6 @@ def validate(
     Args:
         part: Rod and drives; coaxial devices; contact with the wall and its shape;
             flow, wall and motion of the vessel; force sensors; guidewires on a bench.
-        anatomy: Of `wall`: directories of further anatomies, such as an imported scan.
-        convergence: Of `wall`: whether to include the studies of time step and link
-            length.
         data: Of `bench`: folder with phantom.stl and wires.json (docs/bench.md).
     """
     module = "force_sensors" if part == "forces" else part
@@ -38,10 +33,6 @@ def validate(
             "`validate bench` and it alone takes --data DIR, a folder with phantom.stl "
             "and wires.json (docs/bench.md)"
         )
-    if part == "wall":
-        return show(run(anatomy, convergence), json)
-    if anatomy or not convergence:
-        raise ValueError("--anatomy and --no-convergence belong to `validate wall`")
     if part == "bench":
         return show(run(data, lambda text: print(text, file=sys.stderr)), json)
     return show(run(), json)

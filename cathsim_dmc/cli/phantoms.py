@@ -168,11 +168,12 @@ def check(
     anatomy = suite.load_anatomy(phantom)
     if figure is None and Path(phantom).is_dir():
         figure = Path(phantom) / _PICTURE
-    report = validate_anatomy({anatomy.name: anatomy}, figure)
+    report = validate_anatomy(anatomy)
     code = show(report, json)
     if not json:
         print_json(report.findings[anatomy.name]["measures"])
     if figure is not None:
+        views.draw(anatomy, figure)
         print(f"three views: {figure}", file=sys.stderr)
     return code
 

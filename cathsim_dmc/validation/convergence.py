@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy import Anatomy, Centreline, Goal
+from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.tasks.config import (
@@ -31,6 +31,7 @@ FORCE_BOUND = 10.0  # % of the mean wall force
 # Least mean wall force of a script whose force is compared, N.
 LEAST_FORCE = 1e-3
 CURL_TIME = 2.0  # s
+FIGURES = ("path_mean_mm", "path_max_mm", "track_max_mm", "force_mean")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,24 +69,16 @@ SCRIPTS = (
 )
 
 
-def run(
-    script: Script,
-    *,
-    seed: int = 0,
-    anatomy: str | Anatomy = "type1",
-    goal: str | Goal = "lcca",
-    **options: Any,
-) -> Episode:
-    """Runs a script until its end or that of the episode.
+def run(script: Script, *, seed: int = 0, **options: Any) -> Episode:
+    """Runs a script in the type-I arch until its end or that of the episode.
 
     Args:
-        goal: it sets the stroke of the base.
         **options: further fields of `tasks.navigation.NavigationConfig`.
 
     Raises:
         RuntimeError: if the simulation diverges.
     """
-    kwargs = {"random": seed, "anatomy": anatomy, "goal": goal, **options}
+    kwargs = {"random": seed, "anatomy": "type1", "goal": "lcca", **options}
     environment = suite.load(suite.DOMAIN, "navigate", kwargs)
     steps, duration = itertools.count(), round(script.duration / CONTROL_TIMESTEP)
     episode = EpisodeRecorder(environment).record_episode(
@@ -107,63 +100,52 @@ def study(script: Script, parameter: str, values: Sequence[float]) -> dict[str, 
 
     Returns:
         "script" (name), "parameter", and lists with an entry for each value: "value",
-        mean and largest distance (mm) of the head from the finest run's at the same
-        time ("path_mean_mm", "path_max_mm") and from its track whatever the time
-        ("track_max_mm"), and "force_mean" (N), that of the wall force.
+        and `FIGURES`: mean and largest distance (mm) of the head from the finest run's
+        at the same time, largest distance (mm) from its track whatever the time, and
+        mean wall force, N.
     """
     ascending = sorted(float(value) for value in values)
     # A tiny goal: the script runs to its end.
     fixed = {"goal_radius": 1e-5, "outside_range": True}
     options = [{**fixed, parameter: value} for value in ascending]
-    runs = [run(script, **each) for each in options]  # type: ignore
+    runs = [run(script, **each) for each in options]
     heads = [one.head[1:] for one in runs]
-    away = [1e3 * np.linalg.norm(head - heads[0], axis=1) for head in heads]
-    track = [1e3 * _off(head, heads[0]) for head in heads]
+    away = 1e3 * np.linalg.norm(np.array(heads) - heads[0], axis=-1)
+    # What stands still is no line.
+    moves = np.append(True, np.any(np.diff(heads[0], axis=0) != 0.0, axis=1))
+    track = Centreline(heads[0][moves], np.ones(moves.sum()))
+    off = [1e3 * track.project(head).distance.max() for head in heads]
     return {
         "script": script.name,
         "parameter": parameter,
         "value": ascending,
-        "path_mean_mm": [float(each.mean()) for each in away],
-        "path_max_mm": [float(each.max()) for each in away],
-        "track_max_mm": [float(each.max()) for each in track],
+        "path_mean_mm": away.mean(axis=1).tolist(),
+        "path_max_mm": away.max(axis=1).tolist(),
+        "track_max_mm": off,
         "force_mean": [float(one.wall_force_sum.mean()) for one in runs],
     }
-
-
-def _off(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Distances (n,) of points (n, 3) from a polyline (m, 3), m."""
-    moves = np.append(True, np.any(np.diff(line, axis=0) != 0.0, axis=1))
-    track = Centreline(line[moves], np.ones(moves.sum()))
-    return track.project(points).distance
 
 
 def studies() -> list[dict[str, Any]]:
     """Studies of both parameters for each script."""
     resolutions = {"physics_timestep": TIMESTEPS, "shaft_link": SHAFT_LINKS}
-    return [
-        study(script, parameter, values)
-        for script in SCRIPTS
-        for parameter, values in resolutions.items()
-    ]
+    return [study(script, *each) for script in SCRIPTS for each in resolutions.items()]
 
 
 def checks(results: Sequence[dict[str, Any]]) -> Iterator[Check]:
     """Whether the defaults, which are among the values, are converged."""
     for one in results:
-        default, finest = DEFAULTS[one["parameter"]], one["value"][0]
+        default = DEFAULTS[one["parameter"]]
         of_step = one["parameter"] == "physics_timestep"
         kind, unit = ("step", "ms") if of_step else ("links", "mm")
-        label = f"{kind} of {1e3 * default:g} {unit} against {1e3 * finest:g} {unit}, "
-        label += one["script"]
+        name = f"{kind} of {1e3 * default:g} {unit} against "
+        name += f"{1e3 * one['value'][0]:g} {unit}, {one['script']}: "
         index = int(np.argmin(np.abs(np.array(one["value"]) - default)))
-        note = f"largest {one['path_max_mm'][index]:.2f} mm, off the track by at most "
-        note += f"{one['track_max_mm'][index]:.2f} mm"
-        path, name = (
-            one["path_mean_mm"][index],
-            f"{label}: mean distance of the tip paths",
-        )
-        yield Check.at_most(name, path, PATH_BOUND, "mm", note)
-        force, reference = (1e3 * one["force_mean"][k] for k in (index, 0))
-        if reference > 1e3 * LEAST_FORCE:
-            name = f"{label}: mean wall force"
-            yield Check.deviation(name, force, reference, FORCE_BOUND, "mN")
+        path, largest, off, force = (one[key][index] for key in FIGURES)
+        note = f"largest {largest:.2f} mm, off the track by at most {off:.2f} mm"
+        away = f"{name}mean distance of the tip paths"
+        yield Check.at_most(away, path, PATH_BOUND, "mm", note)
+        reference = one["force_mean"][0]
+        if reference > LEAST_FORCE:
+            both = 1e3 * force, 1e3 * reference
+            yield Check.deviation(f"{name}mean wall force", *both, FORCE_BOUND, "mN")

@@ -1,14 +1,10 @@
 """`cathsim validate wall`: wall against lumen, friction that acts, convergence."""
 
-import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.anatomy import measures
+from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.field_loops import FREE
 from cathsim_dmc.anatomy.scan import topology
@@ -46,7 +42,6 @@ def field_error(anatomy: Anatomy) -> np.ndarray:
 
 def lumen_checks(anatomy: Anatomy) -> list[Check]:
     """Surface, field, passage and goals of an anatomy, generated or imported."""
-    name = anatomy.name
     error = 1e3 * field_error(anatomy)
     radius = devices.get("steerable_5f").outer_radius
     # Places, 0.5 mm apart, on the way to each goal that are too narrow.
@@ -61,88 +56,56 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
             astray.append(goal.name)
     faces = anatomy.surface.faces.astype(np.int64)
     loose = int((topology.edge_counts(faces)[1] != 2).sum())
-    made = []
-
-    def check(what: str, value: float, bound: float, unit: str = "", note: str = ""):
-        made.append(Check.at_most(f"{name}: {what}", value, bound, unit, note))
-
-    if not anatomy.scan:  # scans have rings of vessels
-        note = "tubes that touch beyond the place where they part"
-        check("handles of the surface", topology.handles(faces), 0, "", note)
-    note = f"{len(faces)} triangles, {1e6 * anatomy.surface.volume:.0f} ml"
-    check("edges of the surface without two triangles", loose, 0, "", note)
+    made = f"{len(faces)} triangles, {1e6 * anatomy.surface.volume:.0f} ml"
     parts = int(topology.parts(faces).max()) + 1
-    check("separate parts of the surface", parts, 1)
     bound = ERROR_SURFACE if anatomy.scan else ERROR_TREE
-    note = f"mean {error.mean():.4f} mm, at most {error.max():.3f} mm, at "
-    note += f"{len(error)} places within {1e3 * _NEAR_WALL:g} mm of the wall"
+    exact = f"mean {error.mean():.4f} mm, at most {error.max():.3f} mm, at "
+    exact += f"{len(error)} places within {1e3 * _NEAR_WALL:g} mm of the wall"
     worst = float(np.percentile(error, 99))
-    check("error of the field, 99th percentile", worst, bound, "mm", note)
-    check("memory of the field", anatomy.lumen.nbytes / 1e6, LARGEST_FIELD, "MB")
     blocked = ", ".join(one for one, count in narrow.items() if count)
-    note = f"radius {1e3 * radius:.2f} mm" + (blocked and f", blocked: {blocked}")
-    what = "places of the centrelines that the device does not pass"
-    check(what, sum(narrow.values()), 0, "", note)
+    passed = f"radius {1e3 * radius:.2f} mm" + (blocked and f", blocked: {blocked}")
     lost = ", ".join(astray)
-    note = f"of {', '.join(anatomy.goals) or 'none'}" + (lost and f", astray: {lost}")
-    check(
-        "goals that the device cannot reach in their vessel", len(astray), 0, "", note
-    )
-    return made
+    goals = f"of {', '.join(anatomy.goals) or 'none'}" + (lost and f", astray: {lost}")
+    touch = "tubes that touch beyond the place where they part"
+    rows = [
+        ("handles of the surface", topology.handles(faces), 0, "", touch),
+        ("edges of the surface without two triangles", loose, 0, "", made),
+        ("separate parts of the surface", parts, 1),
+        ("error of the field, 99th percentile", worst, bound, "mm", exact),
+        ("memory of the field", anatomy.lumen.nbytes / 1e6, LARGEST_FIELD, "MB"),
+        (
+            "places of the centrelines that the device does not pass",
+            sum(narrow.values()), 0, "", passed,
+        ),
+        ("goals that the device cannot reach in their vessel", len(astray), 0, "",
+         goals),
+    ]  # fmt: skip
+    # Scans have rings of vessels, which are handles.
+    rows = rows[bool(anatomy.scan) :]
+    return [Check.at_most(f"{anatomy.name}: {what}", *row) for what, *row in rows]
 
 
-def validate_anatomy(
-    anatomies: Mapping[str, Anatomy],
-    figure_path: str | Path | None = None,
-) -> Report:
-    """Checks and measures anatomies by name.
-
-    Args:
-        anatomies: generated, measured or imported.
-        figure_path: PNG of three views of the first one, or None.
-    """
-    checks, findings = [], {}
-    for name, anatomy in anatomies.items():
-        checks += lumen_checks(dataclasses.replace(anatomy, name=name))
-        for one in check_tree(anatomy):
-            label = f"{name}: {one.name}, violations"
-            checks.append(Check.at_most(label, int(not one.passed), 0, "", one.detail))
-        findings[name] = {"measures": measures.measure(anatomy.tree)}
-    if figure_path is not None:
-        from cathsim_dmc.validation import views
-
-        views.draw(next(iter(anatomies.values())), figure_path)
-    return Report("anatomy of " + ", ".join(anatomies), checks, findings)
+def validate_anatomy(anatomy: Anatomy) -> Report:
+    """Checks and measures an anatomy: generated, measured or imported."""
+    checks = lumen_checks(anatomy)
+    for one in check_tree(anatomy):
+        name = f"{anatomy.name}: {one.name}, violations"
+        checks.append(Check.at_most(name, int(not one.passed), 0, "", one.detail))
+    measured = measures.measure(anatomy.tree)
+    findings = {anatomy.name: {"measures": measured}}
+    return Report(f"anatomy of {anatomy.name}", checks, findings)
 
 
-def validate_wall(
-    phantoms: Sequence[str | Path] = (),
-    with_convergence: bool = True,
-) -> Report:
-    """Runs every check of the wall.
-
-    Args:
-        phantoms: directories of further anatomies beside the arches, such as an
-            imported scan.
-        with_convergence: whether to run the convergence studies, which take longer
-            than all the rest.
-
-    Raises:
-        FileNotFoundError: if a directory holds no anatomy.
-        ValueError: if its file is damaged.
-    """
-    from cathsim_dmc.anatomy import phantoms as shipped
-
-    anatomies = [*map(shipped.load, ARCHES), *map(Anatomy.load, phantoms)]
-    studies = convergence.studies() if with_convergence else []
+def validate_wall() -> Report:
+    """Runs every check of the wall."""
+    anatomies = [*map(phantoms.load, ARCHES)]
+    studies = convergence.studies()
     pulled: list[friction.Capstan] = []
-    pushed: list[dict[str, Any]] = []
     checks = itertools.chain(
         *map(lumen_checks, anatomies),
         friction.checks(pulled),
-        pressed.push_checks(pushed),
+        pressed.push_checks(),
         convergence.checks(studies),
     )
-    findings = {"pushed": pushed} | ({"convergence": studies} if studies else {})
     data = {"anatomies": anatomies, "capstans": pulled, "studies": studies}
-    return Report("wall", list(checks), findings, data)
+    return Report("wall", list(checks), {"convergence": studies}, data)

@@ -1,6 +1,6 @@
 """Runs the validations, keeps their figures in docs/data and draws their pictures.
 
-    python docs/scripts/validation.py [rod] [pair] [wall] [forces] [--phantom DIRECTORY]
+    python docs/scripts/validation.py [rod] [pair] [wall] [forces]
 
 Each part is kept as soon as it has ended; `figures.py` writes the pages.
 """
@@ -21,12 +21,11 @@ IMAGES = DOCS / "images"
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", metavar="rod|pair|wall|forces")
-    parser.add_argument("--phantom", action="append", default=[])
     arguments = parser.parse_args()
     runs = {
         "rod": rod.validate_rod,
         "pair": pair.validate_pair,
-        "wall": lambda: wall.validate_wall(arguments.phantom),
+        "wall": wall.validate_wall,
         "forces": force_sensors.validate_forces,
     }
     chosen = arguments.parts or list(runs)

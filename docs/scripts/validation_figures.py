@@ -176,10 +176,9 @@ def _convergence(axes, studies):
 
 
 def wall(anatomies, capstans, studies):
-    figure, rows = canvas(3 if studies else 1, 2)
+    figure, rows = canvas(3, 2)
     axes = rows[0]
-    if studies:
-        _convergence(rows[1:], studies)
+    _convergence(rows[1:], studies)
     ax = axes[0]
     for colour, anatomy in zip(COLOURS * 3, anatomies, strict=False):
         values = np.sort(1e3 * field_error(anatomy))
