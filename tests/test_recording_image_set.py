@@ -176,10 +176,10 @@ def test_a_set_is_resumed_and_refused_where_it_must_be(tmp_path, monkeypatch, pa
     out = tmp_path / "set"
     options = dataclasses.replace(OPTIONS, anatomies=(2, 1, 1))
     done = image_set.write(out, options, processes=1)
-    assert done.frames == {"train": 16, "val": 8, "test": 8} and done.new == 32
+    assert done["frames"] == {"train": 16, "val": 8, "test": 8} and done["new"] == 32
     assert "| train | 2 | 16 |" in (out / "README.md").read_text()
     (out / "train" / "train_001.h5").unlink()
-    assert image_set.write(out, options, processes=1).new == 8
+    assert image_set.write(out, options, processes=1)["new"] == 8
     found = json.loads((out / "annotations/train.json").read_text())["images"]
     assert len({image["id"] for image in found}) == 16
     with pytest.raises(ValueError, match="other options"):

@@ -11,7 +11,7 @@ from tyro import conf
 # torchrl goes before dm_control.
 from cathsim_dmc import agents  # isort: skip
 
-from cathsim_dmc import bounds, files, suite
+from cathsim_dmc import bounds, suite
 from cathsim_dmc import play as by_hand
 from cathsim_dmc.agents import evaluation, submission
 from cathsim_dmc.agents.demonstrations import DEMONSTRATION_SEED
@@ -175,10 +175,8 @@ def record(
     recorder = EpisodeRecorder(env, task, task_kwargs)
     episode = recorder.record_episode(in_environment(player, env), seed)
     if out is not None:
-        # Put in place last, once both are written.
-        with files.atomic_path(out.with_suffix(".npz")) as arrays:
-            episode.write(arrays)
-            recorded.write(episode, env, out, fluoroscopy)
+        recorded.write(episode, env, out, fluoroscopy)
+        episode.save(out.with_suffix(".npz"))
     if gif is not None:
         recorded.write(episode, env, gif)
     print(f"{episode.steps} steps, {episode.termination}:", *targets)

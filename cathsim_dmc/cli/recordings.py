@@ -32,13 +32,11 @@ def dataset(
         processes=processes,
         say=lambda text: print(text, file=sys.stderr, flush=True),
     )
-    rates = done.new / done.seconds, done.new / done.processor
     if json:
-        found = {**vars(done), "path": str(out), "frames_per_second": rates[0]}
-        print_json({**found, "frames_per_processor_second": rates[1]})
+        print_json(done)
         return 0
-    held = ", ".join(f"{count} {name}" for name, count in done.frames.items())
-    print(f"{held} images, {rates[0]:.0f} new ones a second: {out}")
+    held = ", ".join(f"{count} {name}" for name, count in done["frames"].items())
+    print(f"{held} images, {done['frames_per_second']:.0f} new ones a second: {out}")
     return 0
 
 

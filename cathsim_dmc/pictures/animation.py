@@ -18,6 +18,7 @@ from cathsim_dmc.recording.episode import Episode
 
 SUFFIXES = (".gif", ".webp")
 FRAMES = 90
+_LENGTH = 2.0, 12.0  # s of a film, without its last pause
 # The last frame stays for so long before it begins again, ms.
 _HOLD_MS = 1500
 _TICK_MS = 20  # browsers do not show frames that are shorter
@@ -33,8 +34,6 @@ def animate(
     surface: Any,
     path: str | os.PathLike[str],
     *,
-    view: str = "front",
-    seconds: float | None = None,
     frames: int = FRAMES,
     width: int = 860,
     quality: int = 80,
@@ -47,9 +46,6 @@ def animate(
     Args:
         surface: Lumen surface with `vertices` and `faces`.
         path: File to write, `.gif` or `.webp`.
-        view: Direction of view, of `figure.VIEWS`.
-        seconds: Length of the film without its last pause; None takes the episode's,
-            at least 2 and at most 12.
         frames: Number of pictures at most; an episode has one state every 40 ms.
         width: Width of the film, pixels.
         quality: Quality of a WebP, 0 to 100.
@@ -58,18 +54,15 @@ def animate(
         The path.
 
     Raises:
-        ValueError: on another suffix, an unknown view, or an episode without a goal.
+        ValueError: on another suffix, or an episode without a goal.
         FileNotFoundError: if the folder does not exist.
     """
     path = Path(path)
     check_film(path)
-    if view not in drawing.VIEWS:
-        raise ValueError(f"no view {view!r}; there are {', '.join(drawing.VIEWS)}")
-    length = float(episode.time[-1] - episode.time[0])
-    seconds = float(np.clip(length, 2.0, 12.0)) if seconds is None else seconds
+    seconds = np.clip(episode.time[-1] - episode.time[0], *_LENGTH)
     count = min(frames, episode.steps + 1)
     chosen = np.unique(np.linspace(0, episode.steps, count).round().astype(int))
-    made = _frames(episode, surface, view, width, chosen)
+    made = _frames(episode, surface, width, chosen)
     pictures = [Image.fromarray(picture) for picture in made]
     tick = max(round(1000 * seconds / len(pictures)), _TICK_MS)
     times = [tick] * (len(pictures) - 1) + [_HOLD_MS]
@@ -99,16 +92,15 @@ def _one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
 
 
 def _frames(
-    episode: Episode, surface: Any, view: str, width: int, steps: np.ndarray
+    episode: Episode, surface: Any, width: int, steps: np.ndarray
 ) -> Iterator[np.ndarray]:
     """RGB pictures (rows, columns, 3) uint8 of some states of an episode."""
-    azimuth = drawing.VIEWS[view][0]
-    rough = ParallelProjection.of(surface.vertices, azimuth=azimuth, margin=_MARGIN)
+    rough = ParallelProjection.of(surface.vertices, margin=_MARGIN)
     left = rough.shape[1] / rough.shape[0]  # width of the scene per height
     height = width / (left + 0.66)
     # One pixel of the glass for each of the film.
     projection = ParallelProjection.of(
-        surface.vertices, azimuth=azimuth, margin=_MARGIN, height=round(height)
+        surface.vertices, margin=_MARGIN, height=round(height)
     )
     rest = glass(surface.vertices, surface.faces, projection)
     size, share = (width / _DPI, height / _DPI), left / (left + 0.66)

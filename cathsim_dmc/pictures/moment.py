@@ -88,7 +88,7 @@ class Moment:
         # Contacts of state t + 1 belong to step t.
         there = episode.contact_step == step - 1
         record, coaxial = VesselRecord.of(episode), CoaxialRecord.of(episode)
-        now = surface if record is None else record.surface(surface, episode, step)
+        now = surface if record is None else record.surface(surface, episode.time[step])
         own: dict[str, np.ndarray] = {"radius": episode.radii}
         if coaxial is not None:
             outermost = coaxial.outermost(episode.catheter)[step]

@@ -146,7 +146,7 @@ def xray_film(
         moves is drawn anew in every fourth state.
     """
     record, states, films = VesselRecord.of(episode), episode.steps + 1, []
-    moved = None if record is None or record.still else record
+    moved = None if record is None or record.motion is None else record
     span = MESH_EVERY if moved else states
     for plane in Angiograph(surface, options).planes():
         film = np.empty((states, *plane.carm.resolution, 1), np.uint8)
@@ -154,7 +154,7 @@ def xray_film(
             line = episode.catheter[first : first + span]
             radius = np.broadcast_to(episode.radii, (len(line), len(episode.radii)))
             if moved:
-                plane = plane.around(moved.surface(surface, episode, first))
+                plane = plane.around(moved.surface(surface, episode.time[first]))
             film[first : first + span] = plane.render([Shadow(line, radius)])
         darkest, brightest = int(film.min()), int(film.max())
         levels = 255 * (np.arange(256.0) - darkest) / max(brightest - darkest, 1)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.geometry import along
 
 # Of one device in ``meta['devices']``: series over the states.
 SERIES = ("insertion", "rotation", "tip_rotation")
@@ -55,13 +56,8 @@ class CoaxialRecord:
         Args:
             line: (T+1, L+1, 3), joints from proximal to distal, then the head.
         """
-        return np.array(
-            [
-                # Ascending for interpolation: from the head backwards.
-                np.stack([np.interp(gap, way[::-1], x[::-1]) for x in points.T], -1)
-                for gap, way, points in zip(self.gaps, _beyond(line), line, strict=True)
-            ]
-        )
+        pairs = zip(line, self.gaps, strict=True)
+        return np.array([along(points[::-1], gaps) for points, gaps in pairs])
 
     def outermost(self, line: np.ndarray) -> np.ndarray:
         """Number (T+1, L) of the outermost device in the middle of each link.
@@ -69,19 +65,13 @@ class CoaxialRecord:
         Args:
             line: (T+1, L+1, 3), joints from proximal to distal, then the head.
         """
-        beyond = _beyond(line)
-        middle = (beyond[:, 1:] + beyond[:, :-1]) / 2
+        lengths = np.linalg.norm(np.diff(line, axis=1), axis=-1)
+        beyond = np.cumsum(lengths[:, ::-1], axis=1)[:, ::-1]
+        middle = beyond - lengths / 2
         number = np.broadcast_to(self.gaps.argmin(axis=1)[:, None], middle.shape).copy()
         for k in range(len(self.names)):
             number[middle >= self.gaps[:, k, None]] = k
         return number
-
-
-def _beyond(line: np.ndarray) -> np.ndarray:
-    """Way (T+1, L+1) along the chain from each joint to the head, metres."""
-    lengths = np.linalg.norm(np.diff(line, axis=1), axis=-1)
-    from_base = np.pad(np.cumsum(lengths, axis=1), ((0, 0), (1, 0)))
-    return from_base[:, -1:] - from_base
 
 
 def device_meta(task: Any, rows: dict[str, np.ndarray]) -> list[dict[str, Any]]:

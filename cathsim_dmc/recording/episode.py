@@ -167,12 +167,6 @@ class Episode:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the episode to a ``.npz``, whole or not at all."""
-        with atomic_path(path, SUFFIX) as temporary:
-            self.write(temporary)
-        return Path(path)
-
-    def write(self, path: str | os.PathLike[str]) -> None:
-        """Write what `save` does, whatever the name, over what is there."""
         header = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
@@ -181,8 +175,10 @@ class Episode:
             "meta": self.meta,
         }
         arrays = {name: getattr(self, name) for name in _AXES}
-        with open(path, "wb") as stream:
-            np.savez_compressed(stream, header=np.array(json.dumps(header)), **arrays)
+        arrays["header"] = np.array(json.dumps(header))
+        with atomic_path(path, SUFFIX) as temporary, open(temporary, "wb") as stream:
+            np.savez_compressed(stream, **arrays)
+        return Path(path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "Episode":

@@ -1,6 +1,7 @@
-"""Forces in drawings: colours, scales and text."""
+"""Forces in drawings: colours, scales and text; places on a line."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 # Top of the colour scale, newtons. Published in-contact forces lie mostly within
 # 0-0.2 N with outliers above 0.4 N, so ordinary contacts use half the scale.
@@ -35,6 +36,13 @@ def force_scale(magnitude: np.ndarray) -> float:
     """
     largest = float(np.max(magnitude, initial=0.0))
     return next((top for top in _FORCE_SCALES if largest <= top), FORCE_COLOUR_MAX)
+
+
+def along(points: np.ndarray, way: ArrayLike) -> np.ndarray:
+    """Return places (m, 3) on a line (n, 3) at ways (m,) from its first point."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    arc = np.append(0.0, np.cumsum(steps))
+    return np.stack([np.interp(way, arc, axis) for axis in points.T], axis=-1)
 
 
 def force_text(newtons: float) -> str:

@@ -25,36 +25,12 @@ import numpy as np
 
 from cathsim_dmc import __version__, bounds, files
 from cathsim_dmc.recording import sequences
-from cathsim_dmc.recording.sequences import KEYPOINTS, KITS, SequenceOptions
+from cathsim_dmc.recording.sequences import KEYPOINTS, KITS, ImageSetOptions
 
 SPLITS = {"train": "train", "val": "train", "test": "test"}  # and their sets of arches
 _TRIES = 8  # arches that are tried in place of those that no device enters
 _FORMAT = "cathsim-image-set"
 Labels = dict[str, list[Any]]  # as `coco.labels` returns them
-
-
-@dataclasses.dataclass(frozen=True)
-class ImageSetOptions(SequenceOptions):
-    """Content of a data set.
-
-    Attributes:
-        anatomies: Number of random arches in train, val and test.
-        pictures: Whether the images are also written as PNG, for tools of COCO.
-        seed: Seed of all that is drawn.
-    """
-
-    anatomies: tuple[int, int, int] = (8, 2, 2)
-    pictures: bool = False
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        counts = bounds.vector("anatomies", self.anatomies, 3, 0, 50)
-        if any(count % 1 for count in counts) or not sum(counts):
-            bounds.refuse("anatomies", self.anatomies, "whole numbers, not all 0")
-        object.__setattr__(self, "anatomies", tuple(map(int, counts)))
-        bounds.switch("pictures", self.pictures)
-        bounds.seed("seed", self.seed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,32 +52,13 @@ class _Shard:
         return [self.options.seed, list(SPLITS).index(self.split), self.number]
 
 
-@dataclasses.dataclass(frozen=True)
-class Written:
-    """Result of a run.
-
-    Attributes:
-        path: of the data set.
-        frames: images of each split, with those of earlier runs.
-        new: images of this run.
-        seconds: wall time of this run.
-        processor: processor time of this run, all processes, s.
-    """
-
-    path: Path
-    frames: dict[str, int]
-    new: int
-    seconds: float
-    processor: float
-
-
 def write(
     out: str | os.PathLike[str],
     options: ImageSetOptions | None = None,
     *,
     processes: int | None = None,
     say: Callable[[str], None] = lambda text: None,
-) -> Written:
+) -> dict[str, Any]:
     """Writes a data set, or what an interrupted run has left out of it.
 
     Args:
@@ -109,6 +66,12 @@ def write(
         processes: number of processes, None for one per core; with more than one, a
             script must guard its main part (`if __name__ == "__main__"`).
         say: receives a line for each anatomy.
+
+    Returns:
+        "path" of the data set; images of each split ("frames"), with those of earlier
+        runs; of this run "new" images, wall time ("seconds"), "processor" time of all
+        processes, s, and the new images in a second of either, "frames_per_second" and
+        "frames_per_processor_second".
 
     Raises:
         ValueError: if an option is wrong, or the folder is that of other options.
@@ -136,7 +99,11 @@ def write(
     frames = _label(out, shards, labels)
     files.write_text(out / "README.md", _card(options, frames))
     took, spent = time.monotonic() - start, sum(os.times()[:4]) - used
-    return Written(out, frames, new, took, spent)
+    return {
+        "path": str(out), "frames": frames, "new": new, "seconds": took,
+        "processor": spent, "frames_per_second": new / took,
+        "frames_per_processor_second": new / spent,
+    }  # fmt: skip
 
 
 def _begin(out: Path, options: ImageSetOptions) -> None:

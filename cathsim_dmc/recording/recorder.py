@@ -15,7 +15,7 @@ from dm_control.rl import control
 from cathsim_dmc import __version__, bounds
 from cathsim_dmc.recording.coaxial import SERIES, device_meta
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.living import dents, vessel_state
+from cathsim_dmc.recording.living import vessel_state
 from cathsim_dmc.simulation.episodes import ComposerSimulation, play
 
 Policy = Callable[[Any], np.ndarray]
@@ -162,7 +162,6 @@ class EpisodeRecorder:
         there = contacts.present
         rows["contact_position"] += list(contacts.position[there])
         rows["contact_force"] += list(contacts.force[there])
-        rows["contact_depth"] += list(dents(task, contacts))
         rows["contact_step"] += [step] * int(there.sum())
 
     def _episode(self, rows: _Rows, seed: int | None, end: dict[str, Any]) -> Episode:
@@ -213,7 +212,6 @@ class EpisodeRecorder:
             meta["vessel"] = {
                 **{name: [state[name] for state in states] for name in states[0]},
                 **(moving.record() if moving else {"lattice": [], "parameters": []}),
-                "depth": rows.array("contact_depth").tolist(),
             }
             goal = np.array(meta["vessel"]["goal"])
         head = rows.array("catheter")[:, -1]

@@ -67,26 +67,11 @@ def write_rrd(
 
     Returns:
         The path.
-
-    Raises:
-        ValueError: on frames that do not fit the episode.
-        RuntimeError: if Rerun is switched off by the ``RERUN`` environment variable.
     """
-    planes, robot_geoms = 0, tuple(robot_geoms)
-    if fluoroscopy is not None:
-        shape, states = np.shape(fluoroscopy), episode.steps + 1
-        planes = shape[-1] if len(shape) == 4 and shape[0] == states else 0
-        if planes not in (1, 2) or fluoroscopy.dtype != np.uint8:
-            raise ValueError(
-                f"fluoroscopy must be uint8 of shape ({states}, H, W, 1), or 2 for two "
-                f"planes; got {fluoroscopy.dtype} of {shape}"
-            )
+    planes = 0 if fluoroscopy is None else fluoroscopy.shape[-1]
+    robot_geoms = tuple(robot_geoms)
     with atomic_path(path, ".rrd") as temporary:
         stream = rr.RecordingStream(APPLICATION_ID)
-        if not stream.is_enabled():
-            raise RuntimeError(
-                "Rerun is switched off; unset the environment variable RERUN"
-            )
         # By default Rerun turns errors into warnings.
         with catch_and_log_exceptions(strict=True):
             stream.set_log_tick_enabled(False)

@@ -33,14 +33,14 @@ HEAD_SCALE = 1.8
 # Geoms that bodies collide with are not drawn, as in MuJoCo's own viewers.
 _VISIBLE_GROUPS = 3
 # MuJoCo geom types that a recording can draw, and how many sizes each one uses:
-# sphere (radius), capsule and cylinder (radius, half length), box (half extents).
-SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3}
+# capsule and cylinder (radius, half length), box (half extents).
+SIZES = {"capsule": 2, "cylinder": 2, "box": 3}
 
 
 def log_vessel(log: Log, surface: Surface) -> None:
     """Log vessel, goal, directions and blood, and how vessel and goal move."""
     record, meta = log.vessel, log.episode.meta
-    moves = record is not None and not record.still
+    moves = record is not None and record.motion is not None
     # Patient frame LPS: x to the patient's left, y to the back, z up.
     log.static("world", rr.ViewCoordinates.LBU)
     mesh = rr.Mesh3D.from_fields(
@@ -70,7 +70,7 @@ def log_vessel(log: Log, surface: Surface) -> None:
         log.columns("world/goal", rr.Transform3D.columns(translation=way))
     if moves:
         rows = np.arange(0, log.episode.steps + 1, MESH_EVERY)
-        states = (record.surface(surface, log.episode, int(row)) for row in rows)
+        states = (record.surface(surface, t) for t in log.episode.time[rows])
         vertices = np.concatenate([each.vertices for each in states]).astype("f4")
         columns = rr.Mesh3D.columns(vertex_positions=vertices)
         columns = columns.partition(np.full(len(rows), len(surface.vertices)))
@@ -162,9 +162,9 @@ class BodyGeom:
     Attributes:
         body: Row of the body in ``Episode.body_pos`` (the MuJoCo body id).
         body_name: Full name of the body, such as ``robot/carriage``.
-        kind: "sphere", "capsule", "cylinder" or "box".
-        size: MuJoCo half sizes in metres: (radius,), (radius, half length) or
-            (half x, half y, half z).
+        kind: One of `SIZES`.
+        size: MuJoCo half sizes in metres: (radius, half length) or (half x, half y,
+            half z).
         position: (3,) centre in the frame of the body, metres.
         quaternion: (4,) wxyz, orientation in the frame of the body.
         rgba: (4,) colour in [0, 1].
@@ -228,8 +228,6 @@ def _shape(kind: str, parts: list[BodyGeom]) -> Any:
     look = {"quaternions": xyzw(turn), "colors": colours, "fill_mode": "solid"}
     if kind == "box":
         return rr.Boxes3D(half_sizes=size, centers=centre, **look)
-    if kind == "sphere":
-        return rr.Ellipsoids3D(half_sizes=size.repeat(3, 1), centers=centre, **look)
     look |= {"radii": size[:, 0], "lengths": 2 * size[:, 1]}
     if kind == "cylinder":
         return rr.Cylinders3D(centers=centre, **look)

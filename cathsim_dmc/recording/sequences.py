@@ -24,6 +24,7 @@ from cathsim_dmc.imaging.materials import MARKER_LENGTH
 from cathsim_dmc.imaging.options import DETECTOR_SIZE
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.physics.vessel import PRESETS
+from cathsim_dmc.recording.geometry import along
 from cathsim_dmc.tasks.anatomies import BRANCHES
 
 # Bits of a mask.
@@ -60,16 +61,19 @@ Warp = tuple[np.ndarray, float]
 
 
 @dataclasses.dataclass(frozen=True)
-class SequenceOptions:
-    """Recordings in each anatomy.
+class ImageSetOptions:
+    """Content of a data set.
 
     Attributes:
-        sequences: Number of motions.
+        sequences: Number of motions in each anatomy.
         frames: Number of frames of a sequence.
         views: Number of C-arms that see each motion, a sequence each.
         stride: Control steps of 40 ms from frame to frame.
         size: Pixels along a side of an image.
         vessel: State of the vessel: rigid, silicone or living.
+        anatomies: Number of random arches in train, val and test.
+        pictures: Whether the images are also written as PNG, for tools of COCO.
+        seed: Seed of all that is drawn.
     """
 
     sequences: int = 32
@@ -78,14 +82,22 @@ class SequenceOptions:
     stride: int = 1
     size: int = 128
     vessel: str = "rigid"
+    anatomies: tuple[int, int, int] = (8, 2, 2)
+    pictures: bool = False
+    seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, most in (
-            ("sequences", 1000), ("frames", 1000), ("views", 100), ("stride", 100),
-        ):  # fmt: skip
-            bounds.whole(name, getattr(self, name), 1, most)
+        most = {"sequences": 1000, "frames": 1000, "views": 100, "stride": 100}
+        for name, limit in most.items():
+            bounds.whole(name, getattr(self, name), 1, limit)
         bounds.whole("size", self.size, 16, bounds.MOST_PIXELS)
         bounds.choice("vessel", self.vessel, PRESETS)
+        counts = bounds.vector("anatomies", self.anatomies, 3, 0, 50)
+        if any(count % 1 for count in counts) or not sum(counts):
+            bounds.refuse("anatomies", self.anatomies, "whole numbers, not all 0")
+        object.__setattr__(self, "anatomies", tuple(map(int, counts)))
+        bounds.switch("pictures", self.pictures)
+        bounds.seed("seed", self.seed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +118,7 @@ class States:
 
 
 def simulate(
-    anatomy: Anatomy, goal: str, kit: str, options: SequenceOptions, seed: Sequence[int]
+    anatomy: Anatomy, goal: str, kit: str, options: ImageSetOptions, seed: Sequence[int]
 ) -> States:
     """Pushes and turns devices at random; ValueError if they do not fit."""
     from cathsim_dmc import suite
@@ -157,25 +169,19 @@ def simulate(
 
 def ostia(anatomy: Anatomy) -> np.ndarray:
     """Places (len(OSTIA), 3) where branches leave their parents, m; NaN for none."""
-    found = np.full((len(BRANCHES), 3), np.nan)
-    for row, name in enumerate(BRANCHES):
-        if name in anatomy.tree.vessels:
-            vessel = anatomy.tree.vessels[name]
-            found[row] = vessel.mouth.position
-    return found
+    vessels, none = anatomy.tree.vessels, np.full(3, np.nan)
+    return np.array([
+        vessels[name].mouth.position if name in vessels else none for name in BRANCHES
+    ])  # fmt: skip
 
 
 def ends(shadow: Shadow) -> np.ndarray:
     """Distal end of a device and where its marker begins (..., 2, 3), m."""
     length = MARKER_LENGTH if shadow.mu is None else shadow.marker_length
     back = shadow.points[..., ::-1, :]
-    steps = np.linalg.norm(np.diff(back, axis=-2), axis=-1)
-    way = np.concatenate([0 * steps[..., :1], np.cumsum(steps, axis=-1)], axis=-1)
     found = np.empty((*back.shape[:-2], 2, 3))
     for row in np.ndindex(back.shape[:-2]):
-        for axis in range(3):
-            place = np.interp([0.0, length], way[row], back[(*row, slice(None), axis)])
-            found[(*row, slice(None), axis)] = place
+        found[row] = along(back[row], [0.0, length])
     return found
 
 
@@ -225,7 +231,7 @@ class Camera:
 
 
 def frames_of(
-    anatomy: Anatomy, states: States, options: SequenceOptions, seed: Sequence[int]
+    anatomy: Anatomy, states: States, options: ImageSetOptions, seed: Sequence[int]
 ) -> Iterator[dict[str, np.ndarray]]:
     """Sequences (T rows of every array) before C-arms drawn for each."""
     random = np.random.RandomState(seed)
@@ -279,7 +285,7 @@ _TYPES = {"camera_matrix": "f8", "sequence": "i4", "motion": "i4"}
 
 
 def write(
-    path: Path, anatomy: Anatomy, states: States, options: SequenceOptions,
+    path: Path, anatomy: Anatomy, states: States, options: ImageSetOptions,
     seed: Sequence[int], **about: Any,
 ) -> int:  # fmt: skip
     """Writes the file of an anatomy, whole or not at all; returns its frames.

@@ -17,6 +17,7 @@ from cathsim_dmc.anatomy.scan.inlet import cut_open
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
 from cathsim_dmc.anatomy.scan.topology import merged
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+from cathsim_dmc.recording.geometry import along
 
 MESH, WIRES = "phantom.stl", "wires.json"
 KINDS = ("straight", "angled")
@@ -94,13 +95,6 @@ class Bench:
 def length_of(points: np.ndarray) -> float:
     """Length of a line (n, 3), m."""
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
-def along(points: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Points (m, 3) of a line (n, 3) at arc lengths (m,) from its first point."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    arc = np.concatenate([[0.0], np.cumsum(steps)])
-    return np.stack([np.interp(at, arc, axis) for axis in points.T], axis=-1)
 
 
 def distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:

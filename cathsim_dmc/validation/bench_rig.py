@@ -19,7 +19,8 @@ from cathsim_dmc.entities.devices import Discretisation
 from cathsim_dmc.entities.phantom import mesh_file
 from cathsim_dmc.entities.posture import bends_of
 from cathsim_dmc.entities.sheath import Sheath, straight
-from cathsim_dmc.validation.bench_data import Wire, along
+from cathsim_dmc.recording.geometry import along
+from cathsim_dmc.validation.bench_data import Wire
 from cathsim_dmc.validation.rig import Rig
 
 _LINK = 7e-3  # m, longest of the shaft
