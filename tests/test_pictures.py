@@ -103,13 +103,14 @@ def test_glass_covers_what_the_surface_covers_and_darkens_at_the_rim():
     assert alpha[0].max() == 0 == alpha[:, 0].max()
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 90.0, 37.0])
-def test_a_projection_maps_points_to_their_pixels(azimuth):
+@pytest.mark.parametrize("angle", [0.0, 90.0, 37.0])
+def test_a_projection_maps_points_to_their_pixels(angle):
     points = np.random.default_rng(0).normal(size=(20, 3))
-    projection = ParallelProjection.of(points, azimuth=azimuth)
+    right = np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0
+    projection = ParallelProjection.of(points, right)
     np.testing.assert_allclose(projection.right @ projection.towards, 0, atol=1e-12)
     # The viewer of the front stands before the chest: towards him is -y.
-    if azimuth == 0:
+    if angle == 0:
         np.testing.assert_allclose(projection.towards, [0, -1, 0], atol=1e-12)
     pixel = projection.pixel(points)
     rows, columns = projection.shape

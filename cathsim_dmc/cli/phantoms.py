@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro import conf
 from tyro.extras import SubcommandApp
 
-from cathsim_dmc import bounds, suite
+from cathsim_dmc import bounds, style, suite
 from cathsim_dmc.anatomy import export as exported
 from cathsim_dmc.anatomy import phantoms as shipped
 from cathsim_dmc.anatomy.arch import arch, sampler
@@ -15,7 +15,7 @@ from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.places import describe
 from cathsim_dmc.anatomy.tree_file import read_tree
 from cathsim_dmc.cli.options import Json, print_json, show
-from cathsim_dmc.validation import views
+from cathsim_dmc.pictures.figure import anatomy_figure
 from cathsim_dmc.validation.wall import validate_anatomy
 
 phantoms = SubcommandApp()
@@ -78,7 +78,7 @@ def import_phantom(
         notes=notes,
     )
     anatomy.save(out)
-    views.draw(anatomy, out / _PICTURE)
+    style.save(anatomy_figure(anatomy), out / _PICTURE)
     files = {"directory": str(out), "picture": str(out / _PICTURE), "notes": notes}
     print_json({**files, **describe(anatomy)})
     return 0
@@ -173,7 +173,7 @@ def check(
     if not json:
         print_json(report.findings[anatomy.name]["measures"])
     if figure is not None:
-        views.draw(anatomy, figure)
+        style.save(anatomy_figure(anatomy), figure)
         print(f"three views: {figure}", file=sys.stderr)
     return code
 

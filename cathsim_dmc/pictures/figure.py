@@ -12,6 +12,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.imaging.device import curve
 from cathsim_dmc.pictures.moment import Moment, fluoroscope_of, xray
@@ -19,11 +20,15 @@ from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.recording.geometry import force_colours, force_text
 from cathsim_dmc.style import COLOURS, tidy
 
-# Directions of view by name: azimuth of the viewer, degrees, and the picture's axes.
+_X, _Y = "x, mm (patient's left →)", "y, mm (towards the back →)"
+_Z, _BELOW = "z, mm (head ↑)", "-y, mm (towards the front ↑)"
+# By name: title, axes of the picture in the world, and their labels.
 VIEWS = {
-    "front": (0.0, "x, mm (patient's left →)"),
-    "left": (90.0, "y, mm (towards the back →)"),
+    "front": ("from the front", (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), _X, _Z),
+    "left": ("from the left", (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), _Y, _Z),
+    "below": ("from below", (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), _X, _BELOW),
 }
+GOAL_RADIUS_MM = 8.0  # the published task's
 GOAL_COLOUR, GOAL_LIGHT = "#12805c", "#5fd7ac"
 DEVICE_COLOUR, DEVICE_LIGHT = "#173a63", "#7fb2e5"
 # Of coaxial devices from the innermost outwards, over and over: a wire, and what a
@@ -84,15 +89,61 @@ def force_map() -> LinearSegmentedColormap:
 
 @functools.lru_cache(maxsize=16)
 def background(
-    surface: Any, azimuth: float, height: int, rest: Any = None
+    surface: Any, view: str, height: int, rest: Any = None
 ) -> tuple[ParallelProjection, Glass]:
-    """A vessel as glass, seen from an azimuth, degrees, in so many rows of pixels.
+    """A vessel as glass in one of `VIEWS`, in so many rows of pixels.
 
     `rest` is the surface on which the view is centred, where that is another.
     """
+    _, right, up, *_ = VIEWS[view]
     middle = (rest or surface).vertices
-    projection = ParallelProjection.of(middle, azimuth=azimuth, height=height)
+    projection = ParallelProjection.of(middle, right, up, height=height)
     return projection, glass(surface.vertices, surface.faces, projection)
+
+
+def anatomy_figure(anatomy: Anatomy) -> Picture:
+    """Draw lumen, centrelines, goals and inlet of an anatomy from three sides."""
+    figure = Picture(figsize=(13.5, 5.6), layout="constrained")
+    for axes, view in zip(figure.subplots(1, 3), VIEWS, strict=True):
+        draw_anatomy(axes, anatomy, view)
+    named = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*named, fontsize=8, loc="outside lower center", ncols=7)
+    figure.suptitle(anatomy.name)
+    return figure
+
+
+def draw_anatomy(axes: Any, anatomy: Anatomy, view: str = "front") -> None:
+    """Draw an anatomy into axes whose units are millimetres."""
+    projection, picture = background(anatomy.surface, view, 700)
+    _prepare(axes, projection, view)
+    axes.imshow(picture.behind, extent=projection.extent_mm, interpolation="bilinear")
+    for number, (name, vessel) in enumerate(anatomy.tree.vessels.items()):
+        line = projection.flat_mm(vessel.centreline.points)
+        axes.plot(*line.T, color=COLOURS[number % len(COLOURS)], lw=1.4, label=name)
+        axes.annotate(name, line[-1], (2, 2), textcoords="offset points", fontsize=6)
+    for goal in anatomy.goals.values():
+        x, y = projection.flat_mm(goal.position).tolist()
+        ring = Circle((x, y), GOAL_RADIUS_MM, fill=False, ec=GOAL_COLOUR, lw=0.8)
+        axes.add_patch(ring)
+        axes.plot(x, y, ".", color=GOAL_COLOUR, ms=4)
+    inlet = anatomy.inlet
+    ends = inlet.position + np.outer((0.015, -0.015), inlet.direction)
+    arrow = {"arrowstyle": "->", "color": "k"}
+    axes.annotate("", *projection.flat_mm(ends), arrowprops=arrow)
+
+
+def _prepare(axes: Any, projection: ParallelProjection, view: str | None) -> None:
+    """Give axes the limits of a projection, and the title and labels of a view."""
+    axes.set_xlim(projection.extent_mm[:2])
+    axes.set_ylim(projection.extent_mm[2:])
+    axes.set_aspect("equal")
+    axes.set_facecolor("white")
+    tidy(axes)
+    axes.grid(False)
+    if view is not None:
+        title, _, _, xlabel, ylabel = VIEWS[view]
+        axes.set(xlabel=xlabel, ylabel=ylabel)
+        axes.set_title(title, fontsize=10)
 
 
 def scene_figure(
@@ -115,7 +166,7 @@ def scene_figure(
         raise ValueError(f"views are {views!r}; give some of {', '.join(VIEWS)}")
     moved = moment.surface is not moment.rest
     draw = background.__wrapped__ if moved else background  # which keeps what it drew
-    drawn = [draw(moment.surface, VIEWS[v][0], pixels, moment.rest) for v in views]
+    drawn = [draw(moment.surface, v, pixels, moment.rest) for v in views]
     ratios = [p.shape[1] / p.shape[0] for p, _ in drawn] + [1.0] * fluoroscopy
     size = _HEIGHT_IN * 0.84 * sum(ratios) + 1.6, _HEIGHT_IN
     if size[0] > _WIDEST_IN:
@@ -124,10 +175,8 @@ def scene_figure(
     panels = figure.subplots(1, len(ratios), width_ratios=ratios, squeeze=False)[0]
     for panel, view, seen in zip(panels, views, drawn, strict=False):
         draw_scene(panel, moment, *seen)
-        panel.set_xlabel(VIEWS[view][1])
-        panel.set_title(f"from the {view}", fontsize=10)
+        _prepare(panel, seen[0], view)
     if views:
-        panels[0].set_ylabel("z, mm (head ↑)")
         scale = Normalize(0, 1e3 * moment.force_scale)
         beside = panels[: len(views)].tolist()
         figure.colorbar(
@@ -153,12 +202,7 @@ def draw_scene(
     """Draw a moment into axes whose units are millimetres."""
     extent = projection.extent_mm
     axes.imshow(picture.behind, extent=extent, zorder=1, interpolation="bilinear")
-    axes.set_xlim(extent[:2])
-    axes.set_ylim(extent[2:])
-    axes.set_aspect("equal")
-    axes.set_facecolor("white")
-    tidy(axes)
-    axes.grid(False)
+    _prepare(axes, projection, None)
     x, z = projection.flat_mm(moment.goal).tolist()
     inside = {"fc": GOAL_COLOUR, "alpha": 0.22, "zorder": 2}
     for look in (inside, {"fill": False, "lw": 1.6, "zorder": 7}):

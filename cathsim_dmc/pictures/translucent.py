@@ -6,6 +6,7 @@ pixels with all triangles are found first, sorted by depth and laid over each ot
 pixel by pixel. Glass is denser where one looks along it, which draws the outline.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,26 +44,25 @@ class ParallelProjection:
     def of(
         cls,
         vertices: np.ndarray,
+        right: Sequence[float] = (1.0, 0.0, 0.0),
+        up: Sequence[float] = (0.0, 0.0, 1.0),
         *,
-        azimuth: float = 0.0,
         margin: float = 6e-3,
         height: int = 900,
     ) -> "ParallelProjection":
-        """A view upright in the patient frame (LPS) that shows all vertices.
+        """A view that shows all vertices.
 
         Args:
             vertices: (V, 3), world frame, metres.
-            azimuth: Angle of the viewer about the long axis of the patient, degrees:
-                0 in front of the chest (AP), 90 at the patient's left (lateral).
+            right, up: Unit vectors (3,) of the picture's axes; from the front (AP) of
+                the patient frame (LPS) by default.
             margin: Space around the vertices, metres.
             height: Number of pixels from top to bottom.
         """
-        angle = np.deg2rad(azimuth)
-        right = np.array([np.cos(angle), np.sin(angle), 0.0])
-        up = np.array([0.0, 0.0, 1.0])
-        flat = vertices @ np.stack([right, up], axis=1)
+        axes = np.array([right, up])
+        flat = vertices @ axes.T
         low, high = flat.min(0) - margin, flat.max(0) + margin
-        return cls(right, up, low, high, height / (high[1] - low[1]))
+        return cls(*axes, low, high, height / (high[1] - low[1]))
 
     @property
     def towards(self) -> np.ndarray:

@@ -98,34 +98,19 @@ class Episode:
         if self.seed is not None:
             object.__setattr__(self, "seed", bounds.whole("seed", self.seed))
         object.__setattr__(self, "meta", _checked_meta(self.meta))
-        for name in _AXES:
-            steps = name == "contact_step"
-            given = bounds.array(name, getattr(self, name), "iu" if steps else "biuf")
-            array = np.array(given, dtype=np.int64 if steps else np.float64)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-        self._check_shapes()
-
-    def _check_shapes(self) -> None:
-        if self.time.ndim != 1 or self.time.size == 0:
-            raise ValueError(
-                f"time must have shape (T+1,) with T >= 0, got {self.time.shape}"
-            )
-        contacts = np.atleast_1d(self.contact_step).shape[0]
-        sizes: dict[int | str, int] = {
-            "state": self.time.size, "step": self.time.size - 1, "contact": contacts,
+        states = np.size(self.time)
+        sizes = {
+            "state": states, "step": states - 1, "contact": np.size(self.contact_step),
         }  # fmt: skip
         for name, (axis, tail) in _AXES.items():
-            shape = getattr(self, name).shape
-            for size, have in zip(tail, shape[1:], strict=False):
-                sizes.setdefault(size, have if isinstance(size, str) else size)
-            wanted = tuple(sizes.get(size, size) for size in (axis, *tail))
-            if shape != wanted or (name == "catheter" and shape[1] < 2):
-                raise ValueError(
-                    f"{name} must have shape {wanted} because time has "
-                    f"{self.time.size} entries and contact_step {contacts}, and at "
-                    f"least one joint and the head; got {shape}"
-                )
+            kinds, dtype = "biuf", np.float64
+            if name == "contact_step":
+                kinds, dtype = "iu", np.int64
+            shape = (sizes[axis], *(-1 if isinstance(n, str) else n for n in tail))
+            given = bounds.array(name, getattr(self, name), kinds, shape)
+            array = np.array(given, dtype)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
         steps = self.contact_step
         order = np.diff(steps, prepend=0, append=self.steps - 1)
         if steps.size and (order < 0).any():

@@ -1,7 +1,6 @@
 """Forces in drawings: colours, scales and text; places on a line."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 # Top of the colour scale, newtons. Published in-contact forces lie mostly within
 # 0-0.2 N with outliers above 0.4 N, so ordinary contacts use half the scale.
@@ -38,7 +37,7 @@ def force_scale(magnitude: np.ndarray) -> float:
     return next((top for top in _FORCE_SCALES if largest <= top), FORCE_COLOUR_MAX)
 
 
-def along(points: np.ndarray, way: ArrayLike) -> np.ndarray:
+def along(points: np.ndarray, way: np.ndarray) -> np.ndarray:
     """Return places (m, 3) on a line (n, 3) at ways (m,) from its first point."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     arc = np.append(0.0, np.cumsum(steps))

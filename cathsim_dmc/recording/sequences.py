@@ -181,7 +181,7 @@ def ends(shadow: Shadow) -> np.ndarray:
     back = shadow.points[..., ::-1, :]
     found = np.empty((*back.shape[:-2], 2, 3))
     for row in np.ndindex(back.shape[:-2]):
-        found[row] = along(back[row], [0.0, length])
+        found[row] = along(back[row], np.array([0.0, length]))
     return found
 
 

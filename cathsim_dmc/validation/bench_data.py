@@ -16,7 +16,6 @@ from cathsim_dmc.anatomy.parts import End, Inlet, Surface
 from cathsim_dmc.anatomy.scan.inlet import cut_open
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
 from cathsim_dmc.anatomy.scan.topology import merged
-from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.recording.geometry import along
 
 MESH, WIRES = "phantom.stl", "wires.json"
@@ -27,7 +26,6 @@ ARCH = "arch"  # tip region of a wire that is in no branch
 FOLDED = np.radians(150.0)
 _CHORD = 6e-3  # m, over which directions are taken
 _STEP = 1e-3  # m
-_ASTRAY = 30e-3  # m outside of the mesh, where no wire in it can be
 _CUTS = (0.0, 0.5e-3, 1e-3, 1.5e-3, 2e-3, 3e-3)  # m into the lumen, tried in turn
 _SIDES = {"superior": "inferior", "left_about": "right", "posterior_about": "front"}
 
@@ -144,8 +142,7 @@ def read(folder: str | Path) -> Bench:
         for key, opposite in _SIDES.items():
             axis = _unit(marks["patient_axes"], key)
             down[key.removesuffix("_about")], down[opposite] = axis, -axis
-        measure = SurfaceDepth(surface)
-        wires = tuple(_wire(row, measure, ends) for row in rows)
+        wires = tuple(_wire(row, ends) for row in rows)
     except (KeyError, TypeError) as error:
         raise ValueError(
             f"{folder / WIRES} is not as `bench_data.read` describes: {error!r}"
@@ -178,26 +175,12 @@ def _opened(
     )
 
 
-def _wire(
-    row: Mapping[str, Any], measure: SurfaceDepth, ends: Mapping[str, Any]
-) -> Wire:
+def _wire(row: Mapping[str, Any], ends: Mapping[str, Any]) -> Wire:
     name = f"{row['run']}, {row['frame']}"
     points = np.array(row["centreline_mm"], dtype=np.float64) / 1e3
-    seen, length = length_of(points), 1e-3 * float(row["inserted_length_mm"])
-    if not 0.0 < length <= seen + 2.0 * _STEP:
-        raise ValueError(
-            f"inserted_length_mm of {name} is {1e3 * length:g}, but its centreline is "
-            f"{1e3 * seen:.1f} mm long; give points from the tip to beyond the entry"
-        )
+    length = 1e-3 * float(row["inserted_length_mm"])
     inside = along(points, np.append(np.arange(0.0, length, _STEP), length))[::-1]
     inside[0] = _vector(row, "entry_point_mm") / 1e3
-    out = -float(measure(inside).min())
-    if not out <= _ASTRAY:
-        raise ValueError(
-            f"{name} is {1e3 * out:.0f} mm outside of the mesh (at most "
-            f"{1e3 * _ASTRAY:g} mm are branches that hang elsewhere); mesh and wires "
-            "must be in one frame, in mm"
-        )
     return Wire(
         name,
         bounds.choice(f"wire of {name}", row["wire"], KINDS),

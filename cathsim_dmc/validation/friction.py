@@ -167,11 +167,11 @@ def capstan(friction: float, wrap: float = np.pi) -> Capstan:
         RuntimeError: if the rod sticks to the drum.
     """
     angle, *pulled = _pulled(friction, wrap)
-    means = [
+    mean, free = (
         float(ratio[travel > _LEAD].mean())
         for travel, ratio in (pulled, _pulled(0.0, wrap)[1:])
-    ]
-    return Capstan(friction, angle, *means, *pulled)
+    )
+    return Capstan(friction, angle, mean, free, *pulled)
 
 
 def _pulled(
@@ -188,8 +188,7 @@ def _pulled(
     """
     length = 2 * _LEAD + _PULL + wrap * _AXIS
     fine = devices.Discretisation(working_length=length)
-    options = {"friction": friction, "stroke": _PULL}
-    rig = Rig("steerable_5f", fine, straight=True, **options)
+    rig = Rig("steerable_5f", fine, straight=True, stroke=_PULL, friction=friction)
     middle = np.array([_AXIS, 0, _PULL - rig.lengths.sum() + _LEAD])
     half = np.array([length, 0.02, length])  # around the whole rod
 

@@ -239,13 +239,14 @@ def in_half_circle(
 
 def checks() -> Iterator[Check]:
     """Pairs held in half a circle, and the axial force of a bend."""
-    for names, gaps, rotation, beyond in CASES:
-        found, expected = in_half_circle(names, gaps, rotation, beyond)
+    for case in CASES:
+        names, _, rotation, _ = case
+        found, expected = in_half_circle(*case)
         length = DeviceStack(names).link_lengths.sum()
         name = f"two rods in half a circle, {' in '.join(names)}"
         off = 100 * float(np.linalg.norm(found.end - expected.end)) / length
         yield Check.at_most(f"{name}, tip", off, TIP_BOUND, "% of its length")
-        off = float(np.degrees(np.abs(found.rotation - expected.rotation).max()))
+        off = np.degrees(np.abs(found.rotation - expected.rotation).max())
         turned = np.degrees(np.abs(expected.rotation - rotation).max())
         note = f"the bend turns an end by {turned:.0f}°"
         yield Check.at_most(f"{name}, rotation", off, ROTATION_BOUND, "°", note)

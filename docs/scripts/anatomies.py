@@ -16,7 +16,8 @@ from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
-from cathsim_dmc.validation import views, wall
+from cathsim_dmc.pictures.figure import anatomy_figure, draw_anatomy
+from cathsim_dmc.validation import wall
 
 ROOT = Path(__file__).parents[1]
 PAGE, IMAGES = ROOT / "anatomies.md", ROOT / "images"
@@ -174,9 +175,9 @@ def gallery():
     seeds = [*arch.arch_set("test")[:8], *arch.arch_set("test_variants")[:4]]
     for place, seed in enumerate(seeds):
         anatomy = arch.build_seed(seed)
-        for side in (0, 1):
+        for side, view in enumerate(("front", "left")):
             ax = axes[place // 3, 2 * (place % 3) + side]
-            views.draw_view(ax, anatomy, views.VIEWS[side])
+            draw_anatomy(ax, anatomy, view)
             ax.set_xlabel("")
             ax.set_ylabel("")
             ax.tick_params(labelsize=6)
@@ -187,7 +188,7 @@ def gallery():
 def main():
     anatomies = {name: phantoms.load(name) for name in phantoms.PHANTOMS}
     for name in phantoms.MEASURED:
-        views.draw(anatomies[name], IMAGES / f"anatomy_{name}.png")
+        style.save(anatomy_figure(anatomies[name]), IMAGES / f"anatomy_{name}.png")
     gallery()
     blocks = {
         "shapes": shapes(anatomies),

@@ -35,8 +35,7 @@ from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.pictures import record
-from cathsim_dmc.pictures.figure import VIEWS
-from cathsim_dmc.pictures.translucent import ParallelProjection, glass
+from cathsim_dmc.pictures.figure import background
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -153,11 +152,8 @@ def write_scene(name: str, out: Path) -> None:
     write_mjcf(name, out, seed=SEED)
     surface = suite.make_task(name).scene.anatomy.surface
     views = {"glass": [], "fluoroscopy": _fluoroscopy(surface, out)}
-    for view, (azimuth, _) in VIEWS.items():
-        projection = ParallelProjection.of(
-            surface.vertices, azimuth=azimuth, height=GLASS_HEIGHT
-        )
-        drawn = glass(surface.vertices, surface.faces, projection)
+    for view in ("front", "left"):
+        projection, drawn = background(surface, view, GLASS_HEIGHT)
         rows, columns = projection.shape
         files = {}
         for layer in ("behind", "glaze"):

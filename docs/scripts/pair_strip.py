@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from cathsim_dmc import policies, suite
-from cathsim_dmc.pictures.figure import DEVICES, VIEWS, Picture, background, draw_scene
+from cathsim_dmc.pictures.figure import DEVICES, Picture, background, draw_scene
 from cathsim_dmc.pictures.moment import Moment
 
 IMAGES = Path(__file__).parents[1] / "images"
@@ -77,7 +77,7 @@ def _titled(env, words: str) -> Moment:
 
 def strip(snapshots: Sequence[Moment], path: Path) -> None:
     """Draws snapshots of one anatomy side by side, from the front."""
-    projection, picture = background(snapshots[0].surface, VIEWS["front"][0], 700)
+    projection, picture = background(snapshots[0].surface, "front", 700)
     left, right, low, high = projection.extent_mm
     low += BELOW * (high - low)
     width = HEIGHT * (right - left) / (high - low)
