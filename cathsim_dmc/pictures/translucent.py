@@ -62,7 +62,7 @@ class ParallelProjection:
         axes = np.array([right, up])
         flat = vertices @ axes.T
         low, high = flat.min(0) - margin, flat.max(0) + margin
-        return cls(*axes, low, high, height / (high[1] - low[1]))
+        return cls(axes[0], axes[1], low, high, height / (high[1] - low[1]))
 
     @property
     def towards(self) -> np.ndarray:
