@@ -47,6 +47,11 @@ def inside(
     return ijk[found > above], found[found > above]
 
 
+def nearest_cell(cells: np.ndarray, place: np.ndarray) -> tuple[int, ...]:
+    """The cell of (n, 3) that is nearest to a place (3,) in cells."""
+    return tuple(cells[np.square(cells - place).sum(axis=1).argmin()].tolist())
+
+
 class LumenDistance:
     """Length of the shortest way inside the lumen to a target, as a lattice.
 
@@ -80,7 +85,10 @@ class LumenDistance:
             cells, _ = inside(depth, self._low, shape, spacing)
             lumen = np.zeros(shape, bool)
             lumen[tuple(cells.T)] = True
-            start, end = (self._nearest(cells, point) for point in (target, origin))
+            start, end = (
+                nearest_cell(cells, (point - self._low) / spacing)
+                for point in (target, origin)
+            )
             field = graph.MCP_Geometric(np.where(lumen, 1.0, -1.0))
             costs, _ = field.find_costs([start])
             if np.isfinite(costs[end]):
@@ -98,10 +106,6 @@ class LumenDistance:
         )
         self._ways = (costs * spacing)[tuple(nearest)].astype(np.float32)
         self._own = np.where(self._inside, self._ways, 0.0)
-
-    def _nearest(self, cells: np.ndarray, point: np.ndarray) -> tuple[int, ...]:
-        offset = self._low + self._spacing * cells - point
-        return tuple(cells[np.vecdot(offset, offset).argmin()].tolist())
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Length (...) of the ways from points (..., 3), m.

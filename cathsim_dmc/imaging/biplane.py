@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cathsim_dmc.anatomy.centreline import arc_lengths
+from cathsim_dmc.anatomy.geodesic import nearest_cell
 from cathsim_dmc.imaging import biplane_loops as loops
 from cathsim_dmc.imaging import materials
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
@@ -148,20 +149,14 @@ class Biplane:
             margin = 0.4 * HULL_SPACING
             cost = (_WIDE / np.clip(depth, margin, _WIDE)) ** 2
             cost = np.where(depth > _OUTSIDE, cost, -1.0)
-            end = _nearest(cost > 0.0, (goal - low) / HULL_SPACING)
+            end = nearest_cell(np.argwhere(cost > 0.0), (goal - low) / HULL_SPACING)
             graph = MCP_Geometric(cost)
             reached = graph.find_costs([end])[0]
-            self._goal, self._graph = (goal, np.isfinite(reached)), graph
-        begin = _nearest(self._goal[1], (start - low) / HULL_SPACING)
+            self._goal = goal, np.argwhere(np.isfinite(reached))
+            self._graph = graph
+        begin = nearest_cell(self._goal[1], (start - low) / HULL_SPACING)
         path = np.array(self._graph.traceback(begin))[::-1]
         return low + path * HULL_SPACING
-
-
-def _nearest(allowed: np.ndarray, place: np.ndarray) -> tuple[int, ...]:
-    """Indices of the nearest point of a grid that is allowed, to a place in indices."""
-    indices = np.argwhere(allowed)
-    chosen = indices[np.square(indices - place).sum(axis=1).argmin()]
-    return tuple(chosen.tolist())
 
 
 @cache

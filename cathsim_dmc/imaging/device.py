@@ -189,28 +189,6 @@ def _bends(joints, link):
 
 
 @compiled
-def curve(joints, pieces):
-    """Smooth curve ((n - 1) * pieces + 1, 3) through joints (n, 3), a cubic on a link.
-
-    Joints are finite and apart.
-    """
-    points = np.empty(((len(joints) - 1) * pieces + 1, 3))
-    points[-1] = joints[-1]
-    for link in range(len(joints) - 1):
-        a, b, c, d, e, f = _bends(joints, link)
-        x, y, z, _ = _chord(joints, link)
-        for piece in range(pieces):
-            t = piece / pieces
-            row = points[link * pieces + piece]
-            sag = t * (1.0 - t)
-            behind, before = sag * (1.0 - t), sag * t
-            row[0] = joints[link, 0] + t * x + behind * a - before * d
-            row[1] = joints[link, 1] + t * y + behind * b - before * e
-            row[2] = joints[link, 2] + t * z + behind * c - before * f
-    return points
-
-
-@compiled
 def _add_devices(images, cameras, radii, focal, material):
     """Adds devices to images (B, rows, columns); returns the widest radius in view, px.
 

@@ -11,10 +11,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from scipy.interpolate import CubicSpline
 
 from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.imaging import FluoroscopyOptions
-from cathsim_dmc.imaging.device import curve
 from cathsim_dmc.pictures.moment import Moment, fluoroscope_of, xray
 from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.recording.geometry import force_colours, force_text
@@ -215,7 +216,10 @@ def draw_scene(
 
 
 def _draw_device(axes: Any, moment: Moment, projection: ParallelProjection) -> None:
-    line = projection.flat_mm(curve(np.float64(moment.device), _PIECES))
+    joints = np.asarray(moment.device, np.float64)
+    way, last = arc_lengths(joints), len(joints) - 1
+    fine = np.interp(np.linspace(0, last, last * _PIECES + 1), np.arange(last + 1), way)
+    line = projection.flat_mm(CubicSpline(way, joints)(fine))
     # Thicker than in truth, by half: as printed it would be two points wide.
     height = 72.0 * axes.get_position().height * axes.figure.get_figheight()  # points
     width = 3e3 * np.repeat(moment.radius, _PIECES) * height / np.ptp(axes.get_ylim())

@@ -24,9 +24,9 @@ from cathsim_dmc.tasks.start import StartPosture
 
 # Of mjStatistic; the mean inertia scales the tolerance of the solver.
 _STATISTICS = ("meaninertia", "meanmass", "meansize", "extent", "center")
-# Arrays of the mesh of the surface, which stays that of the first anatomy, and of the
-# tree of its triangles, which follows those of the bodies.
-_OF_MESH, _TREES = "mesh_", "bvh_"
+# Arrays of texts, and of the mesh of the surface, which is that of the first anatomy;
+# and of the tree of its triangles, which follows those of the bodies.
+_APART, _TREES = ("_", "name", "path", "text", "mesh_"), "bvh_"
 
 Fields = dict[str, np.ndarray]
 
@@ -43,13 +43,7 @@ class Case:
         fluoroscopy: FluoroscopyOptions | None = None,
         fields: Fields | None = None,
     ):
-        """Lets the device settle in the anatomy.
-
-        Args:
-            fluoroscopy: Set-up of the angiography machine, None for no machine.
-            fields: What `write` writes beside the statistics, by its name in MuJoCo's
-                model.
-        """
+        """Lets the device settle; `write` writes the fields into a model."""
         self.scene, self.objective = scene, objective
         index = ModelIndex(model, scene.catheter, scene.robot)
         if isinstance(scene.catheter, DeviceStack):
@@ -124,8 +118,10 @@ def _differences(
     """What of a model differs from the host, and its statistics."""
     names = f"{scene.anatomy.name!r} cannot take turns with {first.anatomy.name!r}"
     fields: Fields = {}
-    for name in _array_names(host):
+    for name in dir(host):
         room, value = getattr(host, name), getattr(model, name)
+        if name.startswith(_APART) or not isinstance(room, np.ndarray):
+            continue
         size = len(value) if name.startswith(_TREES) else len(room)
         if value.shape != (size, *room.shape[1:]) or size > len(room):
             raise ValueError(
@@ -141,12 +137,3 @@ def _differences(
     if ours != theirs:
         raise ValueError(f"{names}: {theirs} are not {ours}; give the same goals")
     return fields
-
-
-def _array_names(model: mujoco.MjModel) -> list[str]:
-    return [
-        name
-        for name in dir(model)
-        if not name.startswith(("_", "name", "path", "text", _OF_MESH))
-        and isinstance(getattr(model, name), np.ndarray)
-    ]

@@ -167,9 +167,9 @@ class ArchParameters:
         for name, bend in bends.items():
             if bend < 1.25 * widest:
                 raise ValueError(
-                    f"the {name} bends with a radius of {bend:g} m; it must be at "
-                    f"least 1.25 times the widest lumen radius ({widest:g} m). Enlarge "
-                    "arch_radius and arch_height, or reduce the limb's bend."
+                    f"the {name} bends with a radius of {bend:g} m, less than 1.25 "
+                    f"times that of the lumen, {widest:g} m. Enlarge arch_radius and "
+                    "arch_height, or reduce the limb's bend."
                 )
 
     def _check_spacings(self) -> None:
