@@ -34,15 +34,11 @@ def tree():
 
 
 def brute_force_distance(line, points):
-    """Distance to the polyline by plain point-to-segment geometry, one at a time."""
-    out = []
-    for p in points:
-        best = np.inf
-        for a, b in zip(line.points[:-1], line.points[1:], strict=True):
-            t = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
-            best = min(best, np.linalg.norm(p - a - t * (b - a)))
-        out.append(best)
-    return np.array(out)
+    """Distance to the polyline by plain point-to-segment geometry."""
+    a, way = line.points[:-1], np.diff(line.points, axis=0)
+    offset = points[:, None] - a
+    t = np.clip(np.vecdot(offset, way) / np.vecdot(way, way), 0.0, 1.0)
+    return np.linalg.norm(offset - t[..., None] * way, axis=-1).min(axis=1)
 
 
 def test_interpolation_on_a_straight_line():

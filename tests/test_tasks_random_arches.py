@@ -15,7 +15,6 @@ from cathsim_dmc.tasks.rows import part
 POOL = 3
 STEPS = 55  # past the first look for an escape
 SEED = 10
-TASKS = ("arch_bca", "femoral_arch_lcca")
 MOTION = {"friction": (0.02, 0.1), "stiffness": (0.8, 1.2), "delay": (0, 2)}
 NUMBERS = ("internal", "tracking", "route", "goal", "force")
 
@@ -184,18 +183,6 @@ def test_the_expert_follows_the_arch_of_each_simulation(plain_pair):
             own, states[i] = plan.decide(plan.settings, states[i], *seen)
             np.testing.assert_array_equal(action[i], own[0])
         simulation.step(action)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_tasks_are_registered_and_have_the_common_shape(task, shared_environment):
-    task = suite.make_task(task, pool=1, arches="test", first=0)
-    assert task.scene.anatomy.name == names(0, 1, "test")[0]
-    place = task.scene.placement
-    route = task.objective.route.length
-    assert place.working_length > route + 0.04
-    shapes = shared_environment("type1_lcca").task.observation_specs
-    for key, spec in task.observation_specs.items():
-        assert spec.shape == shapes[key].shape
 
 
 def test_any_arch_takes_accesses_and_branches_in_turn():

@@ -65,14 +65,15 @@ def placed(
             line = tree.vessel(goal.vessel).centreline
             found[key] = replace(goal, arc_length=line.locate(goal.position))
 
-    def end(name: str, arc: float, side: float, is_open: bool) -> End:
+    ends = []
+    for name, arc, side in (
+        (tree.root.name, 0.0, -1.0),
+        *((name, math.inf, 1.0) for name in tree.vessels),
+    ):
         place = tree.vessel(name).centreline.at(arc)
-        outward = side * place.tangent
-        return End(name, place.position, outward, float(place.radius), is_open)
-
-    ends = [end(tree.root.name, 0.0, -1.0, at_first)]
-    for name in tree.vessels:
-        ends.append(end(name, math.inf, 1.0, name == inlet.vessel and not at_first))
+        is_open = name == inlet.vessel and at_first == (side < 0.0)
+        outward, radius = side * place.tangent, float(place.radius)
+        ends.append(End(name, place.position, outward, radius, is_open))
     entry = next(end for end in ends if end.open)
     opening = Inlet(entry.vessel, entry.position, -entry.direction, entry.radius)
     return tree, tuple(ends), opening, found

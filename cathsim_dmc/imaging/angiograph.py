@@ -49,15 +49,11 @@ class Angiograph:
         """Fluoroscopes of every plane, frontal first."""
         angles, options = (deviation.primary, deviation.secondary), self.options
         if angles not in self._views:
+            names = "kerma", "blur", "gain", "roadmap"
+            own = {name: getattr(options, name) for name in names}
             self._views[angles] = tuple(
                 Fluoroscope.from_surface(
-                    self._surface,
-                    arm,
-                    contrast=options.iodine,
-                    kerma=options.kerma,
-                    blur=options.blur,
-                    gain=options.gain,
-                    roadmap=options.roadmap,
+                    self._surface, arm, contrast=options.iodine, **own
                 )
                 for arm in options.carms(self._surface.vertices, angles)
             )

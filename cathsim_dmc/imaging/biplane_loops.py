@@ -211,13 +211,11 @@ def trace(images, matrices, directions, way, full, enough, line):
     """Follows a device from the marker at its tip back to where it is lost.
 
     Args:
-        images: (2, rows, columns), optical depths of the device.
+        images: (2, rows, columns), optical depths; `full` where the shaft crosses.
         matrices: (2, 3, 4), see `CArm.matrix`.
         directions: (D, 3), unit vectors all around.
-        way: from point to point, m.
-        full: optical depth of a pixel that the shaft crosses.
         enough: number of points with which no other first direction is tried.
-        line: (P, 3), written: the marker, then points every `way` behind it, m.
+        line: (P, 3), written: the marker, then points every `way` (m) behind it, m.
 
     Returns:
         Number of points found, 0 without a marker.

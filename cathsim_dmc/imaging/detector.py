@@ -88,15 +88,10 @@ def _count(frame, quanta, draw, quantiles, skew, out):
 
 
 def blurred(signal: ArrayLike, sigma: float) -> np.ndarray:
-    """Signal spread by a Gaussian of `sigma` pixels; edges continue outwards.
+    """Signal (..., rows, columns) spread by a Gaussian of `sigma` px, float32.
 
-    Args:
-        signal: (..., rows, columns).
-        sigma: standard deviation, px; below 0.2 px, where a neighbour would get less
-            than 1e-5, the signal is returned as it is.
-
-    Returns:
-        (..., rows, columns) float32.
+    Edges continue outwards. Below 0.2 px, where a neighbour would get less than 1e-5,
+    the signal is returned as it is.
     """
     out = np.asarray(signal, dtype=np.float32)
     if sigma < 0.2:
@@ -110,12 +105,7 @@ def blurred(signal: ArrayLike, sigma: float) -> np.ndarray:
 def grey(signal: ArrayLike, gain: float = GAIN) -> np.ndarray:
     """8-bit grey levels: round(255 gain signal), limited to 0..255; dark = opaque.
 
-    Args:
-        signal: (..., rows, columns), 1 behind plain tissue.
-        gain: share of full white given to signal 1.
-
-    Returns:
-        (..., rows, columns) uint8.
+    Signal and levels are (..., rows, columns), signal 1 is behind plain tissue.
     """
     level = np.asarray(signal, dtype=np.float32) * np.float32(255.0 * gain)
     level += np.float32(0.5)

@@ -115,10 +115,9 @@ class Fluoroscope:
         for shadow in shadows[1:]:
             depth += device_attenuation(self.carm, shadow)
         frames = depth.reshape(-1, *self.carm.resolution)
-        states = random_states
-        if isinstance(states, np.random.RandomState):
-            states = [states] * len(frames)
-        return self._developed(frames, states).reshape(*depth.shape, 1)
+        if isinstance(random_states, np.random.RandomState):
+            random_states = [random_states] * len(frames)
+        return self._developed(frames, random_states).reshape(*depth.shape, 1)
 
     def _developed(
         self, depths: np.ndarray, states: Sequence[np.random.RandomState] | None
@@ -140,15 +139,15 @@ class Fluoroscope:
 
     def device_mask(self, shadows: Sequence[Shadow]) -> np.ndarray:
         """Pixels (..., rows, columns) bool that show one of several devices."""
-        return np.any([self._shows(shadow) for shadow in shadows], axis=0)
-
-    def _shows(self, shadow: Shadow) -> np.ndarray:
-        plain = replace(shadow, mu=1.0, marker_mu=None)
-        radii = np.asarray(shadow.radius, dtype=np.float64)
-        if radii.ndim == np.ndim(shadow.points) - 1:
-            # A chain of unlike links is seen where its thinnest link would be.
-            radii = np.asarray(radii.min(axis=-1))
-        arm, diameter = self.carm, 2.0 * radii[..., None, None]
-        width = diameter * arm.focal_length / arm.source_isocentre
-        least = MASK_SHARE * diameter * np.minimum(width, 1.0)
-        return device_attenuation(arm, plain) >= least
+        shows = []
+        for shadow in shadows:
+            plain = replace(shadow, mu=1.0, marker_mu=None)
+            radii = np.asarray(shadow.radius, dtype=np.float64)
+            if radii.ndim == np.ndim(shadow.points) - 1:
+                # A chain of unlike links is seen where its thinnest link would be.
+                radii = np.asarray(radii.min(axis=-1))
+            diameter = 2.0 * radii[..., None, None]
+            width = diameter * self.carm.focal_length / self.carm.source_isocentre
+            least = MASK_SHARE * diameter * np.minimum(width, 1.0)
+            shows.append(device_attenuation(self.carm, plain) >= least)
+        return np.any(shows, axis=0)

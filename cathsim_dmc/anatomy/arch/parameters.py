@@ -181,10 +181,8 @@ class ArchParameters:
         elif self.aberrant is not None:
             raise ValueError("an arch is bovine or has an aberrant, not both.")
         elif self.lcca.radius > 0.8 * self.bca.radius:
-            raise ValueError(
-                f"a bovine LCCA of radius {self.lcca.radius:g} m needs a BCA of "
-                f"radius {self.lcca.radius / 0.8:g} m or more."
-            )
+            least = self.lcca.radius / 0.8
+            raise ValueError(f"a bovine LCCA needs a BCA of radius {least:g} m or more")
         bounds.number("bca_lcca_spacing", self.bca_lcca_spacing, low, high, "m")
         pairs = {"lcca_lsa_spacing": (before_lsa, self.lsa)}
         if self.aberrant is not None:
