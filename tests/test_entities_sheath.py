@@ -209,18 +209,6 @@ def test_nodes_of_the_chain_lie_on_an_arc(bent_rig, turn):
     np.testing.assert_allclose(radius, BEND, atol=0.3e-3)
 
 
-def test_the_chain_advances_along_the_line(bent_rig):
-    line = beyond(bend(0.2))
-    mujoco.mj_resetData(bent_rig.model, bent_rig.data)
-    start = bent_rig.model.joint("catheter/insertion").qposadr[0]
-    bent_rig.data.qpos[start] = 0.03
-    bent_rig.pose(joints_along(bent_rig.lengths, line, advance=0.03))
-    bent = bent_rig.nodes[-1]
-    np.testing.assert_allclose(bent[2], 0.24, atol=1e-3)
-    expected = LENGTH + 0.03 - 0.2 - BEND * np.pi / 2 + BEND
-    assert bent[0] == pytest.approx(expected, abs=2e-3)
-
-
 def test_lines_that_no_chain_follows():
     line = straight(0.1) + [0, 0, 0.1]
     with pytest.raises(ValueError, match="ends before link 2 of 3"):

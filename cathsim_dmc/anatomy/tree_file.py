@@ -60,11 +60,8 @@ class TreeFile:
 
 def read_tree(path: str | os.PathLike[str]) -> TreeFile:
     """Read a tree file; ValueError names the entry that is not as described."""
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no file {path}; give a vessel tree in JSON.")
     try:
-        return parse_tree(json.loads(path.read_text(encoding="utf-8")))
+        return parse_tree(json.loads(Path(path).read_text(encoding="utf-8")))
     except (ValueError, RecursionError) as error:  # of JSON, or of its entries
         raise ValueError(f"{path}: {error}") from error
 
