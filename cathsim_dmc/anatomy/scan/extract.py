@@ -128,7 +128,7 @@ def stump(ways: Ways, ends: Sequence[FreeEnd]) -> FreeEnd | None:
     piece = np.flatnonzero(beyond & (label == sizes.argmax()))
     if len(piece) < STUMP:
         return None
-    last = piece[cKDTree(places).query(ways.points[piece])[0].argmax()]
+    last = int(piece[cKDTree(places).query(ways.points[piece])[0].argmax()])
     radius = float(ways.depth[ways.around(last, END_SEARCH)].max())
     return FreeEnd(ways.points[last], radius, radius)
 
