@@ -56,7 +56,8 @@ def compared(anatomy: Anatomy, tree: VesselTree, back: np.ndarray) -> dict:
     for name, vessel in anatomy.tree.vessels.items():
         if name != anatomy.tree.root.name:
             line = vessel.centreline
-            s = np.arange(min(vessel.ostium + CLEAR, line.length), line.length, 1e-3)
+            start = min(vessel.ostium + CLEAR, line.length - 1e-3)
+            s = np.arange(start, line.length, 1e-3)
             found[name] = whose(tree, line.at(s).position @ back.T)
     for name, (first, last) in found.items():
         if name in ANATOMICAL and name not in (first, last):

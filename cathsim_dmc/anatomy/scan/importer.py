@@ -151,8 +151,6 @@ def _sizes(tree: VesselTree) -> list[str]:
 def _tree(field, curves, places, root, changes, note) -> tuple[VesselTree, bool]:
     """The tree of given curves, or of computed ones; whether it starts at an end."""
     ways = Ways(field)
-    for pinch in ways.pinches:
-        note(f"the lumen is pinched to a slit at {in_mm(pinch)}; vessels go on beyond")
     ends, right, drawn = extract.free_ends(ways), frozenset(), bool(curves)
     entry = extract.plan_inlet(ways, ends, list(curves.values()), places.get("inlet"))
     if not drawn:

@@ -22,7 +22,7 @@ SIZE = (15e-3, 2.5)
 # cerebral artery and that of an aneurysm of the aorta.
 WIDTH = (1.2e-3, 35e-3)
 TYPICAL = 7e-3  # m, that radius where two units are possible
-_SAMPLES = 3000
+_SAMPLES = 1000
 
 
 class Lumen(NamedTuple):

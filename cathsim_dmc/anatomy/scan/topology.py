@@ -119,9 +119,8 @@ def border_loops(faces: np.ndarray) -> list[np.ndarray]:
     import networkx
 
     pairs = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    graph = networkx.DiGraph(map(tuple, pairs.tolist()))
-    graph.remove_edges_from([(a, b) for a, b in graph.edges if graph.has_edge(b, a)])
-    graph.remove_nodes_from(list(networkx.isolates(graph)))
+    key, back = pairs @ (count := faces.max() + 1, 1), pairs @ (1, count)
+    graph = networkx.DiGraph(pairs[~np.isin(key, back)].tolist())
     loops = []
     with contextlib.suppress(networkx.NetworkXNoCycle):
         while True:

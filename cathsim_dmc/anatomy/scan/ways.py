@@ -1,7 +1,6 @@
 """Shortest and deepest ways through a lumen, on a lattice of its inside."""
 
-from functools import cache
-from itertools import combinations
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -18,12 +17,6 @@ LATTICE = 1e-3  # m, spacing of the lattice on which ways are searched
 CELL = 0.2e-3  # m by which depths of its points are less than radii, in the mean
 CORRIDOR = 2e-3  # m, distance from a drawn curve at which a way costs twice
 SHALLOW = 0.2e-3  # m, lattice points nearer to the wall are no way
-# A narrow place splits that lattice. There a finer one joins the pieces again.
-FINE = 0.2e-3  # m, its spacing
-FINE_SHALLOW = 0.02e-3  # m
-REACH = 6e-3  # m, gap between two pieces that is searched
-PIECE = 30  # lattice points; smaller pieces are noise of the lattice
-PLACES = 4  # at which two pieces are tried to be joined
 NEAR = 2.5e-3  # m, of a place in the lumen to the lattice, if it belongs to it
 
 
@@ -36,7 +29,6 @@ class Ways:
         links: (e, 2) rows of neighbouring points.
         main: (n,) bool, in the largest connected piece.
         nodes: (m,) rows of the points in that piece.
-        pinches: (k, 3) m, where pieces were joined through a narrow place.
     """
 
     def __init__(self, field: SurfaceDepth):
@@ -56,7 +48,6 @@ class Ways:
             links.append(np.stack([found, at[found]], axis=1))
             lengths.append(np.full(len(found), LATTICE * np.linalg.norm(offset)))
         self.links, self._lengths = np.concatenate(links), np.concatenate(lengths)
-        self.pinches = self._join(field)
         # Sorting the links takes longer than the searches: once is enough.
         self._order = np.lexsort(self.links.T[::-1])
         rows, count = self.links[self._order, 0], len(self.points)
@@ -68,64 +59,21 @@ class Ways:
         self.lengths_from = cache(self._lengths_from)
         self.deepest_from = cache(self._deepest_from)
 
-    def _join(self, field: SurfaceDepth) -> np.ndarray:
-        """Connect pieces of the lattice through places narrower than its cells."""
-        label, points = groups(len(self.points), self.links), self.points
-        pinches = []
-        for pair in combinations(np.flatnonzero(np.bincount(label) >= PIECE), 2):
-            one, other = (np.flatnonzero(label == piece) for piece in pair)
-            gap, _ = cKDTree(points[one]).query(
-                points[other], distance_upper_bound=REACH
-            )
-            # Several places: the nearest may lie across the wall between two.
-            for _ in range(PLACES):
-                middle = points[other[gap.argmin()]]
-                if not np.isfinite(gap.min()):
-                    break
-                if self._bridge(field, middle, one, other):
-                    pinches.append(middle)
-                    break
-                gap[np.linalg.norm(points[other] - middle, axis=1) <= REACH] = np.inf
-        return np.array(pinches).reshape(-1, 3)
-
-    def _bridge(self, field, middle, one, other) -> bool:
-        """Add the deepest fine way near ``middle`` between nodes of two pieces."""
-        from skimage.graph import MCP_Geometric
-
-        half = round((REACH + 1e-3) / FINE)
-        cells = np.indices((2 * half + 1,) * 3) - half
-        depth = field(middle + FINE * np.moveaxis(cells, 0, -1))
-        price = (FINE / np.maximum(depth, FINE_SHALLOW)) ** 2
-        price[depth <= FINE_SHALLOW] = -1.0  # no way
-        ends = []
-        for nodes in (one, other):
-            at = np.rint((self.points[nodes] - middle) / FINE).astype(int) + half
-            fits = ((at >= 0) & (at <= 2 * half)).all(axis=1)
-            ends.append(dict(zip(map(tuple, at[fits]), nodes[fits], strict=True)))
-        if not all(ends):
-            return False
-        search = MCP_Geometric(price)
-        cost, _ = search.find_costs(list(ends[0]), list(ends[1]), find_all_ends=False)
-        last = min(ends[1], key=lambda cell: cost[cell])
-        if not np.isfinite(cost[last]):
-            return False
-        way = search.traceback(last)
-        inner = np.array(way[1:-1]).reshape(-1, 3)
-        fresh = len(self.points) + np.arange(len(inner))
-        chain = np.array([ends[0][way[0]], *fresh, ends[1][last]])
-        self.points = np.concatenate([self.points, middle + FINE * (inner - half)])
-        self.depth = np.concatenate([self.depth, depth[tuple(inner.T)]])
-        # From the lower row to the higher one, as all links.
-        links = np.sort(np.stack([chain[:-1], chain[1:]], axis=1), axis=1)
-        gaps = np.linalg.norm(np.diff(self.points[chain], axis=0), axis=1)
-        self.links = np.concatenate([self.links, links])
-        self._lengths = np.concatenate([self._lengths, gaps])
-        return True
-
     def _graph(self, weights: np.ndarray) -> csr_matrix:
         """The lattice's links with ``weights`` (e,), in one direction."""
         shape, order = (len(self.points),) * 2, self._order
         return csr_matrix((weights[order], self.links[order, 1], self._starts), shape)
+
+    @cached_property
+    def _near(self) -> csr_matrix:
+        """The links with their lengths."""
+        return self._graph(self._lengths)
+
+    @cached_property
+    def _deep(self) -> csr_matrix:
+        """The links with what they cost on the deepest ways."""
+        depth = self.depth[self.links].mean(axis=1)
+        return self._graph(self._lengths * (LATTICE / depth) ** 4)
 
     def node(self, position: np.ndarray) -> int:
         """Lattice point nearest to ``position`` (3,) m in the largest piece."""
@@ -134,7 +82,7 @@ class Ways:
     def around(self, node: int, radius: float) -> np.ndarray:
         """Rows (m,) of the points in a ball (m) that are joined to its middle in it."""
         near = self.nodes[self._lookup.query_ball_point(self.points[node], radius)]
-        part = self._graph(self._lengths)[near][:, near]
+        part = self._near[near][:, near]
         label = connected_components(part, directed=False)[1]
         return near[label == label[near == node]]
 
@@ -144,7 +92,7 @@ class Ways:
 
     def _lengths_from(self, node: int) -> np.ndarray:
         """Length (n,) m of the shortest way from ``node`` to every point."""
-        return dijkstra(self._graph(self._lengths), directed=False, indices=node)
+        return dijkstra(self._near, directed=False, indices=node)
 
     def _deepest_from(self, node: int) -> np.ndarray:
         """Predecessors (n,) on the deepest ways from ``node``.
@@ -153,9 +101,7 @@ class Ways:
         does (Poiseuille): a way keeps to the middle, and in a ring of vessels it
         takes the artery, not the thin communicating one.
         """
-        depth = self.depth[self.links].mean(axis=1)
-        graph = self._graph(self._lengths * (LATTICE / depth) ** 4)
-        return _before(graph, node)
+        return _before(self._deep, node)
 
     def along(self, curve: np.ndarray, name: str) -> np.ndarray:
         """Deepest way (m, 3) near ``curve`` (n, 3) m, from its start to its end.
@@ -173,7 +119,7 @@ class Ways:
                 raise ValueError(
                     f"the {which} of centreline {name!r} lies in a part of the lumen "
                     "that is closed off: between it and the rest the lumen is narrower "
-                    f"than {2 * FINE * 1e3:g} mm. Open the vessel in the segmentation, "
+                    f"than {LATTICE * 1e3:g} mm. Open the vessel in the segmentation, "
                     "or leave this branch out."
                 )
         far = 5.0 * CORRIDOR
