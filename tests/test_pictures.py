@@ -14,7 +14,7 @@ from cathsim_dmc.pictures.figure import scene_figure
 from cathsim_dmc.pictures.moment import Moment
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.geometry import force_scale, force_text
+from cathsim_dmc.recording.geometry import force_colours, force_scale, force_text
 
 TASK = "simple1_bca"
 
@@ -194,6 +194,10 @@ def test_steps_beyond_the_episode_are_refused(pushed):
 def test_the_scale_of_forces_holds_them_all_and_their_text_has_three_digits():
     scales = [force_scale(np.array(each)) for each in ([], [0.05], [0.01, 0.06], [3.0])]
     assert scales == [0.02, 0.05, 0.1, 0.4]
+    lightness = force_colours(np.linspace(0, 0.5, 30), 0.4) @ [0.2126, 0.7152, 0.0722]
+    assert (np.diff(lightness[:25]) < 0).all() and (
+        lightness[25:] == lightness[-1]
+    ).all()
     texts = [force_text(each) for each in (0.0, 0.01234, 0.9, 1.1749)]
     assert texts == ["0 mN", "12.3 mN", "900 mN", "1.17 N"]
 

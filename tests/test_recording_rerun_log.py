@@ -242,16 +242,6 @@ def test_two_planes_are_two_images(tmp_path):
         np.testing.assert_allclose(image, frames[3, ..., plane], atol=2)
 
 
-def test_reading_episodes_needs_no_rerun():
-    code = (
-        "import sys; import cathsim_dmc.analysis.force_statistics, "
-        "cathsim_dmc.analysis.heatmap; "
-        "print({'rerun', 'matplotlib', 'dm_control', 'torch'} & set(sys.modules))"
-    )
-    found = subprocess.check_output([sys.executable, "-c", code], text=True)
-    assert found.strip() == "set()"
-
-
 def test_a_living_vessel_is_kept_and_its_wall_moves_in_the_file(tmp_path):
     env = suite.load("cathsim", "simple1_bca", {"vessel": "living", "random": 0})
     recorder = EpisodeRecorder(env)

@@ -24,12 +24,6 @@ def test_a_device_turned_in_a_bend_lags_by_the_losses_of_its_material(speed):
     assert np.degrees(abs(lag - expected)) < damping.SPIN_BOUND
 
 
-@pytest.mark.parametrize("on_joint", [True, False])
-def test_three_point_bending_is_that_of_the_beam(on_joint):
-    ratio = damping.three_point(0.06, damping.SPAN_LINK, on_joint)
-    assert ratio == pytest.approx(1.0, abs=damping.SPAN_BOUND / 100)
-
-
 def test_drag_is_that_of_the_correlation_against_the_velocity_of_the_blood():
     rig = Rig("diagnostic_5f_j", rotation=True)
     blood = StillBlood()

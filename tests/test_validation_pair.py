@@ -6,7 +6,7 @@ import pytest
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.devices import Discretisation, get
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
-from cathsim_dmc.validation import pair, pressed, rod, sliding, two_rods
+from cathsim_dmc.validation import pair, pressed, rod, two_rods
 from cathsim_dmc.validation.rig import Rig
 
 
@@ -61,30 +61,6 @@ def test_depth_and_law_agree_with_the_iteration_in_which_they_settle():
     assert law.max() < 1.7
     depth, edge = growth((-1 / 0.003**2, -2 / 0.003), (0.7, 0.999, 0.0003, 0.5, 1))
     assert depth[np.argmax(edge > 2)] == pytest.approx(0.23e-3, abs=0.01e-3)
-
-
-@pytest.mark.slow
-def test_a_jammed_pair_lies_still():
-    push, penetration, least, largest = pressed.jam(pair.PAIR)
-    assert push > 1.0 and penetration < 0.3e-3
-    assert least > 0.5 and largest < 5.0
-
-
-@pytest.mark.slow
-def test_buckling_load_of_the_pair():
-    load = rod.buckling("sliding", device=pair.PAIR)
-    assert load.critical == pytest.approx(load.expected, rel=0.05)
-
-
-@pytest.mark.slow
-def test_a_bend_whips_in_a_curve_and_follows_in_a_straight_tube():
-    straight, bent = sliding.turn(False), sliding.turn(True)
-    assert np.degrees(straight.lag) < sliding.STRAIGHT_LAG
-    assert bent.ratio > 1
-    assert bent.whips > sliding.WHIP > straight.whips
-    # Once in each turn of the base, by a whole turn.
-    jumps = np.flatnonzero(np.diff(bent.tip) > 3 * np.diff(bent.base).mean())
-    assert 1 <= (np.diff(jumps) > 20).sum() + 1 <= 3
 
 
 def test_a_turned_shape_is_the_shape_turned():

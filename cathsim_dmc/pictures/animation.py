@@ -99,9 +99,8 @@ def _frames(
     left = rough.shape[1] / rough.shape[0]  # width of the scene per height
     height = width / (left + 0.66)
     # One pixel of the glass for each of the film.
-    projection = ParallelProjection.of(
-        surface.vertices, margin=_MARGIN, height=round(height)
-    )
+    pixels = rough.pixels * round(height) / rough.shape[0]
+    projection = dataclasses.replace(rough, pixels=pixels)
     rest = glass(surface.vertices, surface.faces, projection)
     size, share = (width / _DPI, height / _DPI), left / (left + 0.66)
     figure = drawing.Picture(figsize=size, dpi=_DPI, facecolor="white")

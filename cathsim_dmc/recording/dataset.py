@@ -12,16 +12,6 @@ import numpy as np
 from cathsim_dmc.files import atomic_directory
 
 
-def _minari() -> Any:
-    try:
-        import minari
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "minari is not installed; `pip install 'cathsim-dmc[gym]'` adds it"
-        ) from error
-    return minari
-
-
 def write(
     path: str | os.PathLike[str],
     buffers: Sequence[Any],
@@ -55,7 +45,7 @@ def write(
     """
     path = Path(path)
     check_free(path)
-    version = _minari().__version__
+    import minari
     from minari.dataset.minari_storage import MinariStorage
 
     name = path.name
@@ -75,7 +65,7 @@ def write(
                 "dataset_id": name if re.search(r"-v\d+$", name) else f"{name}-v0",
                 "algorithm_name": algorithm,
                 "description": description,
-                "minari_version": version,
+                "minari_version": minari.__version__,
             }
         )
         storage.update_episodes(buffers)
@@ -96,7 +86,8 @@ def read_episodes(path: str | os.PathLike[str]) -> Iterator[Any]:
         DatasetError: there is none, or it is damaged.
         ModuleNotFoundError: minari is not installed.
     """
-    minari = _minari()
+    import minari
+
     data = next(Path(path).glob("data"), Path(path)) / "metadata.json"
     if not data.is_file():
         raise DatasetError(

@@ -78,12 +78,8 @@ def write(
         FileNotFoundError: if the directory around `out` does not exist.
         ModuleNotFoundError: if h5py is not installed.
     """
-    try:
-        import h5py  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "h5py is not installed; `pip install 'cathsim-dmc[gym]'` adds it"
-        ) from error
+    import h5py  # noqa: F401  # Now: hours later it would be missed.
+
     out, options = Path(out), options or ImageSetOptions()
     count = os.cpu_count() or 1
     if processes is not None:
@@ -209,14 +205,11 @@ def _label(out: Path, shards: list[_Shard], labels: list[Labels]) -> dict[str, i
 def _card(options: ImageSetOptions, frames: dict[str, int]) -> str:
     counts = zip(frames.items(), options.anatomies, strict=True)
     rows = [f"| {name} | {some} | {n} |" for (name, n), some in counts]
-
-    def span(pair: tuple[float, float], factor: float = 1.0) -> str:
-        return f"{factor * pair[0]:g} to {factor * pair[1]:g}"
-
     return f"""# Simulated fluoroscopy of endovascular devices
 
 Written by `cathsim dataset` of cathsim_dmc {__version__}; the options are in
-`dataset.json`. Licence: that of cathsim_dmc, Apache-2.0.
+`dataset.json`. Its page docs/dataset.md says what is drawn and what the arrays are.
+Licence: that of cathsim_dmc, Apache-2.0.
 
 | split | anatomies | images |
 |---|---|---|
@@ -225,14 +218,7 @@ Written by `cathsim dataset` of cathsim_dmc {__version__}; the options are in
 No anatomy is in two splits. Train and val hold random aortic arches of all types, test
 normal arches of the types I and II of a set that nothing is trained on.
 
-- Images: {options.size} x {options.size}, 8 bits, dark is opaque, quantum noise. Kerma
-  {span(sequences.KERMA, 1e9)} nGy, gain {span(sequences.GAIN)}; every other sequence
-  has contrast, {span(sequences.IODINE)} kg/m³ of iodine. C-arm: primary
-  {span(sequences.PRIMARY)}, secondary {span(sequences.SECONDARY)} degrees, zoom
-  {span(sequences.ZOOM)}.
-- Motion: {options.frames} frames, {40 * options.stride} ms apart, of a device that is
-  pushed and turned at random from anywhere along the way to a branch. Each motion is
-  seen by {options.views} C-arms. Vessel: {options.vessel}. Devices: {", ".join(KITS)}.
+- Images: {options.size} x {options.size}, 8 bits, dark is opaque, quantum noise.
 - Keypoints: {", ".join(KEYPOINTS)}. Those outside the image are absent (0), ostia
   without contrast labelled but not visible (1).
 - Frame: patient, LPS, m. `camera_matrix` takes (x, y, z, 1) to (column w, row w, w);

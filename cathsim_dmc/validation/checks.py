@@ -26,26 +26,23 @@ class Check:
     passed: bool
     note: str = ""
 
-    @property
-    def measured(self) -> str:
-        """The value in three digits with its unit."""
-        return f"{self.value:.3g} {self.unit}".rstrip()
-
     @classmethod
     def at_most(
         cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
     ) -> "Check":
         """A check of value <= bound; a value that is no number fails."""
-        kept = bool(value <= bound)
-        return cls(name, float(value), unit, f"<= {bound:g}", kept, note)
+        return cls(
+            name, float(value), unit, f"<= {bound:g}", bool(value <= bound), note
+        )
 
     @classmethod
     def at_least(
         cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
     ) -> "Check":
         """A check of value >= bound; a value that is no number fails."""
-        kept = bool(value >= bound)
-        return cls(name, float(value), unit, f">= {bound:g}", kept, note)
+        return cls(
+            name, float(value), unit, f">= {bound:g}", bool(value >= bound), note
+        )
 
     @classmethod
     def deviation(
@@ -85,12 +82,7 @@ class Report:
     @property
     def passed(self) -> bool:
         """Whether every check passed."""
-        return not self.failures
-
-    @property
-    def failures(self) -> tuple[Check, ...]:
-        """Checks that did not pass."""
-        return tuple(check for check in self.checks if not check.passed)
+        return all(check.passed for check in self.checks)
 
     def as_dict(self) -> dict[str, Any]:
         """The object that `--json` prints; numbers that JSON lacks become null."""
@@ -113,9 +105,10 @@ class Report:
         table.add_column("")
         table.add_column("behind it", style="dim")
         for check in self.checks:
+            value = f"{check.value:.3g} {check.unit}".rstrip()
             bound = f"{check.bound} {check.unit}".rstrip()
             kept = "[green]pass[/]" if check.passed else "[bold red]FAIL[/]"
-            table.add_row(check.name, check.measured, bound, kept, check.note)
+            table.add_row(check.name, value, bound, kept, check.note)
         return table
 
 

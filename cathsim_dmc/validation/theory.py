@@ -21,12 +21,10 @@ class Elastica(NamedTuple):
     Attributes:
         force: N.
         position: (n, 2), axial and transverse place from the clamp to the end, m.
-        angle: (n,), of the tangent against the clamp's, rad.
     """
 
     force: float
     position: np.ndarray
-    angle: np.ndarray
 
 
 def elastica(lengths: ArrayLike, stiffnesses: ArrayLike, end_angle: float) -> Elastica:
@@ -57,7 +55,7 @@ def elastica(lengths: ArrayLike, stiffnesses: ArrayLike, end_angle: float) -> El
     low = end_angle / (np.diff(from_end**2) / (2 * stiffnesses)).sum()
     force = brentq(lambda f: shape(f)[0, 0], 0.5 * low, 20 * low, xtol=1e-12 * low)
     rows = shape(force)
-    return Elastica(force, rows[:, 2:] - rows[0, 2:], rows[:, 0])
+    return Elastica(force, rows[:, 2:] - rows[0, 2:])
 
 
 def profile(
