@@ -74,7 +74,7 @@ def test_a_failed_check_exits_with_one(cathsim, tmp_path):
     """An arch that has lost a triangle of its surface has edges without two."""
     whole = phantoms.load("simple1")
     surface = Surface(whole.surface.vertices, whole.surface.faces[1:])
-    dataclasses.replace(whole, name="torn", surface=surface).save(tmp_path)
+    dataclasses.replace(whole, name="torn", scan=surface).save(tmp_path)
     code, out, _ = cathsim("phantom", "check", tmp_path, "--json")
     assert code == 1
     failed = [c["name"] for c in json.loads(out)["checks"] if not c["passed"]]
