@@ -1,7 +1,6 @@
-"""Import of a scan: a synthetic Y-shaped lumen, every error, and a real patient."""
+"""Import of a scan: a synthetic Y-shaped lumen, and every error."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,6 @@ from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 
 DEVICE_RADIUS = 0.84e-3
-SCAN = os.environ.get("CATHSIM_SCAN_DIR")
 
 
 @pytest.fixture(scope="module")
@@ -301,16 +299,3 @@ def test_names_must_differ(y_scan, tmp_path):
 def test_inlet_off_the_lumen(y_scan):
     with pytest.raises(ValueError, match="away from the lumen"):
         import_scan(*y_scan[:2], inlet=(90.0, 0.0, 0.0))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(SCAN is None, reason="CATHSIM_SCAN_DIR names no scan")
-def test_real_patient():
-    folder = Path(SCAN)
-    mesh = next(iter(sorted(folder.glob("*.obj"))))
-    curves = sorted(folder.glob("*.mrk.json"))
-    anatomy = import_scan(mesh, curves)
-    assert anatomy.lumen.nbytes < 5e6
-    assert {vessel_name(path) for path in curves} < set(anatomy.tree.vessels)
-    for goal in anatomy.goals:
-        assert anatomy.route(goal).radii.min() > DEVICE_RADIUS

@@ -102,7 +102,12 @@ def import_scan(
     say(f"tree: looking for vessels in {len(lumen.surface.faces):,} triangles")
     grown, at_end = _tree(measure, curves, places, root, changes, note)
     tree, opening, surface = _opened(grown, at_end, lumen.surface)
-    say(f"tree: {', '.join(_sizes(tree))}")
+    sizes = [
+        f"{key} {vessel.centreline.length * 1e3:.0f} mm"
+        + (f" from {vessel.parent}" if vessel.parent else "")
+        for key, vessel in tree.vessels.items()
+    ]
+    say(f"tree: {', '.join(sizes)}")
     name, goals = name or Path(mesh_path).name.split(".")[0], place_goals(tree)
     ends = flat_ends(tree, opening)
     anatomy = Anatomy(name, tree, opening, goals, ends, surface)
@@ -137,15 +142,6 @@ def _changes(rename: Mapping[str, str] | None) -> dict[str, str]:
         if not VESSEL_NAME.fullmatch(str(wanted)):
             bounds.refuse("rename", rename, "names of small letters, digits and '_'")
     return changes
-
-
-def _sizes(tree: VesselTree) -> list[str]:
-    """Name, length and parent of every vessel."""
-    return [
-        f"{key} {vessel.centreline.length * 1e3:.0f} mm"
-        + (f" from {vessel.parent}" if vessel.parent else "")
-        for key, vessel in tree.vessels.items()
-    ]
 
 
 def _tree(field, curves, places, root, changes, note) -> tuple[VesselTree, bool]:

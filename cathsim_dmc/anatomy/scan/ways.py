@@ -1,6 +1,6 @@
 """Shortest and deepest ways through a lumen, on a lattice of its inside."""
 
-from functools import cache, cached_property
+from functools import cache
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -56,24 +56,20 @@ class Ways:
         self.main = label == np.bincount(label).argmax()
         self.nodes = np.flatnonzero(self.main)
         self._lookup = cKDTree(self.points[self.main])
-        self.lengths_from = cache(self._lengths_from)
-        self.deepest_from = cache(self._deepest_from)
+        # A step of a deepest way costs its length over the fourth power of the depth,
+        # as blood flow does (Poiseuille): a way keeps to the middle, and in a ring of
+        # vessels it takes the artery, not the thin communicating one.
+        depth = self.depth[self.links].mean(axis=1)
+        deep = self._graph(self._lengths * (LATTICE / depth) ** 4)
+        self._near = self._graph(self._lengths)
+        # Of a node: lengths (n,) m of the shortest ways, predecessors on the deepest.
+        self.lengths_from = cache(lambda node: dijkstra(self._near, False, node))
+        self.deepest_from = cache(lambda node: _before(deep, node))
 
     def _graph(self, weights: np.ndarray) -> csr_matrix:
         """The lattice's links with ``weights`` (e,), in one direction."""
         shape, order = (len(self.points),) * 2, self._order
         return csr_matrix((weights[order], self.links[order, 1], self._starts), shape)
-
-    @cached_property
-    def _near(self) -> csr_matrix:
-        """The links with their lengths."""
-        return self._graph(self._lengths)
-
-    @cached_property
-    def _deep(self) -> csr_matrix:
-        """The links with what they cost on the deepest ways."""
-        depth = self.depth[self.links].mean(axis=1)
-        return self._graph(self._lengths * (LATTICE / depth) ** 4)
 
     def node(self, position: np.ndarray) -> int:
         """Lattice point nearest to ``position`` (3,) m in the largest piece."""
@@ -89,19 +85,6 @@ class Ways:
     def length(self, way: np.ndarray) -> float:
         """Length (m) of a way (n,) of nodes."""
         return float(arc_lengths(self.points[way])[-1])
-
-    def _lengths_from(self, node: int) -> np.ndarray:
-        """Length (n,) m of the shortest way from ``node`` to every point."""
-        return dijkstra(self._near, directed=False, indices=node)
-
-    def _deepest_from(self, node: int) -> np.ndarray:
-        """Predecessors (n,) on the deepest ways from ``node``.
-
-        A step costs its length over the fourth power of the depth, as blood flow
-        does (Poiseuille): a way keeps to the middle, and in a ring of vessels it
-        takes the artery, not the thin communicating one.
-        """
-        return _before(self._deep, node)
 
     def along(self, curve: np.ndarray, name: str) -> np.ndarray:
         """Deepest way (m, 3) near ``curve`` (n, 3) m, from its start to its end.
