@@ -109,7 +109,7 @@ def _branch(
         "lean_deg": _degrees(math.atan2(direction @ normal, direction[2])),
         "out_of_plane_mm": _mm((far - ostium) @ normal),
         # Length over the chord from ostium to end.
-        "tortuosity": round(own.length / np.linalg.norm(own.points[-1] - ostium), 4),
+        "tortuosity": round(own.length / np.linalg.norm(own.points[-1] - ostium), 6),
         # Distance of the ostium from the axis of the first 30 mm of the aorta.
         "axis_offset_mm": _mm(np.linalg.norm(way - (way @ axis) * axis)),
     }
@@ -120,11 +120,11 @@ def _diameter(vessel: Vessel) -> float:
 
 
 def _mm(length: Any) -> float:
-    return round(1e3 * float(length), 2)
+    return round(1e3 * float(length), 3)
 
 
 def _degrees(angle: float) -> float:
-    return round(math.degrees(angle), 1)
+    return round(math.degrees(angle), 3)
 
 
 def _angle(first: Array, second: Array) -> float:
