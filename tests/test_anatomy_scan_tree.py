@@ -7,6 +7,8 @@ import pytest
 from synthetic_scans import marched, write_markup, write_obj, y_tree
 
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy.arch.arch import ArchSeed
+from cathsim_dmc.anatomy.arch.tree import arch_tree as random_arch
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.check import check_tree
@@ -142,6 +144,18 @@ def test_curves_that_part_early_at_a_wide_flat_end(arch_scan, tmp_path):
         # 207 mm beside the aorta is what was found once.
         assert anatomy.tree.vessel(name).ostium < 30e-3
         assert anatomy.tree.vessel(name).parent == "aorta"
+
+
+@pytest.mark.slow
+def test_an_arch_that_is_cut_off_just_past_its_branches_is_named(tmp_path):
+    """No way comes near what is left of the aorta, which has no room for a device."""
+    tree = random_arch(ArchSeed(5_500_178, "II").parameters())
+    root, origins = tree.root, [tree.origin(k) for k in ("bca", "lcca", "lsa")]
+    line = root.centreline.slice(0.0, max(origins) + 25e-3)
+    cut = VesselTree({**tree.vessels, root.name: replace(root, centreline=line)})
+    anatomy = import_scan(write_obj(tmp_path / "lumen.obj", *marched(cut, 1.3e-3)))
+    assert set(anatomy.tree.vessels) == {"aorta", "bca", "lcca", "lsa"}
+    assert np.linalg.norm(anatomy.inlet.position - line.points[0]) < 30e-3
 
 
 @pytest.mark.slow
