@@ -79,19 +79,20 @@ def evaluate(
     contacts = evaluation.ContactLog()
 
     def play(who: Any, out_dir: Path | None = None) -> evaluation.EvaluationResult:
-        bar = progress_bar(getattr(who, "name", who), " steps", delay=LINE_INTERVAL)
+        name = getattr(who, "name", who)
+        with progress_bar(name, " steps", delay=LINE_INTERVAL) as bar:
 
-        def observe(env: Any, running: np.ndarray) -> None:
-            if who is player:
-                contacts(env, running)
-            text = f"{np.count_nonzero(running)} of {len(running)} episodes run"
-            bar.set_postfix_str(text, refresh=False)
-            bar.update()
+            def observe(env: Any, running: np.ndarray) -> None:
+                if who is player:
+                    contacts(env, running)
+                text = f"{np.count_nonzero(running)} of {len(running)} episodes run"
+                bar.set_postfix_str(text, refresh=False)
+                bar.update()
 
-        return agents.evaluate(
-            who, task, episodes, seed, protocol=protocol, task_kwargs=task_kwargs,
-            num_threads=threads, observer=observe, out_dir=out_dir,
-        )  # fmt: skip
+            return agents.evaluate(
+                who, task, episodes, seed, protocol=protocol, task_kwargs=task_kwargs,
+                num_threads=threads, observer=observe, out_dir=out_dir,
+            )  # fmt: skip
 
     results = {"policy": play(player, out)}
     if baseline and policy != "random":
