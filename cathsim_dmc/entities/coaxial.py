@@ -12,79 +12,26 @@ links, with a weight that falls linearly from 1 at the hinge to 0 at their far e
 chain then has the angle and the mean position of each bend of the rod, wherever the end
 of a device lies in a link, and all properties are continuous in insertion and rotation.
 
-Pure functions of arrays with a leading axis N of simulations; SI units. Directions
-across the chain are complex numbers x + iy in frames that do not twist along the chain:
-a joint bent by a small `bend_y` about y and `bend_x` about x leads towards
-bend_y - i bend_x, and a rotation by φ about the device multiplies by exp(iφ). The
-frames of the links twist, because two hinges do (`hinge_loops.bent`). What devices do
-to each other is in `coaxial_loops`.
+SI units. Directions across the chain are complex numbers x + iy in frames that do not
+twist along the chain: a joint bent by a small `bend_y` about y and `bend_x` about x
+leads towards bend_y - i bend_x, and a rotation by φ about the device multiplies by
+exp(iφ). The frames of the links twist, because two hinges do (`hinge_loops.bent`). What
+devices do to each other is in `coaxial_loops`.
 """
 
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from cathsim_dmc.entities import coaxial_loops, hinge_loops
+from cathsim_dmc.entities import coaxial_loops as loops
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.device import Device
 
 
-class Overlap(NamedTuple):
-    """Properties that depend on the overlap but not on the rotations.
-
-    N simulations, K devices, P pairs of devices, J joints, L links.
-
-    Attributes:
-        compliance: (N, J), ∫h ds/EI of a joint with weight h, rad/(N·m).
-        rest: (N, K, J), ∫h κ_k EI_k/EI ds, angle by which a device bends the free
-            joint, rad.
-        coupling: (N, P, J), ∫h κ_k κ_l EI_k EI_l/EI ds for each pair of `Stack.pairs`:
-            energy of two devices that bend against each other, N·m.
-        stiffness: (N, K, J), weighted mean of EI_k, N·m².
-        moment: (N, K, J), weighted mean of EI_k κ_k, N·m.
-        outermost: (N, K, L), fraction of each link on which a device is the outermost.
-        present: (N, K, L), fraction of each link on which a device is present.
-    """
-
-    compliance: np.ndarray
-    rest: np.ndarray
-    coupling: np.ndarray
-    stiffness: np.ndarray
-    moment: np.ndarray
-    outermost: np.ndarray
-    present: np.ndarray
-
-
-class Links(NamedTuple):
-    """Properties of the links, arrays (N, L).
-
-    Attributes:
-        radius: radius of the outermost device, its mean over the link, m.
-        friction: Coulomb coefficient on the wall, its mean over the link.
-        mass: mass, kg.
-        buoyancy: fraction of the link's weight that buoyancy cancels, beyond the
-            buoyancy of all devices together, which reduces gravity (`gravcomp`).
-        inertia: (N, L, 2), moments of inertia of a solid capsule across and along its
-            axis, kg·m².
-    """
-
-    radius: np.ndarray
-    friction: np.ndarray
-    mass: np.ndarray
-    buoyancy: np.ndarray
-    inertia: np.ndarray
-
-
 class Stack:
     """Coaxial devices on one chain of links.
-
-    Arguments of its methods: `gaps` (N, K), distance from the end of each device to the
-    end of the chain, m, 0 for the one that leads; `turns` (N, K, J), rotation of each
-    device at each joint, rad; `bends` (N, J) complex, bending angles of the
-    joints, rad; `angles` (N, 2 J), positions of the hinges in the order of the chain,
-    rad; `friction` (N,), Coulomb coefficient of an uncoated device on the wall.
 
     Attributes:
         devices: devices from the innermost outwards.
@@ -92,10 +39,11 @@ class Stack:
         nodes: (L + 1,), distances of the ends of the links from the end of the chain,
             from proximal to distal, m.
         spans: (J,), length of rod of each joint, half of its two links, m.
-        pairs: (P, 2), indices of every two devices.
-        tables: nodes, link lengths and the uniform pieces of the devices, see
-            `coaxial_loops.overlaps`.
-        arms: (K,), radius of each device on the wall by its friction ratio, m.
+        tables: nodes, link lengths, and (K, E) start of the uniform pieces of the
+            devices, m from their ends, padded with infinity; (K, E + 1), EI, N·m², and
+            EI κ, N·m, beyond the device and of the pieces.
+        of_links: what `coaxial_loops.links` takes of the devices.
+        arms: (K,), radius of each device by its friction ratio, m.
     """
 
     def __init__(self, devices: Sequence[Device], link_lengths: np.ndarray):
@@ -111,9 +59,6 @@ class Stack:
         self.nodes = np.append(beyond, 0.0)
         self.spans = (self.link_lengths[:-1] + self.link_lengths[1:]) / 2
         count = len(devices)
-        self.pairs = np.stack(np.triu_indices(count, 1), axis=-1)
-        # Start of the uniform pieces of each device, their EI and EI κ; the first entry
-        # of the latter two is the space beyond the device's end.
         pieces = [_pieces(device) for device in self.devices]
         most = max(len(edges) for edges, _, _ in pieces)
         edges = np.full((count, most), np.inf)
@@ -125,52 +70,21 @@ class Stack:
         self.tables = self.nodes, self.link_lengths, edges, bending, moment
         radii = np.array([device.outer_radius for device in devices])
         ratios = np.array([device.friction_ratio for device in devices])
-        # Mass, weight in blood, blood carried by a device that is the outermost and by
-        # one that is present, kg/m.
         outer = [_disc(device.outer_radius) for device in devices]
         inner = [_disc(device.inner_radius) for device in devices]
         masses = [device.linear_density for device in devices]
         weights = [weight_density(device) for device in devices]
         carried = 2 * np.array(outer), np.subtract(inner, outer)
-        self._of_links = radii, ratios, np.array([masses, weights, *carried])
+        self.of_links = radii, ratios, np.array([masses, weights, *carried])
         self.arms = ratios * radii
 
-    def overlap(self, gaps: np.ndarray) -> Overlap:
-        """Integrals around the joints and over the links."""
-        gaps = np.ascontiguousarray(gaps, np.float64)
-        integrals = coaxial_loops.overlaps(gaps, *self.tables)
-        shares = coaxial_loops.shares(gaps, self.nodes, self.link_lengths)
-        return Overlap(*integrals, *shares)
+    def overlap(self, gaps: ArrayLike) -> loops.Overlap:
+        """Properties by the distances (K,) of the devices' ends from the chain's, m."""
+        return loops.overlap(np.array(gaps, np.float64), self.tables)
 
-    def rest_angles(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
-        """Rest angles (N, J) of the joints, complex, rad."""
-        return (overlap.rest * np.exp(1j * turns)).sum(axis=1)
-
-    def unloaded_hinges(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
-        """Angles (N, J, 2) of the hinges about x and y of the unloaded chain, rad."""
-        return hinge_loops.unloaded_hinges(self.rest_angles(overlap, turns))
-
-    def free_hinges(
-        self, overlap: Overlap, turns: np.ndarray, angles: np.ndarray
-    ) -> np.ndarray:
-        """Rest angles of the hinges of the chain as it is bent.
-
-        Two hinges measure a bend differently in each direction, and twist. The springs
-        have the torques of the isotropic energy Σ|β_j - ΣR_k e_k|²/2C_j, in which β_j
-        depends on the hinges of the joint and on the twist of those before it: at
-        angles θ, the rest angles are θ - C ∂E/∂θ.
-
-        Returns:
-            (N, J, 2), about x and about y, rad.
-        """
-        shape, angles = self.rest_angles(overlap, turns), np.ascontiguousarray(angles)
-        return hinge_loops.free_hinges(shape, overlap.compliance, angles)
-
-    def links(self, overlap: Overlap, friction: np.ndarray) -> Links:
-        """Properties of the links."""
-        lengths = self.link_lengths
-        made = coaxial_loops.links(*overlap[5:], lengths, friction, *self._of_links)
-        return Links(*made)
+    def links(self, overlap: loops.Overlap, friction: float) -> loops.Links:
+        """Properties of the links by the Coulomb coefficient of an uncoated device."""
+        return loops.links(overlap, self.link_lengths, friction, *self.of_links)
 
 
 def _disc(radius: float) -> float:

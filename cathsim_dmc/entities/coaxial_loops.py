@@ -1,15 +1,14 @@
 """Coaxial devices: what they do to each other and to the chain, compiled.
 
-`coaxial` defines the quantities: an `Overlap`, and `gaps`, `bends` and `turns` as the
-methods of a `Stack` have them; `tables` and `arms` are those of a `Stack`. A chain has
-some thirty joints, for which compiled loops are faster than numpy. Each simulation is
-computed on its own, so single and batched simulations agree bit for bit.
-
-Arrays have a leading axis N of simulations; K devices, J joints, L = J + 1 links. All
-are C-contiguous.
+`coaxial` defines the quantities. All functions are of one simulation: `gaps` (K,),
+distance from the end of each device to the end of the chain, m, 0 for the one that
+leads; `turns` (K, J), rotation of each device at each joint, rad; `bends` (J,) complex,
+bending angles of the joints, rad; `tables` of a `coaxial.Stack`. K devices, J joints,
+L = J + 1 links. Arrays are C-contiguous.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +17,50 @@ from cathsim_dmc.entities.hinge_loops import unit
 
 # A distance beyond the end of any device, m.
 _FAR = 1e3
+
+
+class Overlap(NamedTuple):
+    """Properties of a chain that depend on the overlap but not on the rotations.
+
+    Attributes:
+        compliance: (J,), ∫h ds/EI of a joint with weight h, rad/(N·m).
+        rest: (K, J), ∫h κ_k EI_k/EI ds, angle by which a device bends the free joint,
+            rad.
+        coupling: (P, J), ∫h κ_k κ_l EI_k EI_l/EI ds for each of the P pairs of devices:
+            energy of two that bend against each other, N·m.
+        stiffness: (K, J), weighted mean of EI_k, N·m².
+        moment: (K, J), weighted mean of EI_k κ_k, N·m.
+        outermost: (K, L), fraction of each link on which a device is the outermost.
+        present: (K, L), fraction of each link on which a device is present.
+    """
+
+    compliance: np.ndarray
+    rest: np.ndarray
+    coupling: np.ndarray
+    stiffness: np.ndarray
+    moment: np.ndarray
+    outermost: np.ndarray
+    present: np.ndarray
+
+
+class Links(NamedTuple):
+    """Properties of the links, arrays (L,).
+
+    Attributes:
+        radius: radius of the outermost device, its mean over the link, m.
+        friction: Coulomb coefficient on the wall, its mean over the link.
+        mass: mass, kg.
+        buoyancy: fraction of the link's weight that buoyancy cancels, beyond the
+            buoyancy of all devices together, which reduces gravity (`gravcomp`).
+        inertia: (L, 2), moments of inertia of a solid capsule across and along its
+            axis, kg·m².
+    """
+
+    radius: np.ndarray
+    friction: np.ndarray
+    mass: np.ndarray
+    buoyancy: np.ndarray
+    inertia: np.ndarray
 
 
 @compiled
@@ -54,74 +97,69 @@ def _piece(place, edges):
 
 
 @compiled
-def overlaps(gaps, nodes, lengths, edges, bending, moment):
-    """Integrals around the joints, the first five of `coaxial.Overlap`.
-
-    Args:
-        edges: (K, E), start of the pieces of the devices, m from their ends; padded
-            with infinity.
-        bending, moment: (K, E + 1), EI (N·m²) and EI κ (N·m) beyond the device (0) and
-            of the pieces.
-    """
-    count, devices = gaps.shape
-    joints = len(lengths) - 1
-    compliance = np.zeros((count, joints))
-    rest = np.zeros((count, devices, joints))
-    coupling = np.zeros((count, devices * (devices - 1) // 2, joints))
-    stiffness = np.zeros((count, devices, joints))
-    mean = np.zeros((count, devices, joints))
+def overlap(gaps, tables):
+    """The `Overlap` of devices."""
+    nodes, lengths, edges, bending, moment = tables
+    devices, joints = len(gaps), len(lengths) - 1
+    pairs = devices * (devices - 1) // 2
+    compliance, coupling = np.zeros(joints), np.zeros((pairs, joints))
+    parts = np.zeros((3, devices, joints))
+    rest, stiffness, mean = parts[0], parts[1], parts[2]
     own_bending, own_moment = np.empty(devices), np.empty(devices)
-    for i in range(count):
-        breaks = _breaks(gaps[i], edges)
-        for c in range(len(breaks) - 1):
-            low, high = breaks[c], breaks[c + 1]
-            if high <= low or low >= nodes[0]:
-                continue
-            total = 0.0
-            for k in range(devices):
-                piece = _piece((low + high) / 2 - gaps[i, k], edges[k])
-                own_bending[k], own_moment[k] = bending[k, piece], moment[k, piece]
-                total += own_bending[k]
-            for j in range(joints):
-                if high <= nodes[j + 2] or low >= nodes[j]:
-                    continue
-                weight = _weight(high, j, nodes, lengths)
-                weight -= _weight(low, j, nodes, lengths)
-                compliance[i, j] += weight / total
-                pair = 0
-                for k in range(devices):
-                    share = own_moment[k] / total
-                    rest[i, k, j] += share * weight
-                    stiffness[i, k, j] += own_bending[k] * weight
-                    mean[i, k, j] += own_moment[k] * weight
-                    for other in range(k + 1, devices):
-                        coupling[i, pair, j] += share * own_moment[other] * weight
-                        pair += 1
+    breaks = _breaks(gaps, edges)
+    for c in range(len(breaks) - 1):
+        low, high = breaks[c], breaks[c + 1]
+        if high <= low or low >= nodes[0]:
+            continue
+        total = 0.0
+        for k in range(devices):
+            piece = _piece((low + high) / 2 - gaps[k], edges[k])
+            own_bending[k], own_moment[k] = bending[k, piece], moment[k, piece]
+            total += own_bending[k]
         for j in range(joints):
-            span = (lengths[j] + lengths[j + 1]) / 2
+            if high <= nodes[j + 2] or low >= nodes[j]:
+                continue
+            weight = _weight(high, j, nodes, lengths)
+            weight -= _weight(low, j, nodes, lengths)
+            compliance[j] += weight / total
+            pair = 0
             for k in range(devices):
-                stiffness[i, k, j] /= span
-                mean[i, k, j] /= span
-    return compliance, rest, coupling, stiffness, mean
+                share = own_moment[k] / total
+                rest[k, j] += share * weight
+                stiffness[k, j] += own_bending[k] * weight
+                mean[k, j] += own_moment[k] * weight
+                for other in range(k + 1, devices):
+                    coupling[pair, j] += share * own_moment[other] * weight
+                    pair += 1
+    for j in range(joints):
+        span = (lengths[j] + lengths[j + 1]) / 2
+        for k in range(devices):
+            stiffness[k, j] /= span
+            mean[k, j] /= span
+    reach = np.empty((2, devices, len(lengths)))
+    outermost, present = reach[0], reach[1]
+    for link in range(len(lengths)):
+        # A device farther out covers a place that it reaches.
+        covered = 0.0
+        for k in range(devices - 1, -1, -1):
+            reached = (nodes[link] - gaps[k]) / lengths[link]
+            reached = min(max(reached, 0.0), 1.0)
+            present[k, link] = reached
+            outermost[k, link] = max(reached - covered, 0.0)
+            covered = max(covered, reached)
+    return Overlap(compliance, rest, coupling, stiffness, mean, outermost, present)
 
 
 @compiled
-def shares(gaps, nodes, lengths):
-    """Fractions (N, K, L) of the links where a device is outermost, and present."""
-    count, devices = gaps.shape
-    outermost = np.empty((count, devices, len(lengths)))
-    present = np.empty_like(outermost)
-    for i in range(count):
-        for link in range(len(lengths)):
-            # A device farther out covers a place that it reaches.
-            covered = 0.0
-            for k in range(devices - 1, -1, -1):
-                reached = (nodes[link] - gaps[i, k]) / lengths[link]
-                reached = min(max(reached, 0.0), 1.0)
-                present[i, k, link] = reached
-                outermost[i, k, link] = max(reached - covered, 0.0)
-                covered = max(covered, reached)
-    return outermost, present
+def rest_angles(rest, turns):
+    """Rest angles (J,) of the joints, complex, rad; `rest` of an `Overlap`."""
+    angles = np.empty(turns.shape[1], np.complex128)
+    for j in range(len(angles)):
+        whole = rest[0, j] * unit(turns[0, j])
+        for k in range(1, len(turns)):
+            whole += rest[k, j] * unit(turns[k, j])
+        angles[j] = whole
+    return angles
 
 
 @compiled
@@ -133,34 +171,32 @@ def restoring(overlap, bends, turns):
     a shaped device into the plane of a curved vessel and makes it whip.
 
     Returns:
-        Torque (N, K, J) on each device about its axis, N·m, and minus its derivative by
-        the rotation, N·m/rad.
+        (2, K, J): torque on each device about its axis, N·m, and minus its derivative
+        by the rotation, N·m/rad.
     """
     compliance, rest, coupling = overlap.compliance, overlap.rest, overlap.coupling
-    count, devices, joints = turns.shape
-    torque, rate = np.empty(turns.shape), np.empty(turns.shape)
-    pulls = np.empty(devices, np.complex128)
-    for i in range(count):
-        for j in range(joints):
-            whole = 0j
-            for k in range(devices):
-                pulls[k] = rest[i, k, j] * unit(turns[i, k, j])
-                whole += pulls[k]
-            for k in range(devices):
-                force = np.conj(bends[i, j] - (whole - pulls[k])) * pulls[k]
-                torque[i, k, j] = -force.imag / compliance[i, j]
-                rate[i, k, j] = force.real / compliance[i, j]
-            pair = 0
-            for k in range(devices):
-                for other in range(k + 1, devices):
-                    energy = coupling[i, pair, j]
-                    angle = turns[i, k, j] - turns[i, other, j]
-                    torque[i, k, j] -= energy * math.sin(angle)
-                    torque[i, other, j] += energy * math.sin(angle)
-                    rate[i, k, j] += energy * math.cos(angle)
-                    rate[i, other, j] += energy * math.cos(angle)
-                    pair += 1
-    return torque, rate
+    devices, joints = turns.shape
+    loads, pulls = np.empty((2, devices, joints)), np.empty(devices, np.complex128)
+    torque, rate = loads[0], loads[1]
+    for j in range(joints):
+        whole = 0j
+        for k in range(devices):
+            pulls[k] = rest[k, j] * unit(turns[k, j])
+            whole += pulls[k]
+        for k in range(devices):
+            force = np.conj(bends[j] - (whole - pulls[k])) * pulls[k]
+            torque[k, j] = -force.imag / compliance[j]
+            rate[k, j] = force.real / compliance[j]
+        pair = 0
+        for k in range(devices):
+            for other in range(k + 1, devices):
+                energy, angle = coupling[pair, j], turns[k, j] - turns[other, j]
+                torque[k, j] -= energy * math.sin(angle)
+                torque[other, j] += energy * math.sin(angle)
+                rate[k, j] += energy * math.cos(angle)
+                rate[other, j] += energy * math.cos(angle)
+                pair += 1
+    return loads
 
 
 @compiled
@@ -188,49 +224,46 @@ def axial(tables, overlap, gaps, bends, turns, slopes):
     rotations of its rod; that of the leading device is minus the others' sum.
 
     Args:
-        slopes: (N, K, J), torque of `restoring` times the derivative of `turns` by the
+        slopes: (K, J), torque of `restoring` times the derivative of `turns` by the
             gap, N.
 
     Returns:
-        (N, K, J), N, positive where a device must be pushed forward.
+        (K, J), N, positive where a device must be pushed forward.
     """
     nodes, lengths, edges, bending, moment = tables
-    compliance, rest = overlap.compliance, overlap.rest
-    count, devices, joints = turns.shape
-    force = np.zeros(turns.shape)
-    loads = np.empty(joints, np.complex128)
-    for i in range(count):
-        leader = gaps[i].argmin()
-        for j in range(joints):
-            whole = bends[i, j]
-            for k in range(devices):
-                whole -= rest[i, k, j] * unit(turns[i, k, j])
-            loads[j] = whole / compliance[i, j]
+    devices, joints = turns.shape
+    force, loads = np.zeros(turns.shape), np.empty(joints, np.complex128)
+    leader = gaps.argmin()
+    for j in range(joints):
+        whole = bends[j]
         for k in range(devices):
-            if k == leader:
-                continue
-            force[i, k] += slopes[i, k]
-            link = joints
-            for piece in range(edges.shape[1]):
-                place = gaps[i, k] + edges[k, piece]
-                if place >= nodes[0]:
-                    break
-                while place >= nodes[link]:
-                    link -= 1
-                share = (place - nodes[link + 1]) / lengths[link]
-                # The joints at both ends of the link share what it bends.
-                for j, weight in ((link - 1, share), (link, 1 - share)):
-                    if 0 <= j < joints:
-                        here = (place, loads[j], turns[i, :, j], gaps[i], edges)
-                        jump = _pull(*here, bending, moment, piece, k)
-                        jump -= _pull(*here, bending, moment, piece + 1, k)
-                        force[i, k, j] += weight * jump
-            force[i, leader] -= force[i, k]
+            whole -= overlap.rest[k, j] * unit(turns[k, j])
+        loads[j] = whole / overlap.compliance[j]
+    for k in range(devices):
+        if k == leader:
+            continue
+        force[k] += slopes[k]
+        link = joints
+        for piece in range(edges.shape[1]):
+            place = gaps[k] + edges[k, piece]
+            if place >= nodes[0]:
+                break
+            while place >= nodes[link]:
+                link -= 1
+            share = (place - nodes[link + 1]) / lengths[link]
+            # The joints at both ends of the link share what it bends.
+            for j, weight in ((link - 1, share), (link, 1 - share)):
+                if 0 <= j < joints:
+                    here = (place, loads[j], turns[:, j], gaps, edges)
+                    jump = _pull(*here, bending, moment, piece, k)
+                    jump -= _pull(*here, bending, moment, piece + 1, k)
+                    force[k, j] += weight * jump
+        force[leader] -= force[k]
     return force
 
 
 @compiled
-def pressure(lengths, overlap, bends, turns, axial, start, ways, coefficient):
+def pressure(lengths, overlap, bends, turns, axial, start, ways, coefficient, factor):
     """Lateral forces of each device on the lumen of the next one, and friction.
 
     The force of a device with the moment M and the compression P is M'' + Pκ per
@@ -239,73 +272,72 @@ def pressure(lengths, overlap, bends, turns, axial, start, ways, coefficient):
 
     Args:
         lengths: (L,), of the links, m.
-        axial: (N, K, J), see `axial`, N.
-        start: (N, K), compression where each device leaves the others, N.
-        ways: (N, K - 1) in [-1, 1], fraction of the friction that acts on device k,
+        axial: (K, J), see `axial`, N.
+        start: (K,), compression where each device leaves the others, N.
+        ways: (K - 1,) in [-1, 1], fraction of the friction that acts on device k,
             positive when it slides forward in the next one.
         coefficient: Coulomb coefficient between the devices.
+        factor: of all stiffnesses.
 
     Returns:
-        (N, K - 1, J), force of device k on device k + 1 at the joints, N, and
-        (N, K - 1), the axial force that their friction demands of device k, N.
+        (K - 1, J), force of device k on device k + 1 at the joints, N, and (K - 1,),
+        the axial force that their friction demands of device k, N.
     """
-    stiffness, moment, present = overlap.stiffness, overlap.moment, overlap.present
-    count, devices, joints = turns.shape
-    force = np.empty((count, devices - 1, joints))
-    drag = np.zeros((count, devices - 1))
+    stiffness, moment = factor * overlap.stiffness, factor * overlap.moment
+    devices, joints = turns.shape
+    force, drag = np.empty((devices - 1, joints)), np.zeros(devices - 1)
     own = np.empty(joints, np.complex128)
     shear = np.zeros(joints, np.complex128)
-    for i in range(count):
-        for k in range(devices - 1):
-            for j in range(joints):
-                span = (lengths[j] + lengths[j + 1]) / 2
-                own[j] = stiffness[i, k, j] * bends[i, j] / span
-                own[j] -= moment[i, k, j] * unit(turns[i, k, j])
-            for j in range(joints - 1):
-                shear[j] = (own[j + 1] - own[j]) / lengths[j + 1]
-            # Compression of the device, from its end on.
-            pushed = start[i, k]
-            for j in range(joints - 1, -1, -1):
-                span = (lengths[j] + lengths[j + 1]) / 2
-                pushed += axial[i, k, j]
-                here = pushed
-                if stiffness[i, k, j] > 0.0:
-                    square = abs(stiffness[i, k, j] * bends[i, j] / span) ** 2
-                    square -= moment[i, k, j] ** 2
-                    here += square / (2 * stiffness[i, k, j])
-                lateral = shear[j] + here * bends[i, j]
-                if j > 0:
-                    lateral -= shear[j - 1]
-                # Only where both devices are present: the mean of both links.
-                both = (present[i, k + 1, j] + present[i, k + 1, j + 1]) / 2
-                force[i, k, j] = abs(lateral) * both
-                rubbing = ways[i, k] * coefficient * force[i, k, j]
-                pushed += rubbing
-                drag[i, k] += rubbing
+    for k in range(devices - 1):
+        for j in range(joints):
+            span = (lengths[j] + lengths[j + 1]) / 2
+            own[j] = stiffness[k, j] * bends[j] / span
+            own[j] -= moment[k, j] * unit(turns[k, j])
+        for j in range(joints - 1):
+            shear[j] = (own[j + 1] - own[j]) / lengths[j + 1]
+        # Compression of the device, from its end on.
+        pushed = start[k]
+        for j in range(joints - 1, -1, -1):
+            span = (lengths[j] + lengths[j + 1]) / 2
+            pushed += axial[k, j]
+            here = pushed
+            if stiffness[k, j] > 0.0:
+                square = abs(stiffness[k, j] * bends[j] / span) ** 2
+                square -= moment[k, j] ** 2
+                here += square / (2 * stiffness[k, j])
+            lateral = shear[j] + here * bends[j]
+            if j > 0:
+                lateral -= shear[j - 1]
+            # Only where both devices are present: the mean of both links.
+            present = overlap.present[k + 1]
+            force[k, j] = abs(lateral) * ((present[j] + present[j + 1]) / 2)
+            rubbing = ways[k] * coefficient * force[k, j]
+            pushed += rubbing
+            drag[k] += rubbing
     return force, drag
 
 
 @compiled
-def wall_friction(arms, overlap, force, coefficient):
-    """Limits (N, K, J) of the friction torque of the wall on the devices, N·m.
+def wall_friction(arms, outermost, force, coefficient):
+    """Limits (K, J) of the friction torque of the wall on the devices, N·m.
 
     Each joint has half of its two links.
 
     Args:
-        force: (N, L), force of the wall on the links, N.
-        coefficient: (N,), Coulomb coefficient of an uncoated device on the wall.
+        arms: (K,), radius of each device by its friction ratio, m.
+        outermost: of an `Overlap`.
+        force: (L,), force of the wall on the links, N.
+        coefficient: Coulomb coefficient of an uncoated device on the wall.
     """
-    outermost = overlap.outermost
-    count, devices, links = outermost.shape
-    torque = np.empty((count, devices, links - 1))
-    for i in range(count):
-        for k in range(devices):
-            for j in range(links - 1):
-                # The last joint bears all of the last link.
-                last = 1.0 if j == links - 2 else 0.5
-                borne = 0.5 * outermost[i, k, j] * force[i, j]
-                borne += last * outermost[i, k, j + 1] * force[i, j + 1]
-                torque[i, k, j] = coefficient[i] * arms[k] * borne
+    devices, links = outermost.shape
+    torque = np.empty((devices, links - 1))
+    for k in range(devices):
+        for j in range(links - 1):
+            # The last joint bears all of the last link.
+            last = 1.0 if j == links - 2 else 0.5
+            borne = 0.5 * outermost[k, j] * force[j]
+            borne += last * outermost[k, j + 1] * force[j + 1]
+            torque[k, j] = coefficient * arms[k] * borne
     return torque
 
 
@@ -321,27 +353,34 @@ def _inertia(mass, radius, length):
 
 
 @compiled
-def links(outermost, present, lengths, friction, radii, ratios, densities):
-    """Properties of the links, see `coaxial.Links` and `Stack`."""
-    count, devices, number = outermost.shape
-    made, moments = np.zeros((4, count, number)), np.empty((count, number, 2))
+def links(overlap, lengths, friction, radii, ratios, densities):
+    """The `Links` of a chain.
+
+    Args:
+        lengths: (L,), m.
+        friction: Coulomb coefficient of an uncoated device on the wall.
+        radii, ratios: (K,), outer radii, m, and friction ratios.
+        densities: (4, K), mass, weight in blood, blood carried by a device that is the
+            outermost and by one that is present, kg/m.
+    """
+    devices, count = overlap.outermost.shape
+    made, moments = np.zeros((4, count)), np.empty((count, 2))
     carried = densities[2, devices - 1] + densities[3].sum()
     share = densities[1].sum() / (densities[0].sum() + carried)
-    for i in range(count):
-        for link in range(number):
-            radius = mass = weight = 0.0
-            whole = True
-            for k in range(devices):
-                outside, there = outermost[i, k, link], present[i, k, link]
-                radius += outside * radii[k]
-                made[1, i, link] += outside * ratios[k] * friction[i]
-                carried = outside * densities[2, k] + there * densities[3, k]
-                mass += (there * densities[0, k] + carried) * lengths[link]
-                weight += there * densities[1, k] * lengths[link]
-                whole = whole and there == 1.0
-            made[0, i, link], made[2, i, link] = radius, mass
-            # Exactly 0 where all devices are present: MuJoCo then skips the link.
-            if share > 0.0 and not whole:
-                made[3, i, link] = 1.0 - weight / (mass * share)
-            moments[i, link] = _inertia(mass, radius, lengths[link])
-    return made[0], made[1], made[2], made[3], moments
+    for link in range(count):
+        radius = mass = weight = 0.0
+        whole = True
+        for k in range(devices):
+            outside, there = overlap.outermost[k, link], overlap.present[k, link]
+            radius += outside * radii[k]
+            made[1, link] += outside * ratios[k] * friction
+            carried = outside * densities[2, k] + there * densities[3, k]
+            mass += (there * densities[0, k] + carried) * lengths[link]
+            weight += there * densities[1, k] * lengths[link]
+            whole = whole and there == 1.0
+        made[0, link], made[2, link] = radius, mass
+        # Exactly 0 where all devices are present: MuJoCo then skips the link.
+        if share > 0.0 and not whole:
+            made[3, link] = 1.0 - weight / (mass * share)
+        moments[link] = _inertia(mass, radius, lengths[link])
+    return Links(made[0], made[1], made[2], made[3], moments)

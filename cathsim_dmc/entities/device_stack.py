@@ -10,6 +10,7 @@ from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
 from cathsim_dmc.entities.coaxial import Stack, carried_mass, weight_density
 from cathsim_dmc.entities.contact import FRICTION, coaxial_contact
 from cathsim_dmc.entities.device import Device
+from cathsim_dmc.entities.hinge_loops import unloaded_hinges
 from cathsim_dmc.entities.torsion import Rods
 
 # Coulomb coefficient between a device and the lined lumen around it (Lin 2020).
@@ -35,7 +36,6 @@ class DeviceStack(Chain):
             start, m.
         friction: Coulomb coefficient of an uncoated device on the wall.
         lumen_friction: Coulomb coefficient between a device and the lumen around it.
-        material_times: (K,), relaxation times of the materials of the devices, s.
     """
 
     coaxial = True
@@ -78,12 +78,10 @@ class DeviceStack(Chain):
         division = discretisation or library.Discretisation()
         self.friction, self.lumen_friction = friction, lumen_friction
         self.stack = Stack(self.devices, division.link_lengths(*self.devices))
-        times = [device.relaxation_time for device in self.devices]
-        self.material_times = np.array(times)
-        self.rods = Rods(self.devices, self.stack.nodes, self.material_times)
+        self.rods = Rods.of(self.devices, self.stack.nodes)
         self.start_gaps = lead * np.arange(len(self.devices), dtype=np.float64)
-        overlap = self.stack.overlap(self.start_gaps[None])
-        turns = np.zeros((1, len(self.devices), len(self.stack.spans)))
+        overlap = self.stack.overlap(self.start_gaps)
+        rest = unloaded_hinges(overlap.rest.sum(axis=0).astype(complex))
         tip = self.stack.nodes <= self.devices[0].tip_length + 1e-9
         self.density = _density(self.devices)
         self._assemble(
@@ -91,9 +89,9 @@ class DeviceStack(Chain):
                 self.stack.link_lengths,
                 # The largest radius, so that the bounding volumes enclose all devices.
                 max(device.outer_radius for device in self.devices),
-                masses=self.stack.links(overlap, np.zeros(1)).mass[0].tolist(),
-                compliances=overlap.compliance[0].tolist(),
-                rest_angles=self.stack.unloaded_hinges(overlap, turns)[0].tolist(),
+                masses=self.stack.links(overlap, 0.0).mass.tolist(),
+                compliances=overlap.compliance.tolist(),
+                rest_angles=rest.tolist(),
                 axial_stiffness=sum(device.axial_stiffness for device in self.devices),
                 tip=int(tip.argmax()),
             ),

@@ -89,21 +89,18 @@ def bent(angles):
     chain, in which bends and rotations of the devices are measured.
 
     Args:
-        angles: (N, 2 J), positions of the hinges in the order of the chain, rad.
+        angles: (2 J,), positions of the hinges in the order of the chain, rad.
 
     Returns:
-        Bends (N, J) complex, and twists (N, J), rad.
+        Bends (J,) complex, and twists (J,), rad.
     """
-    count, joints = angles.shape[0], angles.shape[1] // 2
-    bends = np.empty((count, joints), np.complex128)
-    twists = np.empty((count, joints))
-    for i in range(count):
-        twist = 0.0
-        for j in range(joints):
-            first = j % 2
-            x, y = angles[i, 2 * j + first], angles[i, 2 * j + 1 - first]
-            bends[i, j], twists[i, j] = _bend(x, y, first) * unit(twist), twist
-            twist += _twist(x, y, first)
+    joints, twist = len(angles) // 2, 0.0
+    bends, twists = np.empty(joints, np.complex128), np.empty(joints)
+    for j in range(joints):
+        first = j % 2
+        x, y = angles[2 * j + first], angles[2 * j + 1 - first]
+        bends[j], twists[j] = _bend(x, y, first) * unit(twist), twist
+        twist += _twist(x, y, first)
     return bends, twists
 
 
@@ -114,46 +111,50 @@ def _dot(one, other):
 
 @compiled
 def unloaded_hinges(shape):
-    """Rest angles (N, J, 2) of the hinges of the unloaded chain."""
-    free = np.empty((*shape.shape, 2))
-    for i in range(shape.shape[0]):
-        twist = 0.0
-        for j in range(shape.shape[1]):
-            x, y = _hinges(shape[i, j] * unit(-twist), j % 2)
-            free[i, j, 0], free[i, j, 1] = x, y
-            twist += _twist(x, y, j % 2)
+    """Angles (J, 2) of the hinges about x and y of the unloaded chain, rad.
+
+    Args:
+        shape: (J,) complex, rest angles of the joints, rad.
+    """
+    free, twist = np.empty((len(shape), 2)), 0.0
+    for j in range(len(shape)):
+        x, y = _hinges(shape[j] * unit(-twist), j % 2)
+        free[j, 0], free[j, 1] = x, y
+        twist += _twist(x, y, j % 2)
     return free
 
 
 @compiled
 def free_hinges(shape, compliance, angles):
-    """Rest angles (N, J, 2) of the hinges, see `Stack.free_hinges`.
+    """Rest angles (J, 2) about x and y of the hinges of the chain as it is bent, rad.
+
+    Two hinges measure a bend differently in each direction, and twist. The springs have
+    the torques of the isotropic energy Σ|β_j - ΣR_k e_k|²/2C_j, in which β_j depends on
+    the hinges of the joint and on the twist of those before it: at angles θ, the rest
+    angles are θ - C ∂E/∂θ.
 
     Args:
-        shape: (N, J) complex, rest angles of the joints, rad.
-        compliance: (N, J), rad/(N·m).
-        angles: (N, 2 J), positions of the hinges, rad.
+        shape: (J,) complex, rest angles of the joints, rad.
+        compliance: (J,), rad/(N·m).
+        angles: (2 J,), positions of the hinges in the order of the chain, rad.
     """
-    count, joints = shape.shape
+    joints = len(shape)
     bends, twists = bent(angles)
-    free = np.empty((count, joints, 2))
-    over = np.empty(2, np.complex128)
-    for i in range(count):
-        for j in range(joints):
-            first = j % 2
-            x, y = angles[i, 2 * j + first], angles[i, 2 * j + 1 - first]
-            over[0] = _difference(x, y, first, _STEP, 0.0)
-            over[1] = _difference(x, y, first, 0.0, _STEP)
-            pull = (shape[i, j] - bends[i, j]) * unit(-twists[i, j])
-            free[i, j, 0] = x + _dot(over[0], pull)
-            free[i, j, 1] = y + _dot(over[1], pull)
-        # Torsional moment of all beyond the joint: derivative of the energy by a twist.
-        moment = 0.0
-        for j in range(joints - 1, -1, -1):
-            first = j % 2
-            x, y = angles[i, 2 * j + first], angles[i, 2 * j + 1 - first]
-            turn = _twist_rates(x, y, first)
-            for axis in range(2):
-                free[i, j, axis] -= compliance[i, j] * moment * turn[axis]
-            moment -= _dot(shape[i, j], 1j * bends[i, j]) / compliance[i, j]
+    free, over = np.empty((joints, 2)), np.empty(2, np.complex128)
+    for j in range(joints):
+        first = j % 2
+        x, y = angles[2 * j + first], angles[2 * j + 1 - first]
+        over[0] = _difference(x, y, first, _STEP, 0.0)
+        over[1] = _difference(x, y, first, 0.0, _STEP)
+        pull = (shape[j] - bends[j]) * unit(-twists[j])
+        free[j, 0], free[j, 1] = x + _dot(over[0], pull), y + _dot(over[1], pull)
+    # Torsional moment of all beyond the joint: derivative of the energy by a twist.
+    moment = 0.0
+    for j in range(joints - 1, -1, -1):
+        first = j % 2
+        x, y = angles[2 * j + first], angles[2 * j + 1 - first]
+        turn = _twist_rates(x, y, first)
+        for axis in range(2):
+            free[j, axis] -= compliance[j] * moment * turn[axis]
+        moment -= _dot(shape[j], 1j * bends[j]) / compliance[j]
     return free

@@ -1,12 +1,18 @@
 """Twist of coaxial devices: a one-dimensional rod along each of them.
 
-The nodes of a rod are those of the chain when the device reaches its end. The rotary
-unit holds node 0; the last node is the device's end. A segment has the torque
+The M + 1 nodes of a rod are those of the chain when the device reaches its end. The
+rotary unit holds node 0; the last node is the device's end. A segment has the torque
 GJ/l (Δφ + τ Δφ'), as the torsion hinges of a single catheter have. The rod has no
 inertia: it is in equilibrium with its loads at the end of every control step.
+
+Functions of one simulation; K devices, J = M - 1 joints of the chain, which are the
+inner nodes of a device that reaches its end. `angles` (K, M + 1) are rotations of the
+nodes, rad; `gaps` (K,) the distance from the end of each device to that of the chain,
+m; `nodes` (M + 1,) distances from a device's end, from proximal to distal, m.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,110 +26,28 @@ STICKING = 0.02
 _ROUNDS = 5
 
 
-class Rods:
-    """The rods of K devices in N simulations.
+class Rods(NamedTuple):
+    """The rods of K devices.
 
     Attributes:
-        stiffness: (K, M), torsional stiffness of the M segments, N·m/rad.
+        stiffness: (K, M), torsional stiffness of the segments, N·m/rad.
+        times: (K,), relaxation times τ of the materials, s.
     """
 
-    def __init__(
-        self, devices: Sequence[Device], nodes: np.ndarray, relaxation_times: np.ndarray
-    ):
-        """Computes the stiffness of the segments.
+    stiffness: np.ndarray
+    times: np.ndarray
 
-        Args:
-            nodes: (M + 1,), distances of the nodes from a device's end, from proximal
-                to distal, m; the last one is 0.
-            relaxation_times: (K,), relaxation times τ, s.
-        """
-        self._nodes, self._relaxation_times = nodes, relaxation_times
+    @classmethod
+    def of(cls, devices: Sequence[Device], nodes: np.ndarray) -> "Rods":
+        """The rods of devices."""
         tips = np.minimum(nodes, [[device.tip_length] for device in devices])
         in_tips = -np.diff(tips)
         in_shafts = -np.diff(nodes) - in_tips
         # Twist per torque of a segment, ∫ds/GJ.
         in_tips /= [[device.tip.torsional_stiffness] for device in devices]
         in_shafts /= [[device.shaft.torsional_stiffness] for device in devices]
-        self.stiffness = 1 / (in_tips + in_shafts)
-
-    def turn(
-        self,
-        angles: np.ndarray,
-        turned: np.ndarray,
-        duration: float,
-        torque: np.ndarray | float = 0.0,
-        rate: np.ndarray | float = 0.0,
-        friction: np.ndarray | float = 0.0,
-        brake: np.ndarray | float = 0.0,
-    ) -> np.ndarray:
-        """Rotates the bases and returns the equilibrium of the rods.
-
-        Args:
-            angles: (N, K, M + 1), rotation of the nodes, rad.
-            turned: (N, K), rotations of the bases, rad.
-            duration: duration of that rotation, s.
-            torque: (N, K, M), torque on the nodes except the base, N·m.
-            rate: (N, K, M), minus its derivative by the rotation, N·m/rad.
-            friction: (N, K, M), largest torque of Coulomb friction, N·m.
-            brake: (N, K, M), torque per rate of rotation, N·m·s/rad.
-
-        Returns:
-            (N, K, M + 1), rotation of the nodes, rad.
-        """
-        loads = np.empty((4, *angles.shape[:-1], angles.shape[-1] - 1))
-        loads[0], loads[1], loads[2], loads[3] = torque, rate, friction, brake
-        lag, least = self._relaxation_times / duration, STICKING * duration
-        given = np.ascontiguousarray(angles), turned, self.stiffness, lag, least
-        return _turned(*given, duration, loads)
-
-    def at_joints(self, angles: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """Rotations of the devices at the joints of the chain.
-
-        The rotation is linear between two nodes; a joint beyond a device's end has that
-        of the end.
-
-        Args:
-            angles: (N, K, M + 1), rotation of the nodes, rad.
-            gaps: (N, K), distance from the end of each device to that of the chain, m.
-
-        Returns:
-            (N, K, J), rad; the J = M - 1 joints are the inner nodes of a device that
-            reaches the end of the chain.
-        """
-        return _at_joints(np.ascontiguousarray(angles), gaps, self._nodes)
-
-    def at_nodes(self, loads: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """Loads on the nodes, from loads at the joints of the chain.
-
-        Args:
-            loads: (F, N, K, J), F kinds of loads at the joints.
-            gaps: (N, K), distance from the end of each device to that of the chain, m.
-
-        Returns:
-            (F, N, K, M), loads on the nodes except the base; the nodes on both sides of
-            a joint share its load.
-        """
-        return _at_nodes(loads, gaps, self._nodes)
-
-    def slip(self, angles: np.ndarray, torque: float) -> tuple[np.ndarray, np.ndarray]:
-        """Bases whose clamps slip at a torque.
-
-        Args:
-            angles: (N, K, M + 1), rotation of the nodes, rad.
-            torque: of slip, N·m.
-
-        Returns:
-            Way (N, K) of the slip, and rotation (N, K) of the bases after it, rad.
-        """
-        most = torque / self.stiffness[:, 0]
-        lead = angles[..., 0] - angles[..., 1]
-        slipped = angles[..., 1] + np.clip(lead, -most, most)
-        held = np.where(np.abs(lead) > most, slipped, angles[..., 0])
-        return np.abs(angles[..., 0] - held), held
-
-    def base_torque(self, angles: np.ndarray) -> np.ndarray:
-        """Torque (N, K) of the rotary units on the devices at rest, N·m."""
-        return -self.stiffness[:, 0] * np.diff(angles[..., :2], axis=-1)[..., 0]
+        times = np.array([device.relaxation_time for device in devices])
+        return cls(1 / (in_tips + in_shafts), times)
 
 
 @compiled
@@ -136,35 +60,40 @@ def _on_rod(joint, gap, nodes, first):
 
 
 @compiled
-def _at_joints(angles, gaps, nodes):
-    """Rotations (N, K, J) at the joints of the chain, see `Rods.at_joints`."""
-    (count, devices), joints = gaps.shape, len(nodes) - 2
-    turns = np.empty((count, devices, joints))
-    for i in range(count):
-        for k in range(devices):
-            first = 0
-            for j in range(joints):
-                first, share = _on_rod(j, gaps[i, k], nodes, first)
-                near, far = angles[i, k, first], angles[i, k, first + 1]
-                turns[i, k, j] = near + share * (far - near)
+def at_joints(angles, gaps, nodes):
+    """Rotations (K, J) of the devices at the joints of the chain, rad.
+
+    The rotation is linear between two nodes; a joint beyond a device's end has that of
+    the end.
+    """
+    devices, joints = len(gaps), len(nodes) - 2
+    turns = np.empty((devices, joints))
+    for k in range(devices):
+        first = 0
+        for j in range(joints):
+            first, share = _on_rod(j, gaps[k], nodes, first)
+            near, far = angles[k, first], angles[k, first + 1]
+            turns[k, j] = near + share * (far - near)
     return turns
 
 
 @compiled
-def _at_nodes(loads, gaps, nodes):
-    """Loads (F, N, K, M) on the nodes distal of the base, see `Rods.at_nodes`."""
-    kinds, count, devices, joints = loads.shape
-    shared = np.zeros((kinds, count, devices, joints + 1))
-    for i in range(count):
-        for k in range(devices):
-            first = 0
-            for j in range(joints):
-                first, share = _on_rod(j, gaps[i, k], nodes, first)
-                for kind in range(kinds):
-                    load = loads[kind, i, k, j]
-                    shared[kind, i, k, first] += share * load
-                    if first > 0:
-                        shared[kind, i, k, first - 1] += (1 - share) * load
+def at_nodes(loads, gaps, nodes):
+    """Loads (F, K, M) on the nodes but the bases, from F kinds (F, K, J) at the joints.
+
+    The nodes on both sides of a joint share its load.
+    """
+    kinds, devices, joints = loads.shape
+    shared = np.zeros((kinds, devices, joints + 1))
+    for k in range(devices):
+        first = 0
+        for j in range(joints):
+            first, share = _on_rod(j, gaps[k], nodes, first)
+            for kind in range(kinds):
+                load = loads[kind, k, j]
+                shared[kind, k, first] += share * load
+                if first > 0:
+                    shared[kind, k, first - 1] += (1 - share) * load
     return shared
 
 
@@ -211,31 +140,38 @@ def _balance_sticking(diagonal, beside, load, friction, least, move):
 
 
 @compiled
-def _turned(angles, base, stiffness, lag, least, duration, loads):
-    """Rotations of rods after a rotation of their bases, see `Rods.turn`."""
-    count, devices, nodes = angles.shape
-    segments = nodes - 1
-    new = np.empty_like(angles)
+def turned(angles, base, rods, duration, loads):
+    """Rotations (K, M + 1) of the nodes in equilibrium after a rotation of the bases.
+
+    Args:
+        base: (K,), rotations of the bases, rad.
+        rods: `Rods`.
+        duration: of that rotation, s.
+        loads: (3, K, M) on the nodes but the bases: torque, N·m, minus its derivative
+            by the rotation, N·m/rad, and largest torque of Coulomb friction, N·m.
+    """
+    devices, segments = rods.stiffness.shape
+    new, least = np.empty_like(angles), STICKING * duration
     diagonal, beside = np.empty(segments), np.empty(segments)
     load, move = np.empty(segments), np.empty(segments)
-    for i in range(count):
-        for k in range(devices):
-            for m in range(segments):
-                now = stiffness[k, m] * (angles[i, k, m + 1] - angles[i, k, m])
-                coupling = (1 + lag[k]) * stiffness[k, m]
-                load[m] = loads[0, i, k, m] - now
-                # A negative rate has no equilibrium nearby; there the torque is
-                # explicit, and the damping of the rod bounds the speed.
-                rate = max(loads[1, i, k, m], 0.0)
-                diagonal[m] = coupling + rate + loads[3, i, k, m] / duration
-                if m == 0:
-                    load[0] += coupling * base[i, k]
-                else:
-                    load[m - 1] += now
-                    diagonal[m - 1] += coupling
-                    beside[m - 1] = -coupling
-            _balance_sticking(diagonal, beside, load, loads[2, i, k], least, move)
-            new[i, k, 0] = angles[i, k, 0] + base[i, k]
-            for m in range(segments):
-                new[i, k, m + 1] = angles[i, k, m + 1] + move[m]
+    for k in range(devices):
+        lag = rods.times[k] / duration
+        for m in range(segments):
+            stiffness = rods.stiffness[k, m]
+            now = stiffness * (angles[k, m + 1] - angles[k, m])
+            coupling = (1 + lag) * stiffness
+            load[m] = loads[0, k, m] - now
+            # A negative rate has no equilibrium nearby; there the torque is explicit,
+            # and the damping of the rod bounds the speed.
+            diagonal[m] = coupling + max(loads[1, k, m], 0.0)
+            if m == 0:
+                load[0] += coupling * base[k]
+            else:
+                load[m - 1] += now
+                diagonal[m - 1] += coupling
+                beside[m - 1] = -coupling
+        _balance_sticking(diagonal, beside, load, loads[2, k], least, move)
+        new[k, 0] = angles[k, 0] + base[k]
+        for m in range(segments):
+            new[k, m + 1] = angles[k, m + 1] + move[m]
     return new

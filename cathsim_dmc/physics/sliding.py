@@ -10,7 +10,6 @@ import operator
 
 import numpy as np
 
-from cathsim_dmc.entities import coaxial_loops, hinge_loops
 from cathsim_dmc.entities.chain import (
     MAX_PUSH_FORCE,
     MAX_PUSH_SPEED,
@@ -18,7 +17,6 @@ from cathsim_dmc.entities.chain import (
     MAX_TORQUE,
     Chain,
 )
-from cathsim_dmc.entities.coaxial import Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import postures
 from cathsim_dmc.imaging.device import Shadow
@@ -35,7 +33,6 @@ BEHIND = 0.3
 DEVICE_PLACES = np.arange(7, -1, -1) * 15e-3
 # Way by which a device slides before the friction in the lumen acts in full, m.
 _PRESLIDING = 40e-6
-_GAP_STEP = 1e-8  # m, for a derivative
 # Way of a slipping clamp in a control step by the force beyond its largest, m/N. The
 # axial force of a stiff wire in a tight bend changes by 0.8 N/mm at most.
 _GIVE = 1e-3
@@ -124,11 +121,16 @@ class SlidingDevices(SingleDevice):
         # Views: writing to them writes the state.
         self._insertion = world.parameters[:, :count]
         self._angles = world.parameters[:, count:].reshape(total, count, -1)
-        self._places = ChainFields(world.model, self._entity)
-        self._arrays: list[list[np.ndarray]] = [[]] * total
-        self._radii = np.array([device.outer_radius for device in self._entity.devices])
+        fields, stack = ChainFields(world.model, self._entity), self._stack
+        self._hinges = self._qpos[:, fields.qpos]
+        self._made = (
+            (stack.tables, self._rods, stack.arms, stack.of_links),
+            (self._entity.lumen_friction, CONTROL_TIMESTEP, MAX_TORQUE),
+            fields.places,
+        )
+        self._fields: list[tuple[np.ndarray, ...]] = [()] * total
         # Factors of all stiffnesses, and of all loss factors.
-        self._friction, self._factors = np.zeros(total), np.ones((2, total))
+        self._friction, self._factors = np.zeros(total), np.ones((total, 2))
         # Fraction of the friction between devices that acts, positive when the inner
         # one has slid forward; that friction, and the forces of the drives but for the
         # push force, which the leading device bears, N.
@@ -149,13 +151,12 @@ class SlidingDevices(SingleDevice):
         self._axial[index] = self._others[index] = 0.0
         drawn = episode.friction, episode.stiffness, episode.loss
         usual = self._entity.friction, 1.0, 1.0
-        self._friction[index], *self._factors[:, index] = (
+        self._friction[index], *self._factors[index] = (
             default if value is None else value
             for value, default in zip(drawn, usual, strict=True)
         )
-        self._arrays[index] = [self.world.field(index, name) for name in FIELDS]
-        turns = np.zeros((1, len(gaps), len(self._stack.spans)))
-        self._write(np.array([index]), self._stack.overlap(gaps[None]), turns)
+        self._fields[index] = tuple(self.world.field(index, name) for name in FIELDS)
+        sliding_loops.lay(self._made, gaps, self._angles[index], *self._chain(index))
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Moves the devices and writes the properties of the chains.
@@ -172,7 +173,7 @@ class SlidingDevices(SingleDevice):
         """
         reached = self._qpos[:, self._index.insertion_qpos].copy()
         before, step = self._pushed(), MAX_PUSH_SPEED * CONTROL_TIMESTEP
-        every, leaders = np.arange(len(before)), np.argmax(self._insertion, axis=1)
+        leaders = np.argmax(self._insertion, axis=1)
         told = step * action[:, 0::2]
         moved = self._clamped(told, leaders)
         self.slipped[:, 0::2] += np.abs(told - moved)
@@ -182,10 +183,10 @@ class SlidingDevices(SingleDevice):
         slid = -np.diff(target - before, axis=1) / _PRESLIDING
         self._ways[:] = np.clip(self._ways + slid, -1.0, 1.0)
         self._insertion[:] = target
-        self._write(every, *self._turn(action[:, 1::2], lead, state))
+        self._settle(action[:, 1::2], lead, state)
         command = ((lead - reached) / step)[:, None]
         slip = np.abs(self._drives.follow(command)[:, 0])
-        self.slipped[every, 2 * leaders] += slip
+        self.slipped[np.arange(len(before)), 2 * leaders] += slip
         return command
 
     def _clamped(self, told: np.ndarray, leaders: np.ndarray) -> np.ndarray:
@@ -201,84 +202,45 @@ class SlidingDevices(SingleDevice):
         given = way * np.minimum(way * told, -excess * _GIVE)
         return np.where(excess < 0.0, told, given)
 
-    def _turn(
-        self, rate: np.ndarray, lead: np.ndarray, state: Readings
-    ) -> tuple[Overlap, np.ndarray]:
-        """Turns the devices; their overlap, and rotations (N, K, J) at the joints."""
-        stack, rods = self._stack, self._rods
-        gaps = sliding_loops.gaps(np.ascontiguousarray(self._insertion))
-        overlap, turns = stack.overlap(gaps), rods.at_joints(self._angles, gaps)
-        hinges = np.ascontiguousarray(self._qpos[:, self._places.qpos])
-        bends, _ = hinge_loops.bent(hinges)
-        loads = np.empty((3, *turns.shape))
-        loads[0], loads[1] = coaxial_loops.restoring(overlap, bends, turns)
-        loads[:2] *= self._factors[0, :, None, None]
-        # Nothing rubs in the sheath.
-        depth = self.world.start_depth
-        force = sliding_loops.rubbing(state.external_force, lead, depth, stack.nodes)
-        given = stack.arms, overlap, force, self._friction
-        loads[2] = coaxial_loops.wall_friction(*given)
-        if len(self._entity.devices) > 1:
-            pressure = self._push(overlap, gaps, bends, turns, loads[0], state)
-            # The lumen holds back the device in it; that one is too soft in torsion
-            # to turn the lumen in its turn.
-            rubbing = self._entity.lumen_friction * pressure
-            loads[2, :, :-1] += rubbing * self._radii[:-1, None]
-        turned = MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
-        self._angles[:] = rods.turn(
-            self._angles, turned, CONTROL_TIMESTEP, *rods.at_nodes(loads, gaps)
-        )
-        slip, self._angles[..., 0] = rods.slip(self._angles, MAX_TORQUE)
-        self.slipped[:, 1::2] += slip
-        return overlap, rods.at_joints(self._angles, gaps)
+    def _chain(self, index: int) -> tuple:
+        """Hinges, friction, factors and fields of the chain of one simulation."""
+        drawn = self._friction[index], self._factors[index]
+        return self._hinges[index], *drawn, self._fields[index]
 
-    def _push(
-        self,
-        overlap: Overlap,
-        gaps: np.ndarray,
-        bends: np.ndarray,
-        turns: np.ndarray,
-        torque: np.ndarray,
-        state: Readings,
-    ) -> np.ndarray:
-        """Computes the forces of the drives from the devices in each other.
+    def _settle(self, rate: np.ndarray, lead: np.ndarray, state: Readings) -> None:
+        """Turns the devices, writes the chains, and computes the forces of the drives.
 
-        Returns:
-            Forces (N, K - 1, J) of each device on the next one at the joints, N.
+        Args:
+            rate: (N, K) in [-1, 1], of the rotation of each device.
+            lead: (N,), insertion of the chain, m.
+            state: Readings after the last control step.
         """
-        stack, factor = self._stack, self._factors[0, :, None, None]
-        slopes = self._rods.at_joints(self._angles, gaps + _GAP_STEP) - turns
-        slopes *= torque / factor / _GAP_STEP
-        given = stack.tables, overlap, gaps, bends, turns, slopes
-        axial = factor * coaxial_loops.axial(*given)
-        start = np.zeros(gaps.shape)
-        every, leaders = np.arange(len(gaps)), np.argmin(gaps, axis=1)
-        # What the wall does to the links beyond; forces within are not MuJoCo's state.
-        beyond = -np.cumsum(state.external_force[:, ::-1], axis=1)[:, ::-1]
-        start[every, leaders] = sliding_loops.leading_load(
-            np.ascontiguousarray(beyond), state.centreline, gaps, stack.nodes
-        )
-        own = {"stiffness": overlap.stiffness, "moment": overlap.moment}
-        stiff = overlap._replace(**{name: factor * each for name, each in own.items()})
-        given = stack.link_lengths, stiff, bends, turns, axial, start, self._ways
-        friction = self._entity.lumen_friction
-        pressure, drag = coaxial_loops.pressure(*given, friction)
-        self._drag[:] = drag
-        self._axial[:] = axial.sum(axis=-1)
-        self._axial[:, :-1] += drag
-        self._axial[:, 1:] -= drag
-        # The drive of the leading device bears what the chain's does, and these.
-        self._others[:] = -self._axial[every, leaders]
-        return pressure
-
-    def _write(self, rows: np.ndarray, overlap: Overlap, turns: np.ndarray) -> None:
-        """Writes the properties of the chains of some simulations."""
-        angles, factors = self._qpos[rows, self._places.qpos], self._factors[:, rows]
-        rest = self._stack.free_hinges(overlap, turns, angles)
-        links = self._stack.links(overlap, self._friction[rows])
-        for row, number in enumerate(rows.tolist()):
-            arrays = self._arrays[number]
-            self._places.write(arrays, row, overlap, rest, links, factors)
+        nodes, turned = self._stack.nodes, MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
+        gaps = sliding_loops.gaps(np.ascontiguousarray(self._insertion))
+        # Nothing rubs in the sheath.
+        depth, outside = self.world.start_depth, state.external_force
+        force = sliding_loops.rubbing(outside, lead, depth, nodes)
+        count = gaps.shape[1]
+        load, axial = np.zeros(len(gaps)), np.zeros((*gaps.shape, len(nodes) - 2))
+        if count > 1:
+            # What the wall does to the links beyond; forces within are not MuJoCo's
+            # state.
+            beyond = -np.cumsum(outside[:, ::-1], axis=1)[:, ::-1]
+            beyond = np.ascontiguousarray(beyond)
+            load = sliding_loops.leading_load(beyond, state.centreline, gaps, nodes)
+        for i in range(len(gaps)):
+            sliding_loops.settle(
+                self._made, gaps[i], turned[i], force[i], load[i],
+                (self._angles[i], self._ways[i], self._drag[i], self.slipped[i, 1::2]),
+                axial[i], *self._chain(i),
+            )  # fmt: skip
+        if count > 1:
+            self._axial[:] = axial.sum(axis=-1)
+            self._axial[:, :-1] += self._drag
+            self._axial[:, 1:] -= self._drag
+            # The drive of the leading device bears what the chain's does, and these.
+            leaders = np.argmin(gaps, axis=1)
+            self._others[:] = -self._axial[np.arange(len(gaps)), leaders]
 
     # What others may read.
 
@@ -314,7 +276,8 @@ class SlidingDevices(SingleDevice):
             insertion=insertion,
             rotation=self._angles[..., 0].copy(),
             tip_rotation=self._angles[..., -1].copy(),
-            twist=self._rods.base_torque(self._angles),
+            twist=self._rods.stiffness[:, 0]
+            * (self._angles[..., 0] - self._angles[..., 1]),
             points=sliding_loops.points(line, gaps[..., None] + DEVICE_PLACES, nodes),
             leading_load=load,
             lumen_friction=np.abs(self._drag).sum(axis=1),

@@ -6,6 +6,86 @@ N simulations, K devices, J joints, L links; each simulation on its own.
 import numpy as np
 
 from cathsim_dmc.compiled import compiled
+from cathsim_dmc.entities import coaxial_loops, hinge_loops, torsion
+from cathsim_dmc.physics import chain_fields
+
+_GAP_STEP = 1e-8  # m, for a derivative
+
+
+@compiled
+def _lay(made, overlap, turns, hinges, friction, factors, fields):
+    (tables, _, _, of_links), _, places = made
+    shape = coaxial_loops.rest_angles(overlap.rest, turns)
+    rest = hinge_loops.free_hinges(shape, overlap.compliance, hinges)
+    links = coaxial_loops.links(overlap, tables[1], friction, *of_links)
+    chain_fields.write(fields, places, overlap, rest, links, factors)
+
+
+@compiled
+def lay(made, gaps, angles, hinges, friction, factors, fields):
+    """Writes the properties of the chain of one simulation; see `settle`."""
+    tables = made[0][0]
+    overlap = coaxial_loops.overlap(gaps, tables)
+    turns = torsion.at_joints(angles, gaps, tables[0])
+    _lay(made, overlap, turns, hinges, friction, factors, fields)
+
+
+@compiled
+def settle(
+    made, gaps, turned, force, load, state, axial, hinges, friction, factors, fields
+):
+    """Turns the devices of one simulation and writes the properties of its chain.
+
+    Args:
+        made: `tables` of the `coaxial.Stack`, its `torsion.Rods`, `arms` and
+            `of_links`; Coulomb coefficient between devices, control step, s, and torque
+            at which a clamp slips, N·m; `places` of the `ChainFields`.
+        gaps: (K,), way from the end of each device to that of the chain, m.
+        turned: (K,), by how much the bases are turned, rad.
+        force: (L,), of the wall on the links, N.
+        load: axial force in the leading device where it leaves the others, N.
+        state: (K, M + 1) rotations of the nodes, rad; (K - 1,) fraction of the friction
+            between devices that acts; (K - 1,) that friction, N; (K,) way by which the
+            clamps have slipped, rad. All but the second change.
+        axial: (K, J), receives the axial forces at the joints, N.
+        hinges: (2 J,), positions of the hinges, rad.
+        friction: Coulomb coefficient of an uncoated device on the wall.
+        factors: (2,), of all stiffnesses, and of all loss factors.
+        fields: live `chain_fields.FIELDS` of its model.
+    """
+    (tables, rods, arms, of_links), (lined, duration, torque), _ = made
+    angles, ways, drag, slipped = state
+    nodes, lengths, radii = tables[0], tables[1], of_links[0]
+    overlap = coaxial_loops.overlap(gaps, tables)
+    turns = torsion.at_joints(angles, gaps, nodes)
+    bends, _ = hinge_loops.bent(hinges)
+    loads = np.empty((3, *turns.shape))
+    loads[:2] = coaxial_loops.restoring(overlap, bends, turns) * factors[0]
+    loads[2] = coaxial_loops.wall_friction(arms, overlap.outermost, force, friction)
+    if len(gaps) > 1:
+        slopes = torsion.at_joints(angles, gaps + _GAP_STEP, nodes) - turns
+        slopes *= loads[0] / factors[0] / _GAP_STEP
+        given = overlap, gaps, bends, turns, slopes
+        axial[:] = factors[0] * coaxial_loops.axial(tables, *given)
+        start = np.zeros(len(gaps))
+        start[gaps.argmin()] = load
+        given = lengths, overlap, bends, turns, axial, start, ways, lined, factors[0]
+        pressure, drag[:] = coaxial_loops.pressure(*given)
+        # The lumen holds back the device in it; that one is too soft in torsion to turn
+        # the lumen in its turn.
+        for k in range(len(gaps) - 1):
+            loads[2, k] += lined * pressure[k] * radii[k]
+    borne = torsion.at_nodes(loads, gaps, nodes)
+    angles[:] = torsion.turned(angles, turned, rods, duration, borne)
+    for k in range(len(gaps)):
+        most = torque / rods.stiffness[k, 0]
+        ahead = angles[k, 0] - angles[k, 1]
+        if abs(ahead) > most:
+            held = angles[k, 1] + min(max(ahead, -most), most)
+            slipped[k] += abs(angles[k, 0] - held)
+            angles[k, 0] = held
+    turns = torsion.at_joints(angles, gaps, nodes)
+    _lay(made, overlap, turns, hinges, friction, factors, fields)
 
 
 @compiled

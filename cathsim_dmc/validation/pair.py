@@ -126,8 +126,8 @@ def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float,
         across *= np.arcsin(sine) / sine if sine else 1.0
         still = Rotation.from_rotvec(across) * still
         found.append((still.inv() * frame).as_rotvec()[2])
-    _, taken = hinge_loops.bent(in_order(angles)[None])
-    return float(found[-1]), float(found[-2] - taken[0, -1])
+    _, taken = hinge_loops.bent(in_order(angles))
+    return float(found[-1]), float(found[-2] - taken[-1])
 
 
 def smoothness() -> Check:
@@ -137,9 +137,8 @@ def smoothness() -> Check:
     entity = DeviceStack(sliding.SLIDING_PAIR)
     stack, length = entity.stack, float(entity.link_lengths.sum())
     gaps = np.stack([np.maximum(-leads, 0.0), np.maximum(leads, 0.0)], axis=-1)
-    turns = np.zeros((len(leads), 2, len(stack.spans)))
-    angles = np.real(stack.rest_angles(stack.overlap(gaps), turns))
     # All shapes lie in one plane here.
+    angles = np.array([stack.overlap(gap).rest.sum(axis=0) for gap in gaps])
     heading = np.cumsum(np.pad(angles, ((0, 0), (1, 0))), axis=-1)
     links = stack.link_lengths * np.stack([np.sin(heading), np.cos(heading)])
     curve = [free_curve(entity.devices, gap, length)[::2] for gap in gaps]

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from cathsim_dmc.entities import coaxial_loops, hinge_loops, posture
+from cathsim_dmc.entities import posture
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
-from cathsim_dmc.physics import chain_fields
+from cathsim_dmc.physics import chain_fields, sliding_loops
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check
@@ -152,8 +152,9 @@ def simulate(
     rig.compile()
     entity: Any = rig.catheter
     stack, rods = entity.stack, entity.rods
-    fields = chain_fields.ChainFields(rig.model, entity)
-    arrays = [getattr(rig.model, name) for name in chain_fields.FIELDS]
+    places = chain_fields.ChainFields(rig.model, entity)
+    hinges = rig.data.qpos[places.qpos]
+    fields = tuple(getattr(rig.model, name) for name in chain_fields.FIELDS)
     if beyond is not None:
         # Straight, half a circle, and straight.
         start = stack.nodes[0] - beyond - np.pi * BEND_RADIUS
@@ -164,31 +165,21 @@ def simulate(
         held = 2 * int((stack.nodes[1:-1] > beyond - 1e-6).sum())
         start = int(rig.model.jnt_dofadr[rig.model.joint(f"{rig.name}/bend_x_1").id])
         rig.model.dof_armature[start : start + held] = _HELD
-    gap, none = np.asarray(gaps, float)[None], np.zeros(1)
-    overlap = stack.overlap(gap)
-    turns = np.zeros((1, len(names), len(stack.nodes)))
-    turns += np.asarray(rotation)[:, None]
+    gap = np.asarray(gaps, float)
+    angles = np.tile(np.asarray(rotation, float)[:, None], len(stack.nodes))
+    made = (stack.tables, rods, stack.arms, stack.of_links)
+    made = made, (0.0, CONTROL_TIMESTEP, np.inf), places.places
+    still, force = np.zeros(len(gap)), np.zeros(len(rig.lengths))
+    axial = np.zeros((len(gap), len(stack.spans)))
+    state = angles, np.zeros(len(gap) - 1), np.zeros(len(gap) - 1), np.zeros(len(gap))
+    given = made, gap, still, force, 0.0, state, axial, hinges, 0.0, np.ones(2), fields
     for _ in range(round(duration / CONTROL_TIMESTEP)):
-        at = rods.at_joints(turns, gap)
-        qpos = rig.data.qpos[None, fields.qpos]
-        bends, _ = hinge_loops.bent(qpos)
-        loads = np.array(coaxial_loops.restoring(overlap, bends, at))
-        turns = rods.turn(
-            turns, np.zeros(gap.shape), CONTROL_TIMESTEP, *rods.at_nodes(loads, gap)
-        )
-        after = rods.at_joints(turns, gap)
-        rest = stack.free_hinges(overlap, after, qpos)
-        links = stack.links(overlap, none)
-        fields.write(arrays, 0, overlap, rest, links, np.ones((2, 1)))
+        sliding_loops.settle(*given)
         rig.run(CONTROL_TIMESTEP)
     mujoco.mj_kinematics(rig.model, rig.data)
-    bends, _ = hinge_loops.bent(rig.data.qpos[None, fields.qpos])
-    slopes = rods.at_joints(turns, gap + 1e-8) - rods.at_joints(turns, gap)
-    slopes *= loads[0] / 1e-8
-    force = coaxial_loops.axial(stack.tables, overlap, gap, bends, after, slopes)
-    force = force[0].sum(axis=-1)
+    sliding_loops.settle(*given)
     end = rig.head_position - rig.joints[0]
-    return Rods(turns[0, :, -1], end, force=force)
+    return Rods(angles[:, -1], end, force=axial.sum(axis=-1))
 
 
 def work(speed: float) -> tuple[float, float]:
