@@ -88,7 +88,7 @@ def test_the_moment_of_a_record_is_that_of_the_environment(pushed):
 def test_glass_covers_what_the_surface_covers_and_darkens_at_the_rim():
     tube = make_tube(radius=0.02, length=0.08, sides=48, rings=9)
     vertices, faces = tube.vertices, tube.faces
-    projection = ParallelProjection.of(vertices, margin=0.01, height=200)
+    projection = ParallelProjection.of(vertices, margin=0.01, size=200)
     picture = glass(vertices, faces, projection)
     alpha = picture.behind[..., 3]
     rows, columns = projection.shape

@@ -16,7 +16,6 @@ from cathsim_dmc.anatomy.scan.places import describe
 from cathsim_dmc.anatomy.tree_file import read_tree
 from cathsim_dmc.cli.options import Json, print_json, show
 from cathsim_dmc.pictures.figure import anatomy_figure
-from cathsim_dmc.validation.wall import validate_anatomy
 
 phantoms = SubcommandApp()
 _PICTURE = "check.png"  # three views of an anatomy, in its directory
@@ -165,6 +164,9 @@ def check(
         figure: PNG of three views; check.png in a directory of an anatomy if left
             out.
     """
+    # Not at the top: an import of a scan needs none of the simulation.
+    from cathsim_dmc.validation.wall import validate_anatomy
+
     anatomy = suite.load_anatomy(phantom)
     if figure is None and Path(phantom).is_dir():
         figure = Path(phantom) / _PICTURE

@@ -90,15 +90,15 @@ def force_map() -> LinearSegmentedColormap:
 
 @functools.lru_cache(maxsize=16)
 def background(
-    surface: Any, view: str, height: int, rest: Any = None
+    surface: Any, view: str, size: int, rest: Any = None
 ) -> tuple[ParallelProjection, Glass]:
-    """A vessel as glass in one of `VIEWS`, in so many rows of pixels.
+    """A vessel as glass in one of `VIEWS`, with `size` pixels along the longer side.
 
     `rest` is the surface on which the view is centred, where that is another.
     """
     _, right, up, *_ = VIEWS[view]
     middle = (rest or surface).vertices
-    projection = ParallelProjection.of(middle, right, up, height=height)
+    projection = ParallelProjection.of(middle, right, up, size=size)
     return projection, glass(surface.vertices, surface.faces, projection)
 
 

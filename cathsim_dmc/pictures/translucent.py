@@ -48,7 +48,7 @@ class ParallelProjection:
         up: Sequence[float] = (0.0, 0.0, 1.0),
         *,
         margin: float = 6e-3,
-        height: int = 900,
+        size: int = 900,
     ) -> "ParallelProjection":
         """A view that shows all vertices.
 
@@ -57,12 +57,12 @@ class ParallelProjection:
             right, up: Unit vectors (3,) of the picture's axes; from the front (AP) of
                 the patient frame (LPS) by default.
             margin: Space around the vertices, metres.
-            height: Number of pixels from top to bottom.
+            size: Number of pixels along the longer side.
         """
         axes = np.array([right, up])
         flat = vertices @ axes.T
         low, high = flat.min(0) - margin, flat.max(0) + margin
-        return cls(axes[0], axes[1], low, high, height / (high[1] - low[1]))
+        return cls(axes[0], axes[1], low, high, size / (high - low).max())
 
     @property
     def towards(self) -> np.ndarray:
