@@ -128,19 +128,6 @@ def test_readings_of_the_task_are_those_sensors(environment, reseed):
     assert task.wall_force.sum > 0
 
 
-def test_friction_stays_in_its_cone(pressed, environment):
-    layout = environment.task.rollout.index
-    friction = environment.task.config.friction
-    for sensordata, _ in pressed[::10]:
-        contacts = layout.contacts(sensordata)
-        rows = sensordata[layout.wall_contacts].reshape(-1, 14)[contacts.present]
-        normal, tangents = rows[:, 1], rows[:, 2:4]
-        assert (normal >= -1e-12).all()
-        assert (
-            np.linalg.norm(tangents, axis=-1) <= friction * normal * 1.01 + 1e-9
-        ).all()
-
-
 # Wall.
 
 

@@ -133,7 +133,6 @@ def test_joints_and_names():
     assert physics.model.nv == physics.model.nq == len(JOINTS) == 16
     assert physics.model.nu == 0 and physics.model.neq == 0
     assert robot.mjcf_model.model == "robot"
-    assert Robot(name="follower").mjcf_model.model == "follower"
 
 
 def test_ranges_are_written_but_not_enforced():

@@ -6,7 +6,6 @@ import pytest
 from cathsim_dmc import suite
 from cathsim_dmc.imaging.biplane_loops import carried
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import observations
 
 TASK = "type1_lcca"
 OPTIONS = {
@@ -62,16 +61,3 @@ def test_a_frame_is_carried_without_turning_about_the_line():
     np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(frame[:, 2], tip, atol=1e-9)
     np.testing.assert_allclose(frame[:, 1], [0.0, 1.0, 0.0], atol=1e-9)
-
-
-def test_route_and_biplane_have_the_same_entries():
-    """So that a policy of the one can go on learning from the other."""
-    named = [
-        [
-            (entry.key.partition("_")[2], entry.shape)
-            for entry in observations.entries([name])
-            if not entry.key.endswith("action")
-        ]
-        for name in ("route", "biplane")
-    ]
-    assert named[0] == named[1]

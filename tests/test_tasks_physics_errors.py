@@ -42,29 +42,23 @@ def test_a_device_in_lumen_and_sheath_has_not_escaped():
     ]
 
 
-def test_exploding_force_ends_the_episode_as_a_physics_error(load, monkeypatch, caplog):
+def test_exploding_force_ends_the_episode_in_both_paths(
+    task, load, monkeypatch, caplog
+):
     monkeypatch.setattr(physics_errors, "MAX_FORCE", 1e-5)
     environment = load()
-    timestep = environment.reset()
+    timestep, steps = environment.reset(), 0
     with caplog.at_level(logging.ERROR):
         while not timestep.last():
-            timestep = environment.step(_push(environment))
-    task = environment.task
-    assert (task.termination, task.error) == ("physics_error", physics_errors.EXPLODED)
+            timestep, steps = environment.step(_push(environment)), steps + 1
+    own = environment.task
+    assert (own.termination, own.error) == ("physics_error", physics_errors.EXPLODED)
     assert timestep.reward == 0.0
     assert timestep.discount == 0.0
     (logged,) = caplog.messages
     assert logged.startswith(physics_errors.EXPLODED)
     assert environment.reset().first()
-    assert task.error is None
-
-
-def test_the_batch_reports_the_same_error(task, load, monkeypatch):
-    monkeypatch.setattr(physics_errors, "MAX_FORCE", 1e-5)
-    environment = load()
-    timestep, steps = environment.reset(), 0
-    while not timestep.last():
-        timestep, steps = environment.step(_push(environment)), steps + 1
+    assert own.error is None
     simulation = batch.BatchSimulation(task, 2, seeds=[3, 3])
     simulation.reset()
     for count in range(1, steps + 1):

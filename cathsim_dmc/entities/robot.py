@@ -118,15 +118,13 @@ class Robot(composer.ModelWrapperEntity):
         joints: The MJCF joints in the order of ``JOINTS``.
     """
 
-    def _build(self, device_radius: float = DEVICE_RADIUS, name: str = "robot"):
+    def _build(self, device_radius: float = DEVICE_RADIUS):
         """Builds the model.
 
         Args:
             device_radius: radius of the device between jaws and rollers, m.
-            name: name of the model, the prefix of its elements once attached.
         """
         root = mjcf.from_path(str(MODEL))
-        root.model = name
         super()._build(root)
         for joint in JOINTS:
             part, _, side = joint.rpartition("_")

@@ -19,6 +19,7 @@ from cathsim_dmc.tasks.observation_kind import (
     Entry,
     Frame,
     Observation,
+    ObservationKind,
     ObservationTable,
     Sizes,
 )
@@ -40,6 +41,14 @@ def _fluoroscopic(key: str, channels: int, unit: str, meaning: str) -> Entry:
         return (*sizes.fluoroscopy.resolution, sizes.fluoroscopy.planes * channels)
 
     return Entry(key, shape, unit, meaning, 0, 255, np.uint8)
+
+
+def _shown(entry: Entry, held: str = "", needs: str = "") -> None:
+    """Adds a row of one image, which the sensors hold under its key or another one."""
+    key, source = entry.key, held or entry.key
+    OBSERVATIONS[key] = ObservationKind(
+        lambda frame: {key: frame.images[source]}, (entry,), needs
+    )
 
 
 def _action(key: str) -> Entry:
@@ -116,13 +125,11 @@ def internal(frame: Frame) -> Observation:
     }
 
 
-@OBSERVATIONS.row(
+_shown(
     _fluoroscopic("image", 1, "grey level", "fluoroscopy, dark = opaque, by plane"),
+    held="past_0",
     needs=FLUOROSCOPY,
 )
-def image(frame: Frame) -> Observation:
-    """One fluoroscopic image, a channel for each plane."""
-    return {"image": frame.images["past_0"]}
 
 
 @OBSERVATIONS.row(
@@ -141,13 +148,11 @@ def sequential(frame: Frame) -> Observation:
     return {"sequential": np.concatenate(images, axis=-1)}
 
 
-@OBSERVATIONS.row(
+_shown(
     _fluoroscopic("segmentation", 2, "0 or 255", "channels: device, vessel, by plane"),
+    held="masks",
     needs=FLUOROSCOPY,
 )
-def segmentation(frame: Frame) -> Observation:
-    """Which pixels show the device, and which the vessel."""
-    return {"segmentation": frame.images["masks"]}
 
 
 @OBSERVATIONS.row(
@@ -348,17 +353,12 @@ def _endoluminal(
     return Entry(key, shape, unit, meaning, 0, high, dtype)
 
 
-@OBSERVATIONS.row(
+_shown(
     _endoluminal(
         "endoluminal", "grey level", "wall lit by a lamp at the head", 255, np.uint8
     )
 )
-def endoluminal(frame: Frame) -> Observation:
-    """View of the lumen from the head, without OpenGL."""
-    return {"endoluminal": frame.images["endoluminal"]}
-
-
-@OBSERVATIONS.row(
+_shown(
     _endoluminal(
         "endoluminal_distance",
         "m",
@@ -367,9 +367,6 @@ def endoluminal(frame: Frame) -> Observation:
         np.float32,
     )
 )
-def endoluminal_distance(frame: Frame) -> Observation:
-    """Distances to the wall from the head, without OpenGL."""
-    return {"endoluminal_distance": frame.images["endoluminal_distance"]}
 
 
 # Coaxial devices.
