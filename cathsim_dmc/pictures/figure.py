@@ -115,7 +115,7 @@ def anatomy_figure(anatomy: Anatomy) -> Picture:
 
 def draw_anatomy(axes: Any, anatomy: Anatomy, view: str = "front") -> None:
     """Draw an anatomy into axes whose units are millimetres."""
-    projection, picture = background(anatomy.surface, view, 700)
+    projection, picture = background(anatomy.surface, view, 450)
     _prepare(axes, projection, view)
     axes.imshow(picture.behind, extent=projection.extent_mm, interpolation="bilinear")
     for number, (name, vessel) in enumerate(anatomy.tree.vessels.items()):
