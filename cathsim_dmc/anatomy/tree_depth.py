@@ -17,6 +17,7 @@ _SLACK = 3e-3
 _AROUND = 120
 _SEED = 1.5e-3
 _APART = 0.1e-3
+_GROUP = 2.5  # points along each axis of a group, about
 # Projections on the one wall and the other; walls that meet at 30° take the most.
 _ROUNDS = 30
 # A place on a wall that lies no further than this inside another vessel is wall, m.
@@ -68,8 +69,10 @@ class TreeDepth:
         blocks, points = (
             np.ascontiguousarray(each, dtype=np.float64) for each in (blocks, points)
         )
+        reach = float(np.linalg.norm(points, axis=1).max())
         out = np.empty((len(blocks), len(points)))
-        _tree_depths(self._tree, self._creases, blocks, points, out)
+        groups = _grouped(points)
+        _tree_depths(self._tree, self._creases, blocks, points, reach, groups, out)
         return out
 
     @property
@@ -130,6 +133,21 @@ def _rings(line: Centreline) -> Array:
 def _box(nodes: Array) -> tuple[Array, Array]:
     centres, radii = nodes[:, :3], nodes[:, 6:]
     return (centres - radii).min(axis=0), (centres + radii).max(axis=0)
+
+
+def _grouped(points: Array) -> tuple[np.ndarray, Array, Array]:
+    """Groups (m,) of near points (m, 3), their middles (g, 3) and reaches (g,)."""
+    along = max(1, round(len(points) ** (1 / 3) / _GROUP))
+    size = max(float(np.ptp(points, axis=0).max()), 1e-9) / along
+    cells = ((points - points.min(axis=0)) / size).astype(int).clip(0, along - 1)
+    _, groups = np.unique(cells @ (1, along, along**2), return_inverse=True)
+    parts = [points[groups == group] for group in range(groups.max() + 1)]
+    middles = [own.mean(axis=0) for own in parts]
+    reaches = [
+        np.linalg.norm(own - middle, axis=1).max()
+        for own, middle in zip(parts, middles, strict=True)
+    ]
+    return groups, np.array(middles), np.array(reaches)
 
 
 @compiled
@@ -193,7 +211,9 @@ def _nearest(nodes, first, last, chosen, x, y, z):
 def _signed(tree, vessel, chosen, x, y, z, out):
     """Signed depth (m) in one vessel, and the nearest place of its wall in `out`.
 
-    Only the vessel's chosen rings are looked at.
+    Args:
+        tree: arrays of `TreeDepth`.
+        chosen: numbers of the vessel's rings that matter.
     """
     nodes, (first, last), flats = tree[0], tree[1][vessel], tree[2][vessel]
     k, u, value = _nearest(nodes, first, last, chosen, x, y, z)
@@ -239,17 +259,17 @@ def _square(place, x, y, z):
 
 
 @compiled
-def _rings_near(nodes, span, x, y, z, margin, chosen):
+def _rings_near(nodes, among, x, y, z, margin, chosen):
     """Depth of the rings of one vessel around a place.
 
     Those that matter are written behind their number, chosen[0].
     """
     best, deepest, count = np.inf, -np.inf, 0
-    for k in range(span[0], span[1] + 1):
+    for k in among:
         best = min(best, _from_node(nodes, k, x, y, z))
         deepest = max(deepest, nodes[k, 6] - math.sqrt(_square(nodes[k], x, y, z)))
     limit = (math.sqrt(best) + margin) ** 2
-    for k in range(span[0], span[1] + 1):
+    for k in among:
         if _from_node(nodes, k, x, y, z) <= limit:
             count += 1
             chosen[count] = k
@@ -258,13 +278,13 @@ def _rings_near(nodes, span, x, y, z, margin, chosen):
 
 
 @compiled
-def _creases_near(creases, x, y, z, margin, near):
+def _creases_near(creases, among, x, y, z, margin, near):
     """Those of the creases that matter around a place, a part of `near`."""
     closest, found = np.inf, 0
-    for c in range(len(creases)):
+    for c in among:
         closest = min(closest, _square(creases[c], x, y, z))
     limit = (math.sqrt(closest) + margin) ** 2
-    for c in range(len(creases)):
+    for c in among:
         if _square(creases[c], x, y, z) <= limit:
             near[found] = c
             found += 1
@@ -272,40 +292,64 @@ def _creases_near(creases, x, y, z, margin, near):
 
 
 @compiled
-def _tree_depths(tree, creases, blocks, points, out):
-    """Signed distances (n, q) m at blocks (n, 3) + points (q, 3) m, see `TreeDepth`."""
+def _tree_depths(tree, creases, blocks, points, reach, groups, out):
+    """Signed distance to the wall at every point of every block.
+
+    Args:
+        tree: arrays of `TreeDepth`.
+        creases: (c, 3) points where walls of two vessels meet, m.
+        blocks: (n, 3) middles of the blocks, m.
+        points: (q, 3) relative to the middle of a block, m, within `reach`.
+        groups: see `_grouped`; middles are relative to that of a block.
+        out: (n, q) m, > 0 inside.
+    """
     nodes, spans, _ = tree
-    wide = np.empty((len(spans), len(nodes) + 1), np.int64)
-    close, level, places = wide.copy(), np.empty(len(spans)), np.empty((2, 3))
-    edges, reach = np.empty(len(creases), np.int64), 0.0
-    for q in range(len(points)):
-        reach = max(reach, math.sqrt((points[q] ** 2).sum()))
-    margin = 2.0 * reach + 1e-6
+    group, middles, reaches = groups
+    vessels = len(spans)
+    rings, edges = np.arange(len(nodes)), np.arange(len(creases))
+    wide = np.empty((vessels, len(nodes) + 1), np.int64)
+    close = np.empty((vessels, len(nodes) + 1), np.int64)
+    level, depths = np.empty(vessels), np.empty(vessels)
+    first, second = np.empty(len(creases), np.int64), np.empty(len(creases), np.int64)
+    places = np.empty((2, 3))
     for n in range(len(blocks)):
         x, y, z = blocks[n]
-        for v in range(len(spans)):
-            around = margin + _SLACK
-            level[v] = _rings_near(nodes, spans[v], x, y, z, around, wide[v])
-            _rings_near(nodes, spans[v], x, y, z, margin, close[v])
-        bar = level.max() - margin - _SLACK
-        here = level >= bar, close, level >= bar - _SLACK, wide, places
-        near = _creases_near(creases, x, y, z, margin, edges)
-        for q in range(len(points)):
-            px, py, pz = x + points[q, 0], y + points[q, 1], z + points[q, 2]
-            depth = _tree_depth(tree, here, px, py, pz)
-            closest = np.inf
-            for c in near:
-                closest = min(closest, _square(creases[c], px, py, pz))
-            distance = min(abs(depth), math.sqrt(closest))
-            out[n, q] = math.copysign(distance, depth)
+        margin = 2.0 * reach + _SLACK
+        for v in range(vessels):
+            among = rings[spans[v, 0] : spans[v, 1] + 1]
+            level[v] = _rings_near(nodes, among, x, y, z, margin, wide[v])
+        bar = level.max() - margin
+        around = _creases_near(creases, edges, x, y, z, 2.0 * reach + 1e-6, first)
+        for g in range(len(middles)):
+            gx, gy, gz = x + middles[g, 0], y + middles[g, 1], z + middles[g, 2]
+            margin = 2.0 * reaches[g] + 1e-6
+            for v in range(vessels):
+                depths[v] = -np.inf
+                if level[v] >= bar:
+                    among = wide[v, 1 : 1 + wide[v, 0]]
+                    depths[v] = _rings_near(nodes, among, gx, gy, gz, margin, close[v])
+            lowest = depths.max() - 2.0 * reaches[g] - _SLACK
+            near = _creases_near(creases, around, gx, gy, gz, margin, second)
+            here = depths >= lowest, close, level >= bar - _SLACK, wide, places
+            for q in range(len(points)):
+                if group[q] == g:
+                    px, py, pz = x + points[q, 0], y + points[q, 1], z + points[q, 2]
+                    depth = _tree_depth(tree, here, px, py, pz)
+                    closest = np.inf
+                    for c in near:
+                        closest = min(closest, _square(creases[c], px, py, pz))
+                    distance = min(abs(depth), math.sqrt(closest))
+                    out[n, q] = math.copysign(distance, depth)
 
 
 @compiled
 def _tree_depth(tree, here, x, y, z):
     """Signed distance (m) of one point from the walls, without creases.
 
-    `here` says which vessels matter to the point, and their rings; the same of those
-    that may hold the wall of another; scratch (2, 3).
+    Args:
+        tree: arrays of `TreeDepth`.
+        here: which vessels matter to the point, and their rings; the same of those
+            that may hold the wall of another; scratch (2, 3).
     """
     matters, close, others, wide, places = here
     inside, distance = False, np.inf
