@@ -213,19 +213,32 @@ def evaluate(
         with contextlib.closing(env):
             outcomes += _first_episodes(env, player, observer)
     trained = getattr(player, "checkpoint", None)
-    result = EvaluationResult(
-        task,
-        name or player.name,
-        tuple(seed for part in parts for seed in part.seeds),
-        tuple(outcomes),
-        {"protocol": protocol, "observation": observed, "task_kwargs": options,
-         "frames": trained and trained.frames},
-        protocols.distinct(task, parts[0].task_kwargs),
-        tuple(drawn for part in parts for drawn in part.conditions),
-    )  # fmt: skip
+    settings = {
+        "protocol": protocol, "observation": observed, "task_kwargs": options,
+        "frames": trained and trained.frames,
+    }  # fmt: skip
+    result = _result(task, name or player.name, parts, outcomes, settings)
     if out_dir is not None:
         write_evaluation(out_dir, result.to_dict())
     return result
+
+
+def _result(
+    task: str,
+    name: str,
+    parts: Sequence[protocols.Part],
+    outcomes: Sequence[EpisodeOutcome],
+    settings: Mapping[str, Any],
+) -> EvaluationResult:
+    return EvaluationResult(
+        task,
+        name,
+        tuple(seed for part in parts for seed in part.seeds),
+        tuple(outcomes),
+        settings,
+        protocols.distinct(task, parts[0].task_kwargs),
+        tuple(drawn for part in parts for drawn in part.conditions),
+    )
 
 
 def _check_numbers(episodes: int, seed: int, num_threads: int | None) -> None:

@@ -92,6 +92,14 @@ def sideways(axis, normal, turn):
 
 
 @compiled
+def _depth_of_one(slope, light):
+    """Depth, m, up to which one plane does for a hollow wall, see `tangents`."""
+    if light > 0.0:
+        return light / -slope
+    return _DEEP * (_SLOPED / -slope) ** (1.0 / 3.0)
+
+
+@compiled
 def tangents(entry, place, axis, normal, depth, limit, held, light, turns, rows):
     """Planes (1 or 2 rows of unit normal and clearance) that stand for the wall.
 
@@ -109,18 +117,14 @@ def tangents(entry, place, axis, normal, depth, limit, held, light, turns, rows)
         dx, dy, dz = _ASIDE * bx, _ASIDE * by, _ASIDE * bz
         low = clearance(entry, place[0] - dx, place[1] - dy, place[2] - dz)
         high = clearance(entry, place[0] + dx, place[1] + dy, place[2] + dz)
-        if low >= FREE or high >= FREE:
-            continue
         # To both sides the clearance slopes by its bend, times the way there.
         rise = 0.5 * (low + high) - depth
         slope = 2.0 * rise / _ASIDE
-        if rise >= -_HOLLOW:
+        if low >= FREE or high >= FREE or rise >= -_HOLLOW:
             continue
         corner = slope < _CORNER
         if held > 0.0:
-            one = _DEEP * (_SLOPED / -slope) ** (1.0 / 3.0)
-            if light > 0.0:
-                one = light / -slope
+            one = _depth_of_one(slope, light)
             if held - depth < one:
                 continue
             if light == 0.0:

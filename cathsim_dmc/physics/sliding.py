@@ -121,12 +121,10 @@ class SlidingDevices(SingleDevice):
         # Views: writing to them writes the state.
         self._insertion = world.parameters[:, :count]
         self._angles = world.parameters[:, count:].reshape(total, count, -1)
-        fields, stack = ChainFields(world.model, self._entity), self._stack
-        self._hinges = self._qpos[:, fields.qpos]
-        self._made = (
-            (stack.tables, self._rods, stack.arms, stack.of_links),
-            (self._entity.lumen_friction, CONTROL_TIMESTEP, MAX_TORQUE),
-            fields.places,
+        fields = ChainFields(world.model, self._entity)
+        self._hinges, self._made = (
+            self._qpos[:, fields.qpos],
+            made(self._entity, fields),
         )
         self._fields: list[tuple[np.ndarray, ...]] = [()] * total
         # Factors of all stiffnesses, and of all loss factors.
@@ -300,6 +298,14 @@ class SlidingDevices(SingleDevice):
             Shadow(points[:, k], *of(each))
             for k, each in enumerate(self._entity.devices)
         ]
+
+
+def made(entity: DeviceStack, fields: ChainFields) -> tuple:
+    """What `sliding_loops.settle` takes of coaxial devices."""
+    stack = entity.stack
+    devices = stack.tables, entity.rods, stack.arms, stack.of_links
+    drives = entity.lumen_friction, CONTROL_TIMESTEP, MAX_TORQUE
+    return devices, drives, fields.places
 
 
 def devices_of(chain: Chain) -> SingleDevice:

@@ -132,6 +132,11 @@ class ObservationKind:
     joined: tuple[str, ...] = ()
 
 
+def flat(array: np.ndarray, axes: int) -> np.ndarray:
+    """Joins the last `axes` axes."""
+    return array.reshape(array.shape[:-axes] + (-1,))
+
+
 class ObservationTable(dict[str, ObservationKind]):
     """Observations by name."""
 

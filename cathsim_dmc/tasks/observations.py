@@ -9,10 +9,10 @@ import numpy as np
 
 from cathsim_dmc.imaging.options import FARTHEST_WALL
 from cathsim_dmc.physics.sliding import DEVICE_PLACES
+from cathsim_dmc.tasks.coaxial_observations import COAXIAL_OBSERVATIONS
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
 from cathsim_dmc.tasks.observation_kind import (
     BIPLANE,
-    COAXIAL,
     FLUOROSCOPY,
     LIVING,
     ROUTE,
@@ -22,6 +22,7 @@ from cathsim_dmc.tasks.observation_kind import (
     ObservationKind,
     ObservationTable,
     Sizes,
+    flat,
 )
 from cathsim_dmc.tasks.route import AHEAD, into_frame
 
@@ -31,7 +32,7 @@ SEQUENCE_LENGTH = 3
 OBSERVATIONS = ObservationTable()
 
 
-_actions, _joints, _devices = map(attrgetter, ("actions", "joints", "devices"))
+_actions, _joints = map(attrgetter, ("actions", "joints"))
 
 
 def _fluoroscopic(key: str, channels: int, unit: str, meaning: str) -> Entry:
@@ -76,11 +77,6 @@ def _operator(frame: Frame) -> Observation:
     }
 
 
-def _flat(array: np.ndarray, axes: int) -> np.ndarray:
-    """Joins the last `axes` axes."""
-    return array.reshape(array.shape[:-axes] + (-1,))
-
-
 @OBSERVATIONS.row(
     Entry(
         "position",
@@ -118,10 +114,10 @@ def internal(frame: Frame) -> Observation:
     return {
         "position": chain.joints(state.joint_positions),
         "velocity": chain.joints(state.joint_velocities),
-        "com_inertia": _flat(inertia, 2),
-        "com_velocity": _flat(velocity, 2),
+        "com_inertia": flat(inertia, 2),
+        "com_velocity": flat(velocity, 2),
         "actuator_force": chain.joints(state.actuator_force),
-        "external_force": _flat(force, 2),
+        "external_force": flat(force, 2),
     }
 
 
@@ -170,7 +166,7 @@ def tracking(frame: Frame) -> Observation:
     """Points along the device in space, the goal, the insertion, the last action."""
     line = frame.readings.centreline
     return {
-        "tracking_points": _flat(frame.chain.tracked(line), 2),
+        "tracking_points": flat(frame.chain.tracked(line), 2),
         "tracking_goal": np.broadcast_to(frame.goal, (*line.shape[:-2], 3)),
         **_operator(frame),
     }
@@ -203,8 +199,8 @@ def tracking_2d(frame: Frame) -> Observation:
     """Tracked points and goal in pixels of fluoroscopy."""
     pixels = frame.images["pixels"]
     return {
-        "tracking_pixels": _flat(pixels[..., :-1, :], 3),
-        "tracking_goal_pixels": _flat(pixels[..., -1, :], 2),
+        "tracking_pixels": flat(pixels[..., :-1, :], 3),
+        "tracking_goal_pixels": flat(pixels[..., -1, :], 2),
         **_operator(frame),
     }
 
@@ -252,10 +248,10 @@ def route(frame: Frame) -> Observation:
     device = frame.chain.tracked(state.centreline)[..., :-1, :] - head
     goal = np.broadcast_to(frame.goal, state.head.shape)[..., None, :] - head
     return {
-        "route_points": _flat(ahead.points, 2),
+        "route_points": flat(ahead.points, 2),
         "route_radii": ahead.radii,
         "route_goal": into_frame(goal, axes)[..., 0, :],
-        "route_device": _flat(into_frame(device, axes), 2),
+        "route_device": flat(into_frame(device, axes), 2),
         "route_deviation": ahead.excess[..., None],
         "route_action": frame.action,
     }
@@ -368,56 +364,6 @@ _shown(
     )
 )
 
-
-# Coaxial devices.
-
-
-@OBSERVATIONS.row(
-    Entry(
-        "device_insertion",
-        _devices,
-        "m",
-        "of each device from the innermost outwards: way of its end, 0 where the "
-        "chain's end is at the start of the stroke",
-    ),
-    Entry("device_rotation", _devices, "rad", "of the rotary unit of each device"),
-    needs=COAXIAL,
-)
-def drives(frame: Frame) -> Observation:
-    """How far the operator has pushed and turned each coaxial device."""
-    state = frame.devices
-    assert state is not None
-    return {"device_insertion": state.insertion, "device_rotation": state.rotation}
-
-
-@OBSERVATIONS.row(
-    Entry("device_tip_rotation", _devices, "rad", "of the end of each device"),
-    Entry(
-        "device_points",
-        lambda sizes: 3 * sizes.devices * len(DEVICE_PLACES),
-        "m",
-        f"{len(DEVICE_PLACES)} points along each device, every "
-        f"{1e3 * DEVICE_PLACES[-2]:g} mm, proximal to its end, world frame",
-    ),
-    Entry(
-        "device_load",
-        2,
-        "N",
-        "axial force in the device that reaches farthest where it leaves the others, "
-        "and friction between the devices",
-    ),
-    needs=COAXIAL,
-)
-def devices(frame: Frame) -> Observation:
-    """Shape of each coaxial device and the load on it."""
-    state = frame.devices
-    assert state is not None
-    return {
-        "device_tip_rotation": state.tip_rotation,
-        "device_points": _flat(state.points, 3),
-        "device_load": np.stack([state.leading_load, state.lumen_friction], axis=-1),
-    }
-
-
+OBSERVATIONS.update(COAXIAL_OBSERVATIONS)
 resolve, observe, needs = OBSERVATIONS.resolve, OBSERVATIONS.observe, OBSERVATIONS.needs
 entries, entry_specs = OBSERVATIONS.entries, OBSERVATIONS.entry_specs

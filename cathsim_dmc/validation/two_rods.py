@@ -17,7 +17,7 @@ from cathsim_dmc.entities import posture
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
-from cathsim_dmc.physics import chain_fields, sliding_loops
+from cathsim_dmc.physics import chain_fields, sliding, sliding_loops
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check
@@ -148,10 +148,10 @@ def simulate(
         rotation: (K,), of their bases, rad.
         beyond: free length of the chain after the half circle, m; None where all is.
     """
-    rig = Rig(names)
+    rig = Rig(names, lumen_friction=0.0)
     rig.compile()
     entity: Any = rig.catheter
-    stack, rods = entity.stack, entity.rods
+    stack = entity.stack
     places = chain_fields.ChainFields(rig.model, entity)
     hinges = rig.data.qpos[places.qpos]
     fields = tuple(getattr(rig.model, name) for name in chain_fields.FIELDS)
@@ -167,8 +167,7 @@ def simulate(
         rig.model.dof_armature[start : start + held] = _HELD
     gap = np.asarray(gaps, float)
     angles = np.tile(np.asarray(rotation, float)[:, None], len(stack.nodes))
-    made = (stack.tables, rods, stack.arms, stack.of_links)
-    made = made, (0.0, CONTROL_TIMESTEP, np.inf), places.places
+    made = sliding.made(entity, places)
     still, force = np.zeros(len(gap)), np.zeros(len(rig.lengths))
     axial = np.zeros((len(gap), len(stack.spans)))
     state = angles, np.zeros(len(gap) - 1), np.zeros(len(gap) - 1), np.zeros(len(gap))

@@ -82,12 +82,7 @@ def import_scan(
     """
     started = time.monotonic()
     say, note = _reporters(progress, notes)
-    given = {
-        key: np.array(bounds.vector(key, place, 3))
-        for key, place in (("inlet", inlet), ("heart", heart))
-        if place is not None
-    }
-    changes = _changes(rename)
+    given, changes = _given(inlet=inlet, heart=heart), _changes(rename)
     # Refused before the long steps, or read when the unit is known.
     supposed = "mm" if units is None else units
     to_lps(supposed, mesh_frame, axes)
@@ -100,20 +95,11 @@ def import_scan(
     curves = read_curves(centreline_paths, lumen.units, mesh_frame, axes, root)
     curves = {key: inside_part(key, c, measure) for key, c in curves.items()}
     say(f"tree: looking for vessels in {len(lumen.surface.faces):,} triangles")
-    grown, at_end = _tree(measure, curves, places, root, changes, note)
-    tree, opening, surface = _opened(grown, at_end, lumen.surface)
-    sizes = [
-        f"{key} {vessel.centreline.length * 1e3:.0f} mm"
-        + (f" from {vessel.parent}" if vessel.parent else "")
-        for key, vessel in tree.vessels.items()
-    ]
-    say(f"tree: {', '.join(sizes)}")
-    name, goals = name or Path(mesh_path).name.split(".")[0], place_goals(tree)
-    ends = flat_ends(tree, opening)
-    anatomy = Anatomy(name, tree, opening, goals, ends, surface)
-    _prove(anatomy, note)
+    grown = _tree(measure, curves, places, root, changes, note)
+    name = name or Path(mesh_path).name.split(".")[0]
+    anatomy = _anatomy(name, *_opened(*grown, lumen.surface), say, note)
     seconds = time.monotonic() - started
-    say(f"done in {seconds:.0f} s, goals {', '.join(goals) or 'none'}")
+    say(f"done in {seconds:.0f} s, goals {', '.join(anatomy.goals) or 'none'}")
     return anatomy
 
 
@@ -135,6 +121,15 @@ def _reporters(
     return say, note
 
 
+def _given(**places: Sequence[float] | None) -> dict[str, np.ndarray]:
+    """Those of the places (3,) that are given, checked."""
+    return {
+        key: np.array(bounds.vector(key, place, 3))
+        for key, place in places.items()
+        if place is not None
+    }
+
+
 def _changes(rename: Mapping[str, str] | None) -> dict[str, str]:
     """New names by the computed ones, checked."""
     changes = bounds.options("rename", rename)
@@ -142,6 +137,20 @@ def _changes(rename: Mapping[str, str] | None) -> dict[str, str]:
         if not VESSEL_NAME.fullmatch(str(wanted)):
             bounds.refuse("rename", rename, "names of small letters, digits and '_'")
     return changes
+
+
+def _anatomy(name, tree, opening, surface, say, note) -> Anatomy:
+    """The anatomy of a tree, proved against its surface."""
+    sizes = [
+        f"{key} {vessel.centreline.length * 1e3:.0f} mm"
+        + (f" from {vessel.parent}" if vessel.parent else "")
+        for key, vessel in tree.vessels.items()
+    ]
+    say(f"tree: {', '.join(sizes)}")
+    ends = flat_ends(tree, opening)
+    anatomy = Anatomy(name, tree, opening, place_goals(tree), ends, surface)
+    _prove(anatomy, note)
+    return anatomy
 
 
 def _tree(field, curves, places, root, changes, note) -> tuple[VesselTree, bool]:
