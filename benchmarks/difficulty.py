@@ -154,7 +154,7 @@ def play(
         if action is None:
             slides = _Slides(step.readings.insertion, limit.growth)
             continue
-        tracker.add(step.wall_force._asdict())
+        tracker.add(step.wall_force)
         slides.add(step.readings.insertion)
         for index, end in _ends(step, number, slides.steps, limit).items():
             if running[index]:

@@ -1,11 +1,13 @@
 """Files that appear whole or not at all."""
 
 import contextlib
+import json
 import os
 import shutil
 import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -90,12 +92,17 @@ def write_text(path: str | os.PathLike[str], text: str) -> Path:
     return write_bytes(path, text.encode())
 
 
+def write_json(path: str | os.PathLike[str], values: Any) -> Path:
+    """Write values as JSON atomically, see `atomic_path`; return its path."""
+    return write_text(path, json.dumps(values, indent=2) + "\n")
+
+
 def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}{_PARTIAL}")
 
 
 def read_arrays(
-    path: Path, names: Iterable[str] | None = None
+    path: str | os.PathLike[str], names: Iterable[str] | None = None
 ) -> dict[str, np.ndarray]:
     """Arrays of an .npz archive, all or those named; no pickle is read.
 

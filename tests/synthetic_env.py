@@ -6,13 +6,14 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from cathsim_dmc.physics.forces import NAMES
 from cathsim_dmc.simulation.environments import standard_observations
 
 ACTIONS = 21
 GOAL_RADIUS = 0.15
 # Entries per observation beyond the three that matter.
 SIZES = {"position": 3, "velocity": 3, "com_inertia": 10, "external_force": 4}
-INFO = ("wall_force_sum", "wall_force_max", "success", "distance")
+INFO = (*NAMES, "success", "physics_error", "path_ratio", "distance")
 
 
 class ReachEnv(EnvBase):
@@ -80,8 +81,9 @@ class ReachEnv(EnvBase):
                 pixels[i, y - 4 : y + 4, x - 4 : x + 4] = 255
             out["image"] = torch.as_tensor(pixels)
         info = {
-            "wall_force_sum": force,
-            "wall_force_max": 0.5 * force,
+            **dict(zip(NAMES, (force, 0.5 * force, force, 0.5 * force), strict=True)),
+            "physics_error": np.zeros(n),
+            "path_ratio": np.ones(n),
             "success": distance < GOAL_RADIUS,
             "distance": distance,
         }

@@ -16,14 +16,14 @@ from cathsim_dmc.agents import (
     record_demonstrations,
     train,
 )
-from cathsim_dmc.agents.bc import BC
 from cathsim_dmc.agents.dagger import DAgger
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, load_transitions
+from cathsim_dmc.agents.imitation import BC
 from cathsim_dmc.agents.learners import make_learner
 from cathsim_dmc.agents.networks import NetworkShapes, network_of
 from cathsim_dmc.agents.sac import SAC
+from cathsim_dmc.agents.training import take_over
 from cathsim_dmc.agents.training_log import read_metrics
-from cathsim_dmc.agents.warm_start import take_over
 
 SHARED = {
     "task": "simple1_bca",

@@ -17,8 +17,8 @@ from cathsim_dmc.agents.learners import make_config
 from cathsim_dmc.agents.networks import NetworkShapes, make_policy
 from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.agents.replay import ReplayError
+from cathsim_dmc.agents.training import take_over
 from cathsim_dmc.agents.training_log import read_metrics
-from cathsim_dmc.agents.warm_start import take_over
 from cathsim_dmc.simulation import environments
 
 

@@ -71,7 +71,7 @@ def test_episodes_that_end_at_different_steps_keep_apart(seed, steps, count):
     tracker = ForceTracker(count)
     begun = np.zeros(count, int)
     for step in range(steps):
-        tracker.add(dict(zip(QUANTITIES, values[:, step], strict=True)))
+        tracker.add(values[:, step])
         for simulation in np.flatnonzero(ends[step]):
             found = dataclasses.astuple(tracker.finish(simulation))
             part = values[:, begun[simulation] : step + 1, simulation]

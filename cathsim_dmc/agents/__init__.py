@@ -22,7 +22,6 @@ import torchrl.collectors  # noqa: F401
 
 # isort: on
 
-from cathsim_dmc.agents.actions import record_actions
 from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.demonstrations import record_demonstrations
@@ -31,6 +30,7 @@ from cathsim_dmc.agents.learners import LEARNERS, make_config
 from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.agents.ppo import PPOConfig
 from cathsim_dmc.agents.sac import SACConfig
+from cathsim_dmc.agents.submission import record_actions
 from cathsim_dmc.agents.training import TrainingResult, train
 from cathsim_dmc.simulation.environments import make_env
 

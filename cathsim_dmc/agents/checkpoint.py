@@ -143,7 +143,6 @@ def checkpoints_in(run: Path) -> list[Path]:
 
 def save_checkpoint(
     run: Path,
-    *,
     config: TrainingConfig,
     shapes: NetworkShapes,
     frames: int,
@@ -184,8 +183,7 @@ def save_checkpoint(
             data = stream.getvalue()
             description["sha256"][file] = hashlib.sha256(data).hexdigest()
             files.write_bytes(temporary / file, data)
-        text = json.dumps(description, indent=2) + "\n"
-        files.write_text(temporary / _DESCRIPTION, text)
+        files.write_json(temporary / _DESCRIPTION, description)
     for old in checkpoints_in(run)[: -config.keep_checkpoints]:
         (old / _DESCRIPTION).unlink()  # first: without it, it is no checkpoint
         shutil.rmtree(old)

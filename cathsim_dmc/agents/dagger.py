@@ -15,9 +15,8 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.envs import EnvBase
 from typing_extensions import override
 
-from cathsim_dmc.agents.config import TrainingConfig, require
+from cathsim_dmc.agents.config import TrainingConfig, positive, require, within
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION
-from cathsim_dmc.agents.fields import positive, within
 from cathsim_dmc.agents.imitation import CloningLearner, decaying
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.replay import ReplayMemory

@@ -120,22 +120,21 @@ def record_demonstrations(
         description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
         f"seeds from {seed}",
     )
-    return _described(out, buffers)
-
-
-def _described(out: Path, buffers: list[Any]) -> Demonstrations:
-    forces = {
-        name: [np.asarray(buffer.infos[f"wall_force_{name}"][1:]) for buffer in buffers]
-        for name in ("sum", "max")
-    }
+    means, largest = zip(*map(_forces, buffers), strict=True)
     return Demonstrations(
         path=out,
         episodes=len(buffers),
         successes=sum(bool(buffer.infos["success"][-1]) for buffer in buffers),
         steps=sum(len(buffer.rewards) for buffer in buffers),
-        mean_force=float(np.mean([one.mean() for one in forces["sum"]])),
-        max_force=float(max(one.max() for one in forces["max"])),
+        mean_force=float(np.mean(means)),
+        max_force=float(max(largest)),
     )
+
+
+def _forces(buffer: Any) -> tuple[float, float]:
+    """Mean of the sum over all contacts, and largest contact, of an episode, N."""
+    sums, largest = (buffer.infos[f"wall_force_{name}"][1:] for name in ("sum", "max"))
+    return np.mean(sums), np.max(largest)
 
 
 def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
@@ -157,43 +156,42 @@ def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
         return action
 
     begin = functools.partial(expert.reset, view)
-    columns: dict[Any, list[np.ndarray]] = collections.defaultdict(list)
+    columns: dict[str, Any] = collections.defaultdict(list)
     turns = play(BatchedSimulations(simulation), act, begin, len(seeds))
     for action, step, running in turns:
-        kept: dict[Any, Any] = {
-            **{("observations", key): one for key, one in step.observation.items()},
-            **{("infos", key): one for key, one in step.info().items()},
-        }
+        columns["observations"].append(step.observation)
+        columns["infos"].append(step.info())
         if action is not None:
-            kept |= {"chosen": chosen, "actions": action, "running": running}
-            kept |= {"terminations": step.terminated, "truncations": step.truncated}
-            kept["rewards"] = step.outcome.reward
-        for key, value in kept.items():
-            columns[key].append(np.array(value))
-    stacked = {key: np.stack(one, axis=1) for key, one in columns.items()}
-    return [
-        _buffer(int(seed), {key: one[row] for key, one in stacked.items()})
-        for row, seed in enumerate(seeds)
-    ]
+            columns["running"].append(running.copy())
+            columns["chosen"].append(chosen)
+            columns["actions"].append(action)
+            columns["rewards"].append(step.outcome.reward)
+            columns["terminations"].append(step.terminated)
+            columns["truncations"].append(step.truncated)
+    return [_buffer(int(seed), row, columns) for row, seed in enumerate(seeds)]
 
 
-def _buffer(seed: int, columns: Mapping[Any, np.ndarray]) -> Any:
+def _buffer(seed: int, row: int, columns: Mapping[str, Any]) -> Any:
     """The first episode of a simulation; its expert's last action is repeated."""
     from minari.data_collector import EpisodeBuffer
 
-    steps = np.count_nonzero(columns["running"])
-    found: dict[str, Any] = {"observations": {}, "infos": {}}
-    for key, values in columns.items():
-        if isinstance(key, tuple):
-            found[key[0]][key[1]] = values[: steps + 1]
-    for key, values in found["observations"].items():
+    steps = sum(running[row] for running in columns["running"])
+
+    def stacked(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, Any]:
+        parts = parts[: steps + 1]
+        return {key: np.stack([part[key][row] for part in parts]) for key in parts[0]}
+
+    shown, infos = stacked(columns["observations"]), stacked(columns["infos"])
+    for key, values in shown.items():
         if values.dtype != np.uint8:
-            found["observations"][key] = values.astype(np.float32)
-    chosen = columns["chosen"][:steps]
-    found["infos"][EXPERT_ACTION] = np.append(chosen, chosen[-1:], axis=0)
-    for name in ("rewards", "terminations", "truncations"):
-        found[name] = columns[name][:steps].tolist()
-    return EpisodeBuffer(seed=seed, actions=columns["actions"][:steps], **found)
+            shown[key] = values.astype(np.float32)
+    own = {
+        name: np.stack([one[row] for one in columns[name][:steps]])
+        for name in ("actions", "rewards", "terminations", "truncations", "chosen")
+    }
+    chosen = own.pop("chosen")
+    infos[EXPERT_ACTION] = np.append(chosen, chosen[-1:], axis=0)
+    return EpisodeBuffer(seed=seed, observations=shown, infos=infos, **own)
 
 
 def load_transitions(

@@ -3,20 +3,19 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, ForceTracker
-from cathsim_dmc.physics.forces import NAMES, WallForce
+from cathsim_dmc.physics.forces import NAMES
 
 # Information of the environment about a step, beside the observation.
 INFO = "info"
-# Force of a control step -> its name in the information.
-_FORCES = dict(zip(WallForce._fields, NAMES, strict=True))
 
 
 @dataclass(frozen=True)
 class EpisodeOutcome:
-    """One finished episode. None where the environment does not tell.
+    """One finished episode.
 
     Attributes:
         env: Index of the environment it ran in.
@@ -34,10 +33,10 @@ class EpisodeOutcome:
     reward: float
     length: int
     terminated: bool
-    success: bool | None
+    success: bool
     forces: EpisodeForces
-    physics_error: bool = False
-    path_ratio: float | None = None
+    physics_error: bool
+    path_ratio: float
 
 
 class EpisodeTracker:
@@ -46,44 +45,34 @@ class EpisodeTracker:
     def __init__(self, num_envs: int):
         self.reward = np.zeros(num_envs)
         self.length = np.zeros(num_envs, dtype=np.int64)
-        self.success = np.zeros(num_envs, dtype=bool)
         self.forces = ForceTracker(num_envs)
 
     def add(self, batch: TensorDictBase) -> list[EpisodeOutcome]:
         """Add steps (num_envs, steps); return the episodes that ended, in order."""
 
-        def read(*name: str) -> np.ndarray | None:
-            """Entry after each step (num_envs, steps), None if absent."""
-            value = batch.get(("next", *name), None)
-            return None if value is None else value.reshape(batch.shape).numpy()
+        def read(value: torch.Tensor) -> np.ndarray:
+            return value.reshape(batch.shape).numpy()
 
-        reward, done, terminated = map(read, ("reward", "done", "terminated"))
-        assert reward is not None and done is not None and terminated is not None
-        forces = {name: read(INFO, key) for name, key in _FORCES.items()}
-        success, error, ratio = (
-            read(INFO, name) for name in ("success", "physics_error", "path_ratio")
-        )
+        after, info = batch["next"], batch["next", INFO]
+        reward, done = read(after["reward"]), read(after["done"])
+        forces = [read(info[name]) for name in NAMES]
         finished = []
         for step in range(batch.shape[1]):
             self.reward += reward[:, step]
             self.length += 1
-            known = {n: one[:, step] for n, one in forces.items() if one is not None}
-            self.forces.add(known)
-            if success is not None:
-                self.success |= success[:, step] > 0
+            self.forces.add([one[:, step] for one in forces])
             for env in map(int, np.flatnonzero(done[:, step])):
                 finished.append(
                     EpisodeOutcome(
                         env=env,
                         reward=float(self.reward[env]),
                         length=int(self.length[env]),
-                        terminated=bool(terminated[env, step]),
-                        success=None if success is None else bool(self.success[env]),
+                        terminated=bool(after["terminated"][env, step]),
+                        success=bool(info["success"][env, step]),
                         forces=self.forces.finish(env),
-                        physics_error=error is not None and bool(error[env, step]),
-                        path_ratio=None if ratio is None else float(ratio[env, step]),
+                        physics_error=bool(info["physics_error"][env, step]),
+                        path_ratio=float(info["path_ratio"][env, step]),
                     )
                 )
                 self.reward[env] = self.length[env] = 0
-                self.success[env] = False
         return finished

@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,6 +27,8 @@ from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
 
+# Has the arguments of `environments.make_env`; "info" in what it makes has "success",
+# "physics_error", "path_ratio" and `physics.forces.NAMES`.
 EnvFactory = Callable[..., EnvBase]
 # Called after every step with the environment and which episodes (n,) bool still run.
 Observer = Callable[[EnvBase, np.ndarray], None]
@@ -86,12 +87,11 @@ class EvaluationResult:
         return float(values.mean()), deviation
 
     @property
-    def successes(self) -> int | None:
-        """Episodes that reached the goal; None where the task does not tell."""
-        known = [e.success for e in self.episodes if e.success is not None]
-        return sum(known) if len(known) == len(self.episodes) else None
+    def successes(self) -> int:
+        """Episodes that reached the goal."""
+        return sum(episode.success for episode in self.episodes)
 
-    def safe_success(self, limit: float) -> float | None:
+    def safe_success(self, limit: float) -> float:
         """Share of episodes that reach the goal with little force on the wall.
 
         Args:
@@ -99,14 +99,10 @@ class EvaluationResult:
                 every physics step, N.
 
         Returns:
-            As a fraction; None where success or force is not known.
+            As a fraction; an episode whose force is not known is not safe.
         """
-        if self.successes is None:
-            return None
-        largest = self.values("forces.peak_sum.maximum")
-        if np.isnan(largest).any():
-            return None
-        return float(np.mean((self.values("success") > 0) & (largest <= limit)))
+        safe = self.values("forces.peak_sum.maximum") <= limit
+        return float(np.mean((self.values("success") > 0) & safe))
 
     def summary(self) -> dict[str, Any]:
         """Means with deviations over the episodes, success rate with its interval.
@@ -115,6 +111,7 @@ class EvaluationResult:
         quantity and statistic as docs/forces.md defines them.
         """
         count, successes = len(self.episodes), self.successes
+        interval = list(success_interval(successes, count)) if self.distinct else None
         result: dict[str, Any] = {"episodes": count}
         for name in ("reward", "length", "path_ratio"):
             result[name], result[f"{name}_sd"] = self.mean_sd(name)
@@ -123,11 +120,7 @@ class EvaluationResult:
             mean, deviation = self.mean_sd(f"forces.{quantity}.{name}")
             result["forces"][quantity][name] = {"mean": mean, "sd": deviation}
         result["physics_errors"] = sum(e.physics_error for e in self.episodes)
-        result["success"] = result["success_ci95"] = None
-        if successes is not None:
-            result["success"] = successes / count
-            if self.distinct:
-                result["success_ci95"] = list(success_interval(successes, count))
+        result |= {"success": successes / count, "success_ci95": interval}
         result["safe_success"] = {
             f"{limit:g} N": self.safe_success(limit) for limit in SAFE_FORCES
         }
@@ -136,11 +129,11 @@ class EvaluationResult:
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: identity, summary and every episode."""
         drawn = [{"conditions": dict(one)} for one in self.conditions]
+        drawn = drawn or [{}] * len(self.seeds)
+        played = zip(self.seeds, self.episodes, drawn, strict=True)
         episodes = [
             {"seed": seed, **asdict(episode), **conditions}
-            for seed, episode, conditions in zip(
-                self.seeds, self.episodes, drawn or [{}] * len(self.seeds), strict=True
-            )
+            for seed, episode, conditions in played
         ]
         return {
             "task": self.task,
@@ -194,7 +187,10 @@ def evaluate(
     """
     conditions = protocols.get(protocol)
     episodes = conditions.episodes if episodes is None else episodes
-    _check_numbers(episodes, seed, num_threads)
+    bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
+    bounds.seed("seed", seed)
+    if num_threads is not None:
+        bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
     player = load_policy(policy, seed)
     task, options = task_and_options(player, task, task_kwargs)
     options = options if task_kwargs is None else dict(task_kwargs)
@@ -213,39 +209,21 @@ def evaluate(
         with contextlib.closing(env):
             outcomes += _first_episodes(env, player, observer)
     trained = getattr(player, "checkpoint", None)
-    settings = {
-        "protocol": protocol, "observation": observed, "task_kwargs": options,
-        "frames": trained and trained.frames,
-    }  # fmt: skip
-    result = _result(task, name or player.name, parts, outcomes, settings)
-    if out_dir is not None:
-        write_evaluation(out_dir, result.to_dict())
-    return result
-
-
-def _result(
-    task: str,
-    name: str,
-    parts: Sequence[protocols.Part],
-    outcomes: Sequence[EpisodeOutcome],
-    settings: Mapping[str, Any],
-) -> EvaluationResult:
-    return EvaluationResult(
+    result = EvaluationResult(
         task,
-        name,
+        name or player.name,
         tuple(seed for part in parts for seed in part.seeds),
         tuple(outcomes),
-        settings,
+        {
+            "protocol": protocol, "observation": observed, "task_kwargs": options,
+            "frames": trained and trained.frames,
+        },
         protocols.distinct(task, parts[0].task_kwargs),
         tuple(drawn for part in parts for drawn in part.conditions),
-    )
-
-
-def _check_numbers(episodes: int, seed: int, num_threads: int | None) -> None:
-    bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
-    bounds.seed("seed", seed)
-    if num_threads is not None:
-        bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
+    )  # fmt: skip
+    if out_dir is not None:
+        files.write_json(Path(out_dir) / "evaluation.json", result.to_dict())
+    return result
 
 
 @torch.no_grad()
@@ -271,12 +249,6 @@ def _first_episodes(
         running = running & ~begun
         state = step_mdp(stepped)
     return tuple(outcomes[number] for number in range(count))
-
-
-def write_evaluation(out_dir: str | Path, values: Mapping[str, Any]) -> Path:
-    """Write evaluation.json atomically; return its path."""
-    text = json.dumps(values, indent=2) + "\n"
-    return files.write_text(Path(out_dir) / "evaluation.json", text)
 
 
 class ContactLog:

@@ -1,12 +1,12 @@
-"""The algorithms by name: a new one is a module of its own and a line here."""
+"""The algorithms by name: a new one is two classes and a line here."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cathsim_dmc.agents.bc import BC, BCConfig
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.dagger import DAgger, DAggerConfig
+from cathsim_dmc.agents.imitation import BC, BCConfig
 from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.ppo import PPO, PPOConfig

@@ -11,8 +11,12 @@ from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
-from cathsim_dmc.agents.config import ActorCriticConfig, ConfigError, TrainingConfig
-from cathsim_dmc.agents.fields import checked
+from cathsim_dmc.agents.config import (
+    ActorCriticConfig,
+    ConfigError,
+    TrainingConfig,
+    checked,
+)
 from cathsim_dmc.agents.normalisation import ImageNormaliser, ObservationNormaliser
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.tasks import observations

@@ -20,10 +20,11 @@ from cathsim_dmc.agents.config import (
     ActorCriticConfig,
     ConfigError,
     TrainingConfig,
+    positive,
     require,
+    within,
 )
 from cathsim_dmc.agents.exploration import CorrelatedExploration, CorrelatedNoise
-from cathsim_dmc.agents.fields import positive, within
 from cathsim_dmc.agents.learner import Learner, means
 from cathsim_dmc.agents.networks import (
     NetworkShapes,

@@ -2,8 +2,9 @@
 
 import dataclasses
 import itertools
+import types
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,20 +19,17 @@ _STRATIFIED = (
 )  # fmt: skip
 
 
-@dataclasses.dataclass(frozen=True)
-class Protocol:
+class Protocol(NamedTuple):
     """Conditions of an evaluation.
 
     Attributes:
-        text: One sentence for `--help` and reports.
         episodes: Number of episodes, unless another one is asked for.
         task_kwargs: Options of the task, over all others.
         devices: Steerable devices that episodes take in turn, in place of the task's.
     """
 
-    text: str
     episodes: int
-    task_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    task_kwargs: Mapping[str, Any] = types.MappingProxyType({})
     devices: tuple[str, ...] = ()
 
 
@@ -51,24 +49,15 @@ VARIED_RANGES = Randomisation(
 )
 
 PROTOCOLS = {
-    "published": Protocol(
-        "The task as it is; episodes differ by 1 mm of the start, so they are nearly "
-        "one.",
-        30,
-    ),
+    # The task as it is; episodes differ by 1 mm of the start, so they are nearly one.
+    "published": Protocol(30),
     "varied": Protocol(
-        "Start within 60 mm and 10 mm off the line, any roll, another friction, "
-        "stiffness, loss, viscosity, delay and device in each episode, noise on "
-        "tracked points and in images.",
-        100,
-        {"randomisation": VARIED_RANGES},
-        ("steerable_5f", "steerable_4f"),
+        100, {"randomisation": VARIED_RANGES}, ("steerable_5f", "steerable_4f")
     ),
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class Part:
+class Part(NamedTuple):
     """Episodes that one batch of simulations plays.
 
     Attributes:
@@ -97,10 +86,7 @@ def parts(
     """The episodes of an evaluation, those of each device together.
 
     Args:
-        protocol: Conditions.
-        task: Name of the task.
         task_kwargs: Options of the task, which the protocol changes.
-        episodes: Number of episodes.
         seed: The seeds lie at or above it: one after the other without variation, and
             otherwise those that fill every tenth of each range alike and take the
             arches of a pool in turn.
@@ -114,10 +100,8 @@ def parts(
         pools = [{**options, "device": name} for name in protocol.devices]
     arches = options.get("pool", POOL) if random_arch(task) else 1
     found, played = [], 0
-    for number, own in enumerate(pools):
+    for number, own in enumerate(pools[:episodes]):
         count = len(range(number, episodes, len(pools)))
-        if not count:
-            continue
         first = seed + number * _CANDIDATES * episodes
         seeds = tuple(range(first, first + count))
         if protocol.task_kwargs:
@@ -134,14 +118,10 @@ def random_arch(task: str) -> bool:
     return task in suite.TASKS and suite.TASKS[task].random_arch
 
 
-def _drawn(ranges: Randomisation, seed: int, arches: int) -> tuple[int, Episode]:
-    return ranges.draw_in(np.random.RandomState(seed), arches)
-
-
 def _conditions(
     ranges: Randomisation, seed: int, arches: int, options: Mapping[str, Any]
 ) -> Mapping[str, Any]:
-    arch, episode = _drawn(ranges, seed, arches)
+    arch, episode = ranges.draw_in(np.random.RandomState(seed), arches)
     where = {"arch": options.get("first", 0) + arch} if arches > 1 else {}
     values = {
         name: value.tolist() if isinstance(value, np.ndarray) else value
@@ -163,8 +143,7 @@ def stratified(
         ranges: What is drawn.
         wanted: Number of the arch of each episode in its pool.
         seed: The candidates begin there.
-        arches: Number of arches in the pool; with more than one, a candidate is a seed
-            that draws the arch wanted.
+        arches: Number of arches in the pool, one of which a seed draws.
 
     Returns:
         Seeds, in the order of `wanted`.
@@ -175,9 +154,9 @@ def stratified(
     candidates = itertools.count(seed)
     while any(short.values()):
         candidate = next(candidates)
-        arch, _ = _drawn(Randomisation(), candidate, arches)
+        arch, episode = ranges.draw_in(np.random.RandomState(candidate), arches)
         if short.get(arch):
-            left[arch][candidate] = _bins(ranges, candidate, arches)
+            left[arch][candidate] = _bins(ranges, episode)
             short[arch] -= 1
     filled, chosen = np.zeros((len(_STRATIFIED), _STRATA), dtype=int), []
     for arch in wanted:
@@ -191,9 +170,9 @@ def stratified(
     return tuple(chosen)
 
 
-def _bins(ranges: Randomisation, seed: int, arches: int) -> np.ndarray:
-    """Which tenths of their ranges the draws of a seed lie in."""
-    (_, episode), shares = _drawn(ranges, seed, arches), []
+def _bins(ranges: Randomisation, episode: Episode) -> np.ndarray:
+    """Which tenths of their ranges the draws lie in."""
+    shares = []
     for name in _STRATIFIED:
         chosen = getattr(ranges, name)
         if isinstance(chosen, Sequence) and chosen[1] > chosen[0]:

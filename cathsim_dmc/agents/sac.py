@@ -14,10 +14,10 @@ from cathsim_dmc.agents.config import (
     TUNED_IMAGES,
     TUNED_TRAINING,
     ActorCriticConfig,
+    positive,
     require,
 )
 from cathsim_dmc.agents.demonstrations import load_transitions
-from cathsim_dmc.agents.fields import positive
 from cathsim_dmc.agents.learner import Learner, means
 from cathsim_dmc.agents.networks import NetworkShapes, make_critic
 from cathsim_dmc.agents.replay import ReplayMemory

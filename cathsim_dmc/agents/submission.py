@@ -6,12 +6,16 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cathsim_dmc import __version__, bounds, files, suite
-from cathsim_dmc.agents import actions, evaluation, pretrained
+from cathsim_dmc.agents import evaluation, pretrained, protocols
 from cathsim_dmc.agents.checkpoint import Checkpoint
-from cathsim_dmc.policies import POLICIES
+from cathsim_dmc.agents.policies import PolicyLike, load_policy
+from cathsim_dmc.policies import POLICIES, Policy, View
 
 PROTOCOL = "varied"
+RECORDED = ".npz"  # ending of a file of actions
 
 
 def submit(
@@ -29,7 +33,7 @@ def submit(
 
     Args:
         policy: Name of a policy, "pretrained:NAME", file of a pretrained policy or of
-            `actions.record_actions`, or directory of a run.
+            `record_actions`, or directory of a run.
         out: File to write, ending in .json.
         task: Name of the task; None takes the one that the policy was trained on.
         episodes: Number of episodes, fewer than those of the protocol to try it out.
@@ -49,24 +53,25 @@ def submit(
     if task is not None:
         bounds.choice("task", task, suite.SUITE)
     weights = digest_of(policy)
-    player: str | actions.RecordedActions = policy
-    if policy.endswith(actions.SUFFIX):
-        player = actions.RecordedActions(policy)
+    player: str | RecordedActions = policy
+    if policy.endswith(RECORDED):
+        player = RecordedActions(policy)
         if task not in (None, player.task):
             raise ValueError(f"{policy} holds actions of {player.task}, not of {task}")
         bounds.choice("task", player.task, suite.SUITE)
-        actions.require_protocol(player, episodes)
+        count = episodes or protocols.get(PROTOCOL).episodes
+        if len(player.actions) != count:
+            raise ValueError(
+                f"{policy} holds {len(player.actions)} episodes, not the {count} of "
+                f"the {PROTOCOL} protocol; record them with agents.record_actions"
+            )
     out.parent.mkdir(parents=True, exist_ok=True)
     result = evaluation.evaluate(
         player, task, episodes, protocol=PROTOCOL, num_threads=num_threads
     )
-    submission = {
-        "policy_sha256": weights,
-        "package": __version__,
-        "commit": _commit(),
-        **result.to_dict(),
-    }
-    submission = json.loads(json.dumps(submission, default=str))
+    ours = {"policy_sha256": weights, "package": __version__, "commit": _commit()}
+    values = {**ours, **result.to_dict()}
+    submission = json.loads(json.dumps(values, default=str))
     submission["sha256"] = seal(submission)
     files.write_text(out, text(submission))
     return submission
@@ -93,7 +98,7 @@ def digest_of(policy: str) -> str | None:
         return None
     if policy.startswith(pretrained.PREFIX):
         policy = str(pretrained.pretrained_path(policy))
-    if policy.endswith((pretrained.SUFFIX, actions.SUFFIX)):
+    if policy.endswith((pretrained.SUFFIX, RECORDED)):
         return hashlib.sha256(Path(policy).read_bytes()).hexdigest()
     sums = json.dumps(dict(Checkpoint.open(policy).sha256), sort_keys=True)
     return hashlib.sha256(sums.encode()).hexdigest()
@@ -108,3 +113,86 @@ def _commit() -> str | None:
         command, cwd=home, capture_output=True, text=True, check=False
     )
     return done.stdout.strip() or None
+
+
+class RecordedActions(Policy):
+    """Plays the actions of a file, episode after episode, the last one for ever.
+
+    Attributes:
+        actions: (episodes, steps, A) in [-1, 1]; zeros after the end of an episode.
+    """
+
+    def __init__(self, path: str | Path):
+        """Reads a file of `record_actions`; ValueError if it is none or damaged."""
+        try:
+            header, actions = files.read_arrays(path, ("header", "actions")).values()
+            values = json.loads(str(header))
+            self.name = f"{values['policy']}, recorded actions"
+            self.task, self.task_kwargs = values["task"], dict(values["task_kwargs"])
+            self.observation = values["observation"]
+            self.actions = bounds.array("actions", actions, "f", (-1, -1, -1))
+        except (LookupError, TypeError, ValueError) as error:
+            raise ValueError(f"{path} holds no recorded actions: {error}") from error
+        self._rows, self._step = slice(0, 0), 0
+
+    def reset(self, view: View, which: np.ndarray) -> None:
+        """Begin episodes; those of other simulations follow those before."""
+        if which.all():
+            first = self._rows.stop
+            self._rows, self._step = slice(first, first + view.num_simulations), 0
+
+    def act(self, observation: Any) -> np.ndarray:
+        """Actions (N, A) of the step."""
+        step = min(self._step, self.actions.shape[1] - 1)
+        self._step += 1
+        return self.actions[self._rows, step]
+
+
+class _Recorder(Policy):
+    """Another policy, whose actions (N, A) are kept by batch and step."""
+
+    def __init__(self, policy: Policy):
+        self._policy, self.name, self.task = policy, policy.name, policy.task
+        self.observation, self.task_kwargs = policy.observation, policy.task_kwargs
+        self.batches: list[list[np.ndarray]] = []
+
+    def reset(self, view: View, which: np.ndarray) -> None:
+        if which.all():
+            self.batches.append([])
+        self._policy.reset(view, which)
+
+    def act(self, observation: Any) -> np.ndarray:
+        action = self._policy.act(observation)
+        self.batches[-1].append(np.array(action, np.float32))
+        return action
+
+
+def record_actions(
+    policy: PolicyLike, out: str | Path, task: str | None = None, **options: Any
+) -> evaluation.EvaluationResult:
+    """Play the varied protocol and write the actions, for `cathsim submit`.
+
+    Args:
+        policy: Policy, or what names one, see `policies.load_policy`.
+        out: File to write, ending in .npz.
+        task: Name of the task; None takes the one that the policy was trained on.
+        **options: Of `evaluate`: episodes (fewer than those of the protocol to try it
+            out), observation, task_kwargs, num_threads.
+
+    Returns:
+        What the policy reached.
+    """
+    recorder = _Recorder(load_policy(policy, evaluation.EVALUATION_SEED))
+    with files.atomic_path(out, RECORDED) as path:
+        result = evaluation.evaluate(recorder, task, protocol=PROTOCOL, **options)
+        length = max(map(len, recorder.batches))
+        found = [np.stack(batch, axis=1) for batch in recorder.batches]  # (N, steps, A)
+        rest = [((0, 0), (0, length - one.shape[1]), (0, 0)) for one in found]
+        actions = np.concatenate(list(map(np.pad, found, rest)))
+        for episode, one in zip(result.episodes, actions, strict=True):
+            one[episode.length :] = 0.0
+        own = {name: result.settings[name] for name in ("observation", "task_kwargs")}
+        header = json.dumps({"policy": result.policy, "task": result.task, **own})
+        with open(path, "wb") as stream:
+            np.savez_compressed(stream, header=np.array(header), actions=actions)
+    return result

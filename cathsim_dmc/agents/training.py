@@ -1,7 +1,6 @@
 """Training: make the environment, make the learner, loop."""
 
 import contextlib
-import json
 import math
 import os
 import signal
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 from filelock import FileLock, Timeout
 from tensordict import TensorDictBase
+from torch import nn
 from torchrl.envs import EnvBase
 
 from cathsim_dmc import files
@@ -31,12 +31,16 @@ from cathsim_dmc.agents.episodes import INFO, EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
 from cathsim_dmc.agents.learner import Learner, make_collector
 from cathsim_dmc.agents.learners import make_learner
-from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
+from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 from cathsim_dmc.agents.training_log import TrainingLog, crossed
-from cathsim_dmc.agents.warm_start import take_over
 from cathsim_dmc.simulation import environments
+from cathsim_dmc.tasks import observations
 
 CONFIG_FILE = "config.json"
+# What must agree for the weights of another policy to mean the same.
+_ALIKE = ("hidden", "activation", "subtract_background",
+          "convolutions", "cnn_features", "observation_clip")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -113,8 +117,7 @@ def train(
         state = _start(learner, env, config, checkpoint, without_replay)
         collector = make_collector(config, learner, env, state["frames"])
         stack.callback(collector.shutdown)
-        text = json.dumps(config.to_dict(), indent=2) + "\n"
-        files.write_text(run / CONFIG_FILE, text)
+        files.write_json(run / CONFIG_FILE, config.to_dict())
         # After everything that draws numbers while being made.
         if checkpoint:
             torch.set_rng_state(state["rng"])
@@ -122,9 +125,8 @@ def train(
             torch.manual_seed(config.seed + 1)
         log = TrainingLog(run, config, learner.metrics, state, progress)
         stack.callback(log.close)
-        newest = checkpoint.path if checkpoint else None
-        loop = _Loop(run, config, iter(collector), learner, log, newest)
-        return loop.run_until(stack.enter_context(_interruption()))
+        interruption = stack.enter_context(_interruption())
+        return _loop(run, iter(collector), learner, log, interruption)
 
 
 @contextlib.contextmanager
@@ -230,69 +232,112 @@ def _start(
     return {"frames": checkpoint.frames, "seconds": checkpoint.seconds, **state}
 
 
-@dataclass
-class _Loop:
-    """Collects, learns, logs and saves."""
+def take_over(
+    network: nn.Module, config: TrainingConfig, shapes: NetworkShapes
+) -> None:
+    """Give a policy the weights and observation statistics of `initial_policy`.
 
-    run: Path
-    config: TrainingConfig
-    batches: Iterator[TensorDictBase]
-    learner: Learner
-    log: TrainingLog
-    newest: Path | None
+    A deviation that depends on the state (SAC) starts as one that does not (PPO,
+    cloning), and the other way round as its value in the middle of all states.
 
-    def run_until(self, interruption: threading.Event) -> TrainingResult:
-        """Train to the last frame, or until an event is set."""
-        config, log = self.config, self.log
-        tracker, saved, since = (
-            EpisodeTracker(config.num_envs),
-            log.frames,
-            time.monotonic(),
+    Raises:
+        ConfigError: the other policy has another network, sizes or observation.
+        CheckpointError: there is none, or it is damaged.
+    """
+    name = f"initial_policy={config.initial_policy!r}"
+    source = load_policy(str(config.initial_policy))
+    if not isinstance(source, TrainedPolicy):
+        raise ConfigError(
+            f"{name} has no network: give the directory of a run or of a checkpoint, "
+            'or "pretrained:NAME".'
         )
-        while log.frames < config.total_frames and not interruption.is_set():
-            batch = next(self.batches)
-            finished = tracker.add(batch)
-            _truncate_diverged(batch)
-            losses = self.learner.update(batch, log.frames / config.total_frames)
-            frames = log.frames + batch.numel()
-            broken = {name: x for name, x in losses.items() if not math.isfinite(x)}
-            if broken:
-                raise FloatingPointError(
-                    f"after {frames} frames these are not finite: {broken}. Nothing "
-                    f"was saved since {self.newest}; lower the learning rate, or look "
-                    "at the observations."
-                )
-            step_reward = float(batch["next", "reward"].mean())
-            last = frames >= config.total_frames or interruption.is_set()
-            log.add(batch.numel(), finished, step_reward, losses, last)
-            if (
-                crossed(saved, log.frames, config.checkpoint_frames)
-                or time.monotonic() - since >= config.checkpoint_seconds
-            ):
-                self.save()
-                saved, since = log.frames, time.monotonic()
-        # However it ended; writes nothing if the last batch has just been saved.
-        newest, short = self.save(), log.frames < config.total_frames
-        return TrainingResult(self.run, newest, log.frames, log.seconds, short, log.row)
-
-    def save(self) -> Path:
-        """Write a checkpoint; return its directory."""
-        learner, log = self.learner, self.log
-        self.newest = save_checkpoint(
-            self.run,
-            config=self.config,
-            shapes=learner.shapes,
-            frames=log.frames,
-            seconds=log.seconds,
-            policy=learner.policy_state(),
-            learning={
-                "learner": learner.learning_state(),
-                "rng": torch.get_rng_state(),
-                "episodes": log.episodes,
-                "window": list(log.window),
-            },
+    pairs = {n: (getattr(source.config, n), getattr(config, n)) for n in _ALIKE}
+    pairs["sizes"] = source.shapes, shapes
+    seen = source.config.observation, config.observation
+    if _entries(seen[0]) != _entries(seen[1]):
+        pairs["observation"] = seen
+    differing = [
+        f"{what}: it has {theirs!r}, given is {ours!r}"
+        for what, (theirs, ours) in pairs.items()
+        if theirs != ours
+    ]
+    if differing:
+        raise ConfigError(
+            f"{name} does not fit ({'; '.join(differing)}); give the same settings, or "
+            "another policy."
         )
-        return self.newest
+    given, state = source.network.state_dict(), network.state_dict()
+    (middle,) = (v for n, v in given.items() if n.endswith(("log_std", "log_std.bias")))
+    if config.initial_std is not None:
+        middle = torch.full_like(middle, config.initial_std).log()
+    alike = given.keys() == state.keys() and config.initial_std is None
+    for key, value in state.items():
+        if alike or "log_std" not in key:
+            state[key] = given[key]
+        elif value.ndim == 1:
+            state[key] = middle.clamp(*LOG_STD_RANGE)
+        else:
+            state[key] = torch.zeros_like(value)  # alike in all states
+    network.load_state_dict(state)
+
+
+def _entries(names: str | tuple[str, ...]) -> list[str]:
+    """Entries of an observation without the word of where they are from.
+
+    "route" and "biplane" have the same: one measures what the other reconstructs.
+    """
+    rows = observations.entries(observations.resolve(names))
+    return sorted(entry.key.partition("_")[2] or entry.key for entry in rows)
+
+
+def _loop(
+    run: Path,
+    batches: Iterator[TensorDictBase],
+    learner: Learner,
+    log: TrainingLog,
+    interruption: threading.Event,
+) -> TrainingResult:
+    """Collect, learn, log and save, to the last frame or until an event is set."""
+    config = learner.config
+
+    def save() -> Path:
+        learning = {
+            "learner": learner.learning_state(),
+            "rng": torch.get_rng_state(),
+            "episodes": log.episodes,
+            "window": list(log.window),
+        }
+        shapes, policy = learner.shapes, learner.policy_state()
+        counted = log.frames, log.seconds
+        return save_checkpoint(run, config, shapes, *counted, policy, learning)
+
+    tracker = EpisodeTracker(config.num_envs)
+    saved, since = log.frames, time.monotonic()
+    while log.frames < config.total_frames and not interruption.is_set():
+        batch = next(batches)
+        finished = tracker.add(batch)
+        _truncate_diverged(batch)
+        losses = learner.update(batch, log.frames / config.total_frames)
+        frames = log.frames + batch.numel()
+        broken = {name: x for name, x in losses.items() if not math.isfinite(x)}
+        if broken:
+            raise FloatingPointError(
+                f"after {frames} frames these are not finite: {broken}. Nothing was "
+                f"saved since {max(checkpoints_in(run), default='the start')}; lower "
+                "the learning rate, or look at the observations."
+            )
+        step_reward = float(batch["next", "reward"].mean())
+        last = frames >= config.total_frames or interruption.is_set()
+        log.add(batch.numel(), finished, step_reward, losses, last)
+        if (
+            crossed(saved, log.frames, config.checkpoint_frames)
+            or time.monotonic() - since >= config.checkpoint_seconds
+        ):
+            save()
+            saved, since = log.frames, time.monotonic()
+    # However it ended; writes nothing if the last batch has just been saved.
+    newest, short = save(), log.frames < config.total_frames
+    return TrainingResult(run, newest, log.frames, log.seconds, short, log.row)
 
 
 def _truncate_diverged(batch: TensorDictBase) -> None:
@@ -301,9 +346,7 @@ def _truncate_diverged(batch: TensorDictBase) -> None:
     Rewards are negative distances, so an end worth nothing afterwards would be the
     best of all: the agent would learn to break the simulation.
     """
-    error = batch.get(("next", INFO, "physics_error"), None)
-    if error is not None:
-        batch["next", "terminated"] &= ~error
+    batch["next", "terminated"] &= ~batch["next", INFO, "physics_error"].bool()
 
 
 @contextlib.contextmanager

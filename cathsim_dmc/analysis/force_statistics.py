@@ -6,7 +6,7 @@ them and relates them to the published figures.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,19 +87,10 @@ class ForceTracker:
         """
         self._steps: list[list[np.ndarray]] = [[] for _ in range(num_simulations)]
 
-    def add(self, forces: Mapping[str, np.ndarray | None]) -> None:
-        """Add a control step.
-
-        Args:
-            forces: Values (N,) in N by their names in `QUANTITIES`; None or left out
-                where they are not known.
-        """
-        table = np.full((len(self._steps), len(QUANTITIES)), np.nan)
-        for index, name in enumerate(QUANTITIES):
-            values = forces.get(name)
-            if values is not None:
-                table[:, index] = values
-        for steps, row in zip(self._steps, table, strict=True):
+    def add(self, forces: Sequence[np.ndarray]) -> None:
+        """Add a control step: forces (N,) in N, in the order of `QUANTITIES`."""
+        rows = np.array(forces, dtype=np.float64).T
+        for steps, row in zip(self._steps, rows, strict=True):
             steps.append(row)
 
     def finish(self, simulation: int) -> EpisodeForces:

@@ -11,7 +11,7 @@ from tyro import conf
 # torchrl goes before dm_control.
 from cathsim_dmc import agents  # isort: skip
 
-from cathsim_dmc import bounds, suite
+from cathsim_dmc import bounds, files, suite
 from cathsim_dmc import play as by_hand
 from cathsim_dmc.agents import evaluation, submission
 from cathsim_dmc.agents.demonstrations import DEMONSTRATION_SEED
@@ -100,7 +100,7 @@ def evaluate(
     values: dict[str, Any] = {name: one.to_dict() for name, one in results.items()}
     values["seconds"] = round(time.monotonic() - began, 1)
     if out is not None:
-        evaluation.write_evaluation(out, values)
+        files.write_json(out / "evaluation.json", values)
         contacts.draw(results["policy"], out / "heatmap.png")
     if json:
         # No figure of a policy has a bar to keep.

@@ -40,26 +40,19 @@ def print_results(*results: EvaluationResult) -> None:
 
 
 def _figures(result: EvaluationResult) -> dict[str, str]:
-    def spread(name: str, digits: int) -> str:
-        mean, deviation = result.mean_sd(name)
-        return "–" if mean is None else f"{mean:.{digits}f} ± {deviation:.{digits}f}"
-
-    def percent(rate: float | None) -> str:
-        return "–" if rate is None else f"{100 * rate:.0f} %"
-
     summary = result.summary()
-    success = percent(summary["success"])
+    success = f"{100 * summary['success']:.0f} %"
     if summary["success_ci95"] is not None:
         low, high = (round(100 * bound) for bound in summary["success_ci95"])
         success += f" ({low}–{high})"
     forces = {name: result.mean_sd(f"forces.{name}") for name in FIGURES}
     safe = summary["safe_success"].items()
     return {
-        "reward": spread("reward", 1),
-        "steps": spread("length", 0),
+        "reward": f"{summary['reward']:.1f} ± {summary['reward_sd']:.1f}",
+        "steps": f"{summary['length']:.0f} ± {summary['length_sd']:.0f}",
         **{f"{n.replace('_', ' ')}, mN": millinewtons(*f) for n, f in forces.items()},
         "success": success,
-        **{f"safe success, {limit}": percent(rate) for limit, rate in safe},
+        **{f"safe success, {limit}": f"{100 * rate:.0f} %" for limit, rate in safe},
     }
 
 
@@ -84,9 +77,6 @@ def print_episodes(result: EvaluationResult) -> None:
 def _outcome(
     seed: int, conditions: Mapping[str, Any], episode: EpisodeOutcome
 ) -> dict[str, str]:
-    def shown(value: float | None, digits: int) -> str:
-        return "–" if value is None else f"{value:.{digits}f}"
-
     end = "goal reached" if episode.success else "out of time"
     forces = episode.forces
     return {
@@ -94,9 +84,9 @@ def _outcome(
         "arch": str(conditions.get("arch", "–")),
         "device": str(conditions.get("device", "–")),
         "end": "physics error" if episode.physics_error else end,
-        "time, s": shown(episode.length * CONTROL_TIMESTEP, 1),
-        "path ratio": shown(episode.path_ratio, 2),
+        "time, s": f"{episode.length * CONTROL_TIMESTEP:.1f}",
+        "path ratio": f"{episode.path_ratio:.2f}",
         "mean force, mN": millinewtons(forces.mean_force),
         "peak force, mN": millinewtons(forces.peak_force),
-        "largest sum, N": shown(forces.peak_sum and forces.peak_sum.maximum, 2),
+        "largest sum, N": f"{forces.peak_sum.maximum:.2f}" if forces.peak_sum else "–",
     }
