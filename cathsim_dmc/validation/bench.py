@@ -32,24 +32,19 @@ EITHER = "pushed or led"  # the better of two histories, since the true one is u
 BASELINES = ("centreline", "nearest", "hull")
 
 
-def _nitrex(shaft: float, tip: float, length: float) -> Device:
-    """A straight wire of nitinol with a tip of gold-tungsten; EI in N·m², length m."""
-    return Device(
+# Nitrex, nitinol with a straight tip of gold-tungsten; Radifocus M Stiff, angled.
+DEVICES = {
+    "straight": Device(
         name="nitrex",
         outer_radius=0.445e-3,
         linear_density=4.0e-3,
-        shaft=Section.isotropic(shaft, METAL_POISSON_RATIO),
-        tip=Section.isotropic(tip, METAL_POISSON_RATIO),
-        tip_length=length,
-        tip_links=round(length / 4e-3),
+        shaft=Section.isotropic(75e-6, METAL_POISSON_RATIO),
+        tip=Section.isotropic(2.25e-6, METAL_POISSON_RATIO),
+        tip_length=0.03,
+        tip_links=8,
         loss_factor=METAL_LOSS,
         source="fit to every second recommended frame (docs/bench.md)",
-    )
-
-
-# Nitrex with a straight tip; Radifocus M Stiff with an angled one.
-DEVICES = {
-    "straight": _nitrex(75e-6, 2.25e-6, 0.03),
+    ),
     "angled": WIRE_035_GLIDE,
 }
 DOWN = "left"  # of the patient, see docs/bench.md
@@ -92,21 +87,17 @@ class Experiment:
         scale: float = 1.0,
         **changes: Any,
     ) -> Result:
-        """Simulates a wire in one of `WAYS`.
+        """Simulates a wire that comes to its place in one of `WAYS`.
 
         Args:
-            wire: to compare with.
-            way: in which it comes to its place.
             turns: of the wire about its axis, rad.
             scale: by which the lumen is larger.
             **changes: of the setting: `friction`, `down`, `overshoot`; by kind of the
                 wire `device` and `taper`.
         """
-        wall = self.field(scale)
-        start = {"led": self._nearest(wire), "laid": wire}.get(way)
-        shapes = []
+        start, shapes = {"led": self._nearest(wire), "laid": wire}.get(way), []
         for turn in turns if way == "pushed" or start is not None else ():
-            held = self.held(wire, wall, turn, **changes)
+            held = self.held(wire, self.field(scale), turn, **changes)
             shapes.append(held.push() if start is None else held.release(start.points))
         return _result(wire, shapes)
 
@@ -127,9 +118,9 @@ class Experiment:
         def away(other: Wire) -> float:
             return float(np.linalg.norm(other.points[-1] - wire.points[-1]))
 
-        others = (one for one in self.bench.wires if one.recommended)
-        others = (one for one in others if one is not wire and one.kind == wire.kind)
-        return min((o for o in others if not o.folded), key=away, default=None)
+        others = [one for one in self.bench.wires if one.recommended and not one.folded]
+        others = [one for one in others if one is not wire and one.kind == wire.kind]
+        return min(others, key=away, default=None)
 
     def hull(self, wire: Wire) -> Result:
         """The wire pushed into MuJoCo's own mesh, which is its convex hull."""
@@ -181,14 +172,9 @@ def _row(experiment: Experiment, wire: Wire, half: str) -> dict[str, Any]:
     angles = np.arange(TURNS if wire.kind == "angled" else 1) * (2.0 * np.pi / TURNS)
     results = {way: experiment.compare(wire, way, angles.tolist()) for way in WAYS}
     results |= {name: getattr(experiment, name)(wire) for name in BASELINES}
-    row: dict[str, Any] = {
-        "frame": wire.name,
-        "wire": wire.kind,
-        "vessel": wire.vessel,
-        "half": half,
-        "folded": wire.folded,
-        "inserted_mm": 1e3 * wire.length,
-    }
+    row: dict[str, Any] = {"frame": wire.name, "wire": wire.kind, "half": half}
+    row |= {"vessel": wire.vessel, "folded": wire.folded}
+    row["inserted_mm"] = 1e3 * wire.length
     for name, result in results.items():
         best = int(result.rms.argmin())
         row[name] = {
@@ -207,19 +193,16 @@ def _checks(rows: Sequence[dict[str, Any]]) -> Iterator[Check]:
         chosen = [row for row in rows if row["wire"] == kind and not row["folded"]]
         if not chosen:
             continue
-        baseline = {
-            key: float(np.median([row[key]["rms"] for row in chosen]))
-            for key in BASELINES
-        }
+        rms = {key: [row[key]["rms"] for row in chosen] for key in BASELINES}
+        baseline = {key: float(np.median(each)) for key, each in rms.items()}
         note = ", ".join(f"{key} {value:.2f} mm" for key, value in baseline.items())
         least = min(value for value in baseline.values() if np.isfinite(value))
         for way in ("pushed", EITHER, "laid"):
             each = [row[way]["rms"] for row in chosen]
             tested = [row[way]["rms"] for row in chosen if row["half"] == "test"]
             largest = max(row[way]["largest"] for row in chosen)
-            name = f"{kind} wires, {way}: median RMS"
+            name, value = f"{kind} wires, {way}: median RMS", float(np.median(each))
             behind = f"of {len(each)} frames, largest distance {largest:.1f} mm"
-            value = float(np.median(each))
             yield Check.at_most(name, value, bound, "mm", behind)
             if way != "laid":
                 label = f"{name}, against the best baseline"

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc import bounds
+from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End, Inlet, Surface
 from cathsim_dmc.anatomy.scan.inlet import cut_open
@@ -53,7 +54,7 @@ class Wire:
     @property
     def length(self) -> float:
         """Inserted length, m."""
-        return length_of(self.points)
+        return float(arc_lengths(self.points)[-1])
 
     @property
     def folded(self) -> bool:
@@ -90,38 +91,32 @@ class Bench:
         return Field.of(surface, [self.entry])
 
 
-def length_of(points: np.ndarray) -> float:
-    """Length of a line (n, 3), m."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
 def distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Distances (k,) m of two lines (n, 3), (m, 3) at equal arc lengths, every mm."""
-    at = np.arange(0.0, min(length_of(one), length_of(other)) + 1e-9, _STEP)
+    length = min(arc_lengths(one)[-1], arc_lengths(other)[-1])
+    at = np.arange(0.0, length + 1e-9, _STEP)
     return np.linalg.norm(along(one, at) - along(other, at), axis=1)
 
 
 def read(folder: str | Path) -> Bench:
     """Reads a folder of measured wires.
 
-    Args:
-        folder: with `MESH` (mm) and `WIRES`, which holds "wires", a list of objects
-            with "run", "frame", "wire" (one of `KINDS`), "tip_region",
-            "recommended", "inserted_length_mm", "entry_point_mm", "entry_direction"
-            and "centreline_mm", points from the tip on and beyond the entry; and
-            "landmarks": "entry" (point_mm, outward_normal, radius_mm), the far end
-            "ascending_aorta_root_mm", the "patient_axes", and branches (ostium_mm,
-            end_mm or fork_mm).
+    The folder has `MESH` (mm) and `WIRES`, which holds "wires", a list of objects with
+    "run", "frame", "wire" (one of `KINDS`), "tip_region", "recommended",
+    "inserted_length_mm", "entry_point_mm", "entry_direction" and "centreline_mm",
+    points from the tip on and beyond the entry; and "landmarks": "entry" (point_mm,
+    outward_normal, radius_mm), the far end "ascending_aorta_root_mm", the
+    "patient_axes", and branches (ostium_mm, end_mm or fork_mm).
 
     Raises:
         FileNotFoundError: if a file is missing.
         ValueError: if one is not as stated.
     """
     folder = Path(folder)
-    for name in (MESH, WIRES):
-        if not (folder / name).is_file():
+    for path in (folder / MESH, folder / WIRES):
+        if not path.is_file():
             raise FileNotFoundError(
-                f"no file {folder / name}; the folder has {MESH} and {WIRES}"
+                f"no file {path}; give a folder with {MESH} and {WIRES}"
             )
     vertices, faces = read_triangles(folder / MESH)
     vertices, faces = merged(vertices / 1e3, faces)
@@ -159,9 +154,8 @@ def _opened(
     for inwards in _CUTS:
         place = inlet.position + inwards * inlet.direction
         try:
-            points, shell, cap = cut_open(
-                vertices, faces, replace(inlet, position=place)
-            )
+            at = replace(inlet, position=place)
+            points, shell, cap = cut_open(vertices, faces, at)
         except ValueError:
             continue
         used, numbers = np.unique(np.concatenate([shell, cap]), return_inverse=True)

@@ -47,13 +47,13 @@ class Held:
         overshoot: float = 0.0,
         taper: tuple[float, float] | None = None,
     ):
-        """Builds the scene.
+        """Builds the scene; vectors are in the frame of the mesh.
 
         Args:
-            wall: lumen, frame of the mesh; of a surface its convex hull.
+            wall: lumen; of a surface its convex hull.
             wire: whose entry and length are taken.
             device: the wire.
-            down: (3,) direction of gravity, frame of the mesh; 0 for none.
+            down: (3,) direction of gravity; 0 for none.
             turn: of the device about its axis, rad.
             friction: Coulomb coefficient.
             overshoot: by which the wire is pushed too far and pulled back, m.
@@ -65,8 +65,8 @@ class Held:
         """
         # Rest does not depend on damping; so much makes it soon.
         device = replace(device, loss_factor=2.0)
-        self.length, self._reach = wire.length, wire.length + overshoot
-        reach = self._reach
+        self.length, self._entry = wire.length, wire.points[0]
+        self._reach = reach = wire.length + overshoot
         shaft = reach - device.tip_length
         if shaft < _LINK:
             raise ValueError(
@@ -83,17 +83,13 @@ class Held:
         across /= np.linalg.norm(across)
         frame = np.stack([across, np.cross(axis, across), axis], axis=1)
         self._frame = frame @ Rotation.from_euler("z", turn).as_matrix()
-        self._entry = wire.points[0]
         root = rig.arena.mjcf_model
         buoyancy = BLOOD_DENSITY / rig.catheter.density
         root.option.gravity = GRAVITY * (1.0 - buoyancy) * down @ self._frame
         bore = straight(float(rig.lengths.sum()))
         rig.arena.attach(Sheath(bore, device.outer_radius))
-        body = root.worldbody.add(
-            "body",
-            pos=-self._entry @ self._frame,
-            quat=Rotation.from_matrix(self._frame.T).as_quat(scalar_first=True),
-        )
+        quat = Rotation.from_matrix(self._frame.T).as_quat(scalar_first=True)
+        body = root.worldbody.add("body", pos=-self._entry @ self._frame, quat=quat)
         if isinstance(wall, Field):
             shape = fields.carrier(wall)
         else:
@@ -116,12 +112,16 @@ class Held:
                 rig.model.joint(f"{rig.name}/bend_{name}_{number}").stiffness = own
 
     def push(self) -> np.ndarray:
-        """Pushes the wire in, from outside; its shape (n, 3) at rest, m."""
+        """Pushes the wire in, from outside; its shape (n, 3) at rest, m.
+
+        Raises:
+            RuntimeError: if the simulation diverges.
+        """
         self._rig.data.qpos[:] = 0.0
         return self._advance(0.0)
 
     def release(self, points: np.ndarray) -> np.ndarray:
-        """Lays the wire along a line and lets it go; its shape (n, 3) at rest, m.
+        """Lays the wire along a line and lets it go; see `push`.
 
         Args:
             points: (n, 3) m, moved to the entry and, where too short, made longer.
@@ -140,14 +140,7 @@ class Held:
         return self._advance(self.length)
 
     def _advance(self, place: float) -> np.ndarray:
-        """Moves the carriage from a place, m, to the inserted length.
-
-        Returns:
-            What of the wire is in, at rest, (n, 3) m, frame of the mesh.
-
-        Raises:
-            RuntimeError: if the simulation diverges.
-        """
+        """Moves the carriage to the inserted length; the shape of `push`."""
         rig = self._rig
         actuator = rig.model.actuator(f"{rig.name}/insertion").id
         servo = rig.model.actuator_actadr[actuator]
@@ -158,9 +151,9 @@ class Held:
                 place += np.clip(goal - place, -step, step)
                 rig.data.act[servo] = place / MAX_PUSH_SPEED
                 rig.step()
-        end = rig.data.time + _LONGEST
         mujoco.mj_forward(rig.model, rig.data)
         before, nodes = np.inf, np.vstack([rig.joints, rig.head_position])
+        end = rig.data.time + _LONGEST
         while np.abs(nodes - before).max() > _REST and rig.data.time < end:
             rig.run(_WHILE)
             before, nodes = nodes, np.vstack([rig.joints, rig.head_position])

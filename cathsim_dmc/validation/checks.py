@@ -1,7 +1,7 @@
 """Checks: a measured figure, the bound it must keep, and reports of many of them."""
 
 import dataclasses
-import math
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -31,18 +31,16 @@ class Check:
         cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
     ) -> "Check":
         """A check of value <= bound; a value that is no number fails."""
-        return cls(
-            name, float(value), unit, f"<= {bound:g}", bool(value <= bound), note
-        )
+        kept = bool(value <= bound)
+        return cls(name, float(value), unit, f"<= {bound:g}", kept, note)
 
     @classmethod
     def at_least(
         cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
     ) -> "Check":
         """A check of value >= bound; a value that is no number fails."""
-        return cls(
-            name, float(value), unit, f">= {bound:g}", bool(value >= bound), note
-        )
+        kept = bool(value >= bound)
+        return cls(name, float(value), unit, f">= {bound:g}", kept, note)
 
     @classmethod
     def deviation(
@@ -56,8 +54,7 @@ class Check:
     ) -> "Check":
         """A check that |measured / expected - 1| is at most `percent` %.
 
-        Args:
-            unit: of both quantities, which the note states if none is given.
+        The note states both quantities, in their unit, if none is given.
         """
         note = note or f"{measured:.5g} {unit}, expected {expected:.5g} {unit}".rstrip()
         return cls.at_most(name, 100 * abs(measured / expected - 1), percent, "%", note)
@@ -86,14 +83,14 @@ class Report:
 
     def as_dict(self) -> dict[str, Any]:
         """The object that `--json` prints; numbers that JSON lacks become null."""
-        return _plain(
-            {
-                "checks": [dataclasses.asdict(check) for check in self.checks],
-                "title": self.title,
-                "passed": self.passed,
-                "findings": dict(self.findings),
-            }
-        )
+        found = {
+            "checks": [dataclasses.asdict(check) for check in self.checks],
+            "title": self.title,
+            "passed": self.passed,
+            "findings": dict(self.findings),
+        }
+        text = json.dumps(found, default=lambda array: array.tolist())
+        return json.loads(text, parse_constant=lambda _: None)
 
     def table(self):
         """A `rich.table.Table` of the checks."""
@@ -110,15 +107,3 @@ class Report:
             kept = "[green]pass[/]" if check.passed else "[bold red]FAIL[/]"
             table.add_row(check.name, value, bound, kept, check.note)
         return table
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(each) for each in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

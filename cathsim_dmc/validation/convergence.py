@@ -11,18 +11,15 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
-from cathsim_dmc.tasks.config import (
-    CONTROL_TIMESTEP,
-    PHYSICS_TIMESTEP,
-    NavigationConfig,
-)
+from cathsim_dmc.tasks import config
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check
 
 TIMESTEPS = (0.001, 0.002, 0.004, 0.008)  # s
 SHAFT_LINKS = (0.005, 0.007, 0.010, 0.014, 0.0175, 0.025)  # m
 DEFAULTS = {
-    "physics_timestep": PHYSICS_TIMESTEP,
-    "shaft_link": NavigationConfig().shaft_link,
+    "physics_timestep": config.PHYSICS_TIMESTEP,
+    "shaft_link": config.NavigationConfig().shaft_link,
 }
 # The start of an episode is displaced by up to 1 mm; a coarser model may not move the
 # path by more than that on average.
@@ -73,7 +70,7 @@ def run(script: Script, *, seed: int = 0, **options: Any) -> Episode:
     """Runs a script in the type-I arch until its end or that of the episode.
 
     Args:
-        **options: further fields of `tasks.navigation.NavigationConfig`.
+        **options: further fields of `tasks.config.NavigationConfig`.
 
     Raises:
         RuntimeError: if the simulation diverges.
@@ -86,9 +83,8 @@ def run(script: Script, *, seed: int = 0, **options: Any) -> Episode:
     )
     environment.close()
     if "error" in episode.meta:
-        raise RuntimeError(
-            f"insertion {script.name!r} with {options} diverged at step {episode.steps}"
-        )
+        where = f"with {options} diverged at step {episode.steps}"
+        raise RuntimeError(f"insertion {script.name!r} {where}")
     return episode
 
 
@@ -99,15 +95,14 @@ def study(script: Script, parameter: str, values: Sequence[float]) -> dict[str, 
         parameter: "physics_timestep" (s) or "shaft_link" (m).
 
     Returns:
-        "script" (name), "parameter", and lists with an entry for each value: "value",
+        "script" (name), "parameter", and lists with an entry for each value: "value"
         and `FIGURES`: mean and largest distance (mm) of the head from the finest run's
-        at the same time, largest distance (mm) from its track whatever the time, and
-        mean wall force, N.
+        at the same time, largest one from its track, and mean wall force, N.
     """
     ascending = sorted(float(value) for value in values)
     # A tiny goal: the script runs to its end.
-    fixed = {"goal_radius": 1e-5, "outside_range": True}
-    options = [{**fixed, parameter: value} for value in ascending]
+    fixed: dict[str, Any] = {"goal_radius": 1e-5, "outside_range": True}
+    options: list[dict[str, Any]] = [fixed | {parameter: one} for one in ascending]
     runs = [run(script, **each) for each in options]
     heads = [one.head[1:] for one in runs]
     away = 1e3 * np.linalg.norm(np.array(heads) - heads[0], axis=-1)
@@ -134,18 +129,17 @@ def studies() -> list[dict[str, Any]]:
 
 def checks(results: Sequence[dict[str, Any]]) -> Iterator[Check]:
     """Whether the defaults, which are among the values, are converged."""
+    units = {"physics_timestep": ("step", "ms"), "shaft_link": ("links", "mm")}
     for one in results:
-        default = DEFAULTS[one["parameter"]]
-        of_step = one["parameter"] == "physics_timestep"
-        kind, unit = ("step", "ms") if of_step else ("links", "mm")
+        default, (kind, unit) = DEFAULTS[one["parameter"]], units[one["parameter"]]
         name = f"{kind} of {1e3 * default:g} {unit} against "
-        name += f"{1e3 * one['value'][0]:g} {unit}, {one['script']}: "
-        index = int(np.argmin(np.abs(np.array(one["value"]) - default)))
+        name += f"{1e3 * one['value'][0]:g} {unit}, {one['script']}: mean "
+        index = one["value"].index(default)
         path, largest, off, force = (one[key][index] for key in FIGURES)
         note = f"largest {largest:.2f} mm, off the track by at most {off:.2f} mm"
-        away = f"{name}mean distance of the tip paths"
+        away = f"{name}distance of the tip paths"
         yield Check.at_most(away, path, PATH_BOUND, "mm", note)
         reference = one["force_mean"][0]
         if reference > LEAST_FORCE:
             both = 1e3 * force, 1e3 * reference
-            yield Check.deviation(f"{name}mean wall force", *both, FORCE_BOUND, "mN")
+            yield Check.deviation(f"{name}wall force", *both, FORCE_BOUND, "mN")

@@ -65,10 +65,7 @@ def cantilever(blood: StillBlood | None) -> Rig:
 
 
 def release(*, blood: bool = True) -> tuple[float, float, float, float]:
-    """Releases a bent cantilever of 0.2 m from the shape of its first mode.
-
-    Args:
-        blood: whether it is in blood, or without any fluid.
+    """Releases a cantilever of 0.2 m from its first mode, in blood or without fluid.
 
     Returns:
         Frequencies, simulated and of the beam, Hz; decay rates likewise, 1/s.
@@ -96,7 +93,8 @@ def release(*, blood: bool = True) -> tuple[float, float, float, float]:
     time = rig.model.opt.timestep * np.arange(len(curve))
     beam = _beam(one, length, start, time, blood)
     (mine, decay), (theirs, expected) = (
-        _swing(time, each) for each in (np.array(curve), beam)
+        _swing(time, np.array(curve)),
+        _swing(time, beam),
     )
     return mine, theirs, decay, expected
 
@@ -114,8 +112,8 @@ def _beam(
     """Deflection (n,) of the end of a beam released from its first mode, m."""
     mass = device.linear_density + (carried_mass([device]) if blood else 0.0)
     squares = (_ROOTS / length) ** 4
-    # The rotors of the hinges stand for no mass of the device; in blood they are left
-    # out, as they matter less there.
+    # The rotors of the hinges stand for no mass of the device, and matter little in
+    # blood.
     rotors = 0.0 if blood else HINGE_ARMATURE * LINK / mass * squares
     rates = device.shaft.bending_stiffness / mass * squares / (1 + rotors)
     places, weights = np.polynomial.legendre.leggauss(40)
@@ -130,12 +128,10 @@ def _beam(
             force -= modes @ (weights * drag(across, diameter)) / mass
         return np.concatenate([velocities, force])
 
-    first = np.zeros(8)
-    first[0] = start / _modes(np.ones(1))[0, 0]
-    solved = solve_ivp(
-        change, (0, time[-1]), first, "LSODA", time, rtol=1e-8, atol=1e-10
-    )
-    return _modes(np.ones(1))[:, 0] @ solved.y[:4]
+    end, limits = _modes(np.ones(1))[:, 0], {"rtol": 1e-8, "atol": 1e-10}
+    first = np.append(start / end[0], np.zeros(7))
+    solved = solve_ivp(change, (0, time[-1]), first, "LSODA", time, **limits)
+    return end @ solved.y[:4]
 
 
 def drag(velocity: np.ndarray, diameter: float) -> np.ndarray:
@@ -151,14 +147,13 @@ def spin(speed: float) -> tuple[float, float]:
     """Mean lag of the end and Σ τ ω θ²/C of the joints through the twist, rad.
 
     A device turns in a half circle of 40 mm, for one turn after the first quarter. A
-    joint of compliance C that is bent by θ brakes the turning with τ ω θ²/C, where τ
-    is the relaxation time of the material; the torsion hinges bear the sum of all
-    joints beyond them.
+    joint of compliance C that is bent by θ brakes with τ ω θ²/C, τ being the relaxation
+    time of the material; a torsion hinge bears the sum of all joints beyond it.
     """
     length = devices.Discretisation(working_length=0.3, torsion_joints=4)
     rig = Rig("steerable_5f", length, rotation=True, friction=0.0)
-    ends = [[0, 0, -0.1]], [[2 * _BEND, 0, -0.2]]
-    line = np.vstack([ends[0], half_circle(_BEND, 0.0, 30), ends[1]])
+    arc = half_circle(_BEND, 0.0, 30)
+    line = np.vstack([[[0, 0, -0.1]], arc, [[2 * _BEND, 0, -0.2]]])
     line[:, 2] += 0.1 - rig.lengths.sum()
     rig.arena.attach(Sheath(line[:-1], rig.device.outer_radius, rig.lengths.max()))
     rig.compile()
@@ -167,8 +162,7 @@ def spin(speed: float) -> tuple[float, float]:
     twist_hinges = ids(rig.model, rig.catheter.hinges[len(rig.catheter.bends) :])
     places = rig.model.jnt_qposadr[twist_hinges]
     command = np.array([[0.0, speed / MAX_ROTATION_SPEED]])
-    twists = []
-    steps = round(2 * np.pi / speed / CONTROL_TIMESTEP)
+    twists, steps = [], round(2 * np.pi / speed / CONTROL_TIMESTEP)
     settling = max(round(2.0 / CONTROL_TIMESTEP), steps // 4)
     for _ in range(settling + steps):
         drives.follow(command)

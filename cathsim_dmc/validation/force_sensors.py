@@ -1,5 +1,6 @@
 """`cathsim validate forces`: sensors against known loads."""
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -39,26 +40,20 @@ def resting_link(load: float) -> np.ndarray:
         Force of the device on the plate by the contact sensor, by the load cell under
         the plate, and by the sensor of the base, N; penetration, m.
     """
-    rig = Rig()
+    rig, rows = Rig(), []
     rig.add_plate(rig.device.outer_radius)
     rig.compile()
-    steps = round(RESTING_TIME / rig.model.opt.timestep)
-    rows = []
-    for step in range(steps):
-        share = min(1.0, step * rig.model.opt.timestep)
+    for step in range(round(RESTING_TIME / PHYSICS_TIMESTEP)):
+        share = min(1.0, step * PHYSICS_TIMESTEP)
         rig.data.xfrc_applied[rig.tip_body, 1] = share * load
         rig.step()
         contacts = forces.Contacts.from_sensor(rig.sensor("wall_contacts"))
-        rows.append(
-            (
-                contacts.force[..., 1].sum(),
-                # MuJoCo's sensor gives the force of the support on the phantom.
-                -rig.sensor("load_cell")[1],
-                -rig.sensor(f"{rig.name}/push_force")[1],
-                contacts.penetration.max(),
-            )
-        )
-    return np.mean(rows[-round(AVERAGING / rig.model.opt.timestep) :], axis=0)
+        across = contacts.force[..., 1].sum()
+        # MuJoCo's sensor gives the force of the support on the phantom.
+        cell = -rig.sensor("load_cell")[1]
+        base = -rig.sensor(f"{rig.name}/push_force")[1]
+        rows.append((across, cell, base, contacts.penetration.max()))
+    return np.mean(rows[-round(AVERAGING / PHYSICS_TIMESTEP) :], axis=0)
 
 
 class DeadEnd(NamedTuple):
@@ -82,10 +77,9 @@ def dead_end(command: float, size: tuple[float, float] = GUIDING_TUBE) -> DeadEn
     environment = in_tube(size)
     task = environment.task
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
-    motor = model.actuator(f"{task.scene.catheter.mjcf_model.model}/insertion")
-    data.actuator(motor.id).ctrl[0] = command
+    motor = model.actuator(f"{task.scene.catheter.mjcf_model.model}/insertion").id
     push = command * LARGEST_PUSH
-    model.actuator_forcerange[motor.id] = -push, push
+    data.ctrl[motor], model.actuator_forcerange[motor] = command, (-push, push)
     sheath = environment.physics.bind([task.scene.sheath.bore.parent]).element_id
     way = size[0] - task.scene.placement.start_depth
     steps = round((SETTLING + way / (command * MAX_PUSH_SPEED)) / PHYSICS_TIMESTEP)
@@ -94,15 +88,9 @@ def dead_end(command: float, size: tuple[float, float] = GUIDING_TUBE) -> DeadEn
     for _ in range(last):
         mujoco.mj_step(model, data)
         reading = task.rollout.index.read(data)
-        contacts = task.rollout.index.contacts(data.sensordata)
-        rows.append(
-            (
-                reading.push_force,
-                reading.load_cell[2],
-                contacts.force[:, 2].sum(),
-                _axial_force_on(model, data, sheath),
-            )
-        )
+        pressed = task.rollout.index.contacts(data.sensordata).force[:, 2].sum()
+        rim = _axial_force_on(model, data, sheath)
+        rows.append((reading.push_force, reading.load_cell[2], pressed, rim))
     means = np.mean(rows, axis=0).tolist()
     return DeadEnd(push, *means, ripple=float(np.std(rows, axis=0)[0]))
 
@@ -124,9 +112,8 @@ def _checks(pushed: dict[str, list[DeadEnd]]) -> Iterator[Check]:
     for load in RESTING_LOADS:
         contacts, load_cell, _, depth = resting_link(load)
         name = f"last link resting under {load:g} N, contact sensor"
-        note = (
-            f"{contacts:.5f} N, load cell {load_cell:.5f} N, {1e3 * depth:.2f} mm deep"
-        )
+        note = f"{contacts:.5f} N, load cell {load_cell:.5f} N, "
+        note += f"{1e3 * depth:.2f} mm deep"
         yield Check.deviation(name, contacts, load, BALANCE_BOUND, "N", note)
     for one in pushed["guiding"]:
         for what, value in (("load cell", one.load_cell), ("contacts", one.contacts)):
@@ -138,15 +125,12 @@ def _checks(pushed: dict[str, list[DeadEnd]]) -> Iterator[Check]:
         yield Check.deviation(name, value, one.push, BALANCE_BOUND, "N")
     # Insertions into the BCA of the type-I arch.
     for speed in INSERTION_SPEEDS:
-        runs = [
-            convergence.run(
-                convergence.Script("into the BCA", speed, curl, 4.0 / speed),
-                seed=seed,
-                goal="bca",
-            )
+        scripts = [
+            convergence.Script("into the BCA", speed, curl, 4.0 / speed)
             for curl in INSERTION_CURLS
-            for seed in range(INSERTION_SEEDS)
         ]
+        drawn = itertools.product(scripts, range(INSERTION_SEEDS))
+        runs = [convergence.run(one, seed=seed, goal="bca") for one, seed in drawn]
         every = np.concatenate([run.contact_force for run in runs])
         single = np.linalg.norm(every, axis=-1)
         usual = 100 * float((single <= USUAL_FORCE).mean())
@@ -161,9 +145,6 @@ def _checks(pushed: dict[str, list[DeadEnd]]) -> Iterator[Check]:
 
 def validate_forces() -> Report:
     """Runs every check of the forces."""
-    tubes = {"guiding": GUIDING_TUBE, "wide": WIDE_TUBE}
-    pushed = {
-        name: [dead_end(command, size) for command in PUSHES]
-        for name, size in tubes.items()
-    }
+    pushed = {"guiding": [dead_end(command) for command in PUSHES]}
+    pushed["wide"] = [dead_end(command, WIDE_TUBE) for command in PUSHES]
     return Report("forces", list(_checks(pushed)), data={"pushed": pushed})

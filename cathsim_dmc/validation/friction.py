@@ -29,15 +29,9 @@ CAPSTAN_BOUND = 3.0  # % of the coefficient of friction
 DRUM_RADIUS = 0.05  # m
 # Coefficient and angle of the wrap, rad: default friction, and about the ends of the
 # range of lubricated silicone to bare steel.
-CAPSTANS = (
-    (0.05, 0.5 * np.pi),
-    (FRICTION, np.pi),
-    (0.05, np.pi),
-    (0.2, np.pi),
-    (0.05, 1.5 * np.pi),
-    (0.2, 0.5 * np.pi),
-    (0.2, 1.5 * np.pi),
-)
+QUARTER, HALF = 0.5 * np.pi, np.pi
+CAPSTANS = ((0.05, QUARTER), (FRICTION, HALF), (0.05, HALF), (0.2, HALF))
+CAPSTANS += ((0.05, 3 * QUARTER), (0.2, QUARTER), (0.2, 3 * QUARTER))
 TENSION = 0.5  # N, dead load on the distal end: far above EI/R² = 0.02 N
 PULL_SPEED = 0.02  # m/s, no load
 _AXIS = DRUM_RADIUS + devices.STEERABLE_5F.outer_radius  # m, radius of the rod's axis
@@ -55,11 +49,7 @@ _PULL = 0.1  # m
 
 
 def _on_plate(device: Any, load: float) -> tuple[Rig, np.ndarray]:
-    """A straight device on a plate, settled under a load, N, on its end.
-
-    Returns:
-        The rig, and the load of each of its bodies, N.
-    """
+    """A straight device, settled on a plate, its end loaded; loads of its bodies, N."""
     rig = Rig(device, straight=True)
     rig.add_plate(rig.device.outer_radius + _DROP)
     rig.compile()
@@ -75,12 +65,7 @@ def _on_plate(device: Any, load: float) -> tuple[Rig, np.ndarray]:
 
 
 def slid(device: Any, load: float, speed: float) -> tuple[float, float]:
-    """Pulls a device over a plate.
-
-    Args:
-        device: see `Rig`.
-        load: of its end on the plate, N.
-        speed: m/s.
+    """Pulls a device (see `Rig`) over a plate under a load, N, with a speed, m/s.
 
     Returns:
         Coefficient of friction that acts, pull over load; standard deviation of the
@@ -93,8 +78,8 @@ def slid(device: Any, load: float, speed: float) -> tuple[float, float]:
     for _ in range(round(_WATCHED / speed / rig.model.opt.timestep)):
         rig.step()
         pull.append(-rig.sensor(f"{rig.name}/push_force")[2])
-    mean = float(np.mean(pull))
-    return mean / load, float(np.std(pull)) / abs(mean)
+    mean, deviation = float(np.mean(pull)), float(np.std(pull))
+    return mean / load, deviation / abs(mean)
 
 
 def creep(device: Any) -> float:
@@ -114,8 +99,7 @@ class Capstan(NamedTuple):
         friction: Coulomb coefficient.
         angle: by which the drum turns the force in the rod, rad.
         mean: ratio of the tensions at the base and at the end, in steady sliding.
-        free: the same without friction. Bending and straightening the rod dissipates
-            a little, by however much it is wrapped.
+        free: the same without friction: bending and straightening dissipate a little.
         travel: (n,), way of the base, m.
         ratio: (n,), of the tensions.
     """
@@ -139,11 +123,7 @@ class Capstan(NamedTuple):
         return float(np.log(ratio) / (self.angle * _LEVER))
 
     def check(self) -> Check:
-        """The coefficient that acts against the one that was set.
-
-        The ratio of a slippery rod is near 1 whatever happens: 12 % less friction
-        over a quarter turn are 0.9 % of it at 0.05. So the exponent is bounded.
-        """
+        """The coefficient that acts against the one set; ratios hide small ones."""
         angle = np.degrees(self.angle)
         name = f"capstan, friction {self.friction:g} over {angle:.0f}°"
         note = f"friction {self.acting:.4f} acts, ratio {self.mean:.4f}, "
@@ -153,39 +133,24 @@ class Capstan(NamedTuple):
 
 
 def capstan(friction: float, wrap: float = np.pi) -> Capstan:
-    """Pulls the rod over a drum with and without friction.
+    """Pulls the rod over a drum, by `wrap` rad, with and without friction.
 
-    The drum is a field. The distal end carries a dead load; the base retracts. Both
-    forces are measured, and so is the angle between them, because a rod with bending
-    stiffness leaves the drum earlier than a string.
-
-    Args:
-        wrap: angle by which the drum turns the rod at the start, rad; above half a
-            turn the rod passes beside itself, for it does not touch itself.
+    The distal end carries a dead load; the base retracts. Both forces are measured, and
+    so is the angle between them, because a rod with bending stiffness leaves the drum
+    earlier than a string. Above half a turn the rod passes through itself.
 
     Raises:
         RuntimeError: if the rod sticks to the drum.
     """
-    angle, *pulled = _pulled(friction, wrap)
-    mean, free = (
-        float(ratio[travel > _LEAD].mean())
-        for travel, ratio in (pulled, _pulled(0.0, wrap)[1:])
-    )
-    return Capstan(friction, angle, mean, free, *pulled)
+    (angle, travel, ratio), (_, way, free) = _pulled(friction, wrap), _pulled(0.0, wrap)
+    means = float(ratio[travel > _LEAD].mean()), float(free[way > _LEAD].mean())
+    return Capstan(friction, angle, *means, travel, ratio)
 
 
 def _pulled(
     friction: float, wrap: float, tube: float | None = None
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Pulls a rod round a drum about a line along y.
-
-    Args:
-        tube: radius (m) of a tube that leads round the drum by half a turn, from below
-            and back, with the drum as its inner wall; None for the drum alone.
-
-    Returns:
-        Angle of the wrap, rad; way of the base (n,), m; ratio of the tensions (n,).
-    """
+    """Angle of a rod round a drum, or in a tube about it; ways and ratios (n,)."""
     length = 2 * _LEAD + _PULL + wrap * _AXIS
     fine = devices.Discretisation(working_length=length)
     rig = Rig("steerable_5f", fine, straight=True, stroke=_PULL, friction=friction)
@@ -209,22 +174,20 @@ def _pulled(
     load = TENSION * np.array([np.sin(wrap), 0.0, np.cos(wrap)])
     rig.run(_SETTLING, load)
     rig.data.actuator(f"{rig.name}/insertion").ctrl[0] = -PULL_SPEED / MAX_PUSH_SPEED
-    rows = [np.zeros(4)]
-    while rows[-1][0] < _PULL - 0.02:
+    travel, force = [0.0], []
+    while travel[-1] < _PULL - 0.02:
         rig.step(load)
-        travel = _PULL - rig.qpos("insertion")
-        rows.append(np.append(travel, rig.sensor(f"{rig.name}/push_force")))
-        if len(rows) > 10_000:
-            raise RuntimeError(f"the rod stuck on the drum after {1e3 * travel:.1f} mm")
-    travel, force = np.split(np.array(rows[1:]), [1], axis=1)
-    travel = travel[:, 0]
-    tension = np.linalg.norm(force, axis=1)
+        travel.append(_PULL - rig.qpos("insertion"))
+        force.append(rig.sensor(f"{rig.name}/push_force"))
+        if len(force) > 10_000:
+            moved = 1e3 * travel[-1]
+            raise RuntimeError(f"the rod stuck on the drum after {moved:.1f} mm")
+    way, force = np.array(travel[1:]), np.array(force)
     # Link 0 never turns, so its frame is the world's. Both forces point away from
     # the drum; that of the base against its heading, which is about 0.
-    sliding = travel > _LEAD
-    heading = np.arctan2(-force[sliding, 0], -force[sliding, 2])
-    angle = float(wrap - heading.mean())
-    return angle, travel, tension / TENSION
+    heading = np.arctan2(-force[:, 0], -force[:, 2])[way > _LEAD]
+    tension = np.linalg.norm(force, axis=1)
+    return float(wrap - heading.mean()), way, tension / TENSION
 
 
 def arch_ripple() -> float:
@@ -252,6 +215,5 @@ def checks(pulled: list[Capstan]) -> Iterator[Check]:
         yield Check.at_most(f"{name}creep", 1e3 * creep(device), CREEP_BOUND, "mm/s")
     name = f"drawn round an arch under {TENSION:g} N: ripple of the force"
     yield Check.at_most(name, 100 * arch_ripple(), ARCH_RIPPLE, "%")
-    for case in CAPSTANS:
-        pulled.append(capstan(*case))
-        yield pulled[-1].check()
+    pulled.extend(capstan(*case) for case in CAPSTANS)
+    yield from (one.check() for one in pulled)

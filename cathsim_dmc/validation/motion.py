@@ -9,11 +9,7 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.motion import PULSE_PRESSURE, Motion, distensibility
 from cathsim_dmc.anatomy.motion_loops import MARK, PARAMETERS, courses, pulse
 from cathsim_dmc.collision import carrying
-from cathsim_dmc.entities.contact import (
-    CONTACT_SOLIMP,
-    CONTACT_SOLREF,
-    FRICTION_STIFFNESS,
-)
+from cathsim_dmc.entities import contact
 from cathsim_dmc.physics.flow import moving_velocities
 from cathsim_dmc.physics.stepper import PHYSICS_TIMESTEP
 from cathsim_dmc.validation.checks import Check
@@ -40,10 +36,10 @@ def parameters(heart: float, breathing: float, soft: float) -> np.ndarray:
 def stirred(lumen, lattice: np.ndarray, friction: float = 0.0) -> mujoco.MjSpec:
     """A model of a moving wall alone, geom 0."""
     carrying.install()
-    fixed = {"solref": CONTACT_SOLREF, "solimp": CONTACT_SOLIMP}
+    fixed = {"solref": contact.CONTACT_SOLREF, "solimp": contact.CONTACT_SOLIMP}
     spec = bare(lumen, lattice, friction=(friction, 0, 0), **fixed)
     spec.nuserdata = 3 + PARAMETERS
-    spec.option.impratio = FRICTION_STIFFNESS
+    spec.option.impratio = contact.FRICTION_STIFFNESS
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     return spec
 
@@ -59,14 +55,12 @@ def begin(model: mujoco.MjModel, course: np.ndarray) -> mujoco.MjData:
 def clearances(
     anatomy: Anatomy, course: np.ndarray, times: Sequence[float], points: np.ndarray
 ) -> np.ndarray:
-    """Distances (T, n) m of points from a moving wall at times; NaN where too far.
-
-    Small spheres measure them.
+    """Distances (T, n) m of points from a moving wall, as small spheres measure them.
 
     Args:
         course: of the motion, see `parameters`.
         times: (T,) s.
-        points: (n, 3) m, or (T, n, 3).
+        points: (n, 3) or (T, n, 3), m; NaN is returned where they are too far away.
     """
     points = np.broadcast_to(points, (len(times), *points.shape[-2:]))
     spec = stirred(anatomy.lumen, anatomy.motion.lattice)
@@ -112,8 +106,8 @@ def wall_place(anatomy: Anatomy, number: int = 40) -> float:
 
     Points of the wall at rest are moved, and looked for by the collisions of probes.
     """
-    course = parameters(_HEART, _BREATHING, _SOFT)
-    random, lumen = np.random.RandomState(0), anatomy.lumen
+    course, lumen = parameters(_HEART, _BREATHING, _SOFT), anatomy.lumen
+    random = np.random.RandomState(0)
     vertices, normals = anatomy.surface.vertices, anatomy.surface.normals
     open_ends = np.array([end.position for end in anatomy.ends])
     far = np.linalg.norm(vertices - open_ends[:, None], axis=-1).min(axis=0)
@@ -139,8 +133,7 @@ def wall_place(anatomy: Anatomy, number: int = 40) -> float:
 def section_flow(anatomy: Anatomy, time: float) -> float:
     """Flow through a section of a straight tube in motion, over that prescribed.
 
-    The velocity relative to the moving space is integrated over the section, whose
-    points and normals come from where `Motion.to_space` puts it.
+    The velocity relative to space is integrated over where `Motion.to_space` puts it.
     """
     course = parameters(_HEART, _BREATHING, _SOFT)
 
@@ -151,9 +144,8 @@ def section_flow(anatomy: Anatomy, time: float) -> float:
 
     grown = RADIUS + float(there(np.zeros(1), np.zeros(1))[1][0])
     places, weights = np.polynomial.legendre.leggauss(32)
-    radius, angle = np.meshgrid(
-        grown * (places + 1) / 2, np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    )
+    round_ = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    radius, angle = np.meshgrid(grown * (places + 1) / 2, round_)
     step = 1e-4  # m
     along = there(radius + step, angle)[0] - there(radius - step, angle)[0]
     turn = step / radius
@@ -191,15 +183,10 @@ def ride(
     course = parameters(_HEART, 0.0, 0.0)
     motion = rigid_motion(anatomy, np.array(way))
     spec = stirred(anatomy.lumen, motion.lattice, friction)
-    slider(
-        spec,
-        np.eye(3),
-        (RADIUS - 1e-3 - 1e-6, 0, 0.1),
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        size=(1e-3, 2e-3, 0),
-        mass=1e-3,
-        friction=(friction, 0, 0),
-    )
+    capsule = {"size": (1e-3, 2e-3, 0), "mass": 1e-3, "friction": (friction, 0, 0)}
+    capsule["type"] = mujoco.mjtGeom.mjGEOM_CAPSULE
+    slider(spec, np.eye(3), (RADIUS - 1e-3 - 1e-6, 0, 0.1), **capsule)
+    # As `physics.motion.add_clock`.
     clock = spec.worldbody.add_body(gravcomp=1, mass=0.1, inertia=(1e-5,) * 3)
     clock.explicitinertial = True
     clock.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(0, 1, 0))
@@ -207,21 +194,18 @@ def ride(
     data = begin(model, course)
     if inertial:
         data.userdata[2:] = 0.0
-    count = round(_RIDE / PHYSICS_TIMESTEP)
-    link, wall = np.empty((2, count, 3))
-    for step in range(count):
-        time = step * PHYSICS_TIMESTEP
+    times, half = np.arange(0.0, _RIDE, PHYSICS_TIMESTEP), 0.5 * PHYSICS_TIMESTEP
+    link = []
+    for time in times:
         model.opt.gravity[:] = _GRAVITY, 0, 0
         if inertial:
             # The wall's velocities are those in the middle of each step.
-            step_half = 0.5 * PHYSICS_TIMESTEP
-            after = courses(course, time + step_half)[3]
-            rate = (after - courses(course, time - step_half)[3]) / PHYSICS_TIMESTEP
-            model.opt.gravity[:] -= rate * np.array(way)
+            gain = courses(course, time + half)[3] - courses(course, time - half)[3]
+            model.opt.gravity[:] -= gain / PHYSICS_TIMESTEP * np.array(way)
         mujoco.mj_step(model, data)
-        link[step] = data.qpos[:3]
-        wall[step] = courses(course, time + PHYSICS_TIMESTEP)[0] * np.array(way)
-    return link, wall
+        link.append(data.qpos[:3].copy())
+    wall = [courses(course, time + PHYSICS_TIMESTEP)[0] for time in times]
+    return np.array(link), np.outer(wall, way)
 
 
 def slip(anatomy: Anatomy) -> float:

@@ -1,6 +1,7 @@
 """Devices pressed on a wall and pushed along it: rest, contacts, repeated steps."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -40,12 +41,7 @@ def pressed(
     solref: tuple[float, ...] = contact.CONTACT_SOLREF,
     solimp: tuple[float, ...] = contact.CONTACT_SOLIMP,
 ) -> tuple[float, float]:
-    """Presses a mass on a plane, by the integrator and time step of the tasks.
-
-    Args:
-        load: N.
-        solref: of the contact, MuJoCo's.
-        solimp: likewise.
+    """Presses a mass on a plane with a load, N, by integrator and step of the tasks.
 
     Returns:
         Mean depth, and the largest less the smallest, m.
@@ -67,10 +63,7 @@ def pressed(
 
 
 def jam(pair: tuple[str, str]) -> tuple[float, float, float, float]:
-    """Pushes both devices into the dead end of a tube until their drives give way.
-
-    Args:
-        pair: Names of guidewire and catheter.
+    """Pushes guidewire and catheter into a dead end until their drives give way.
 
     Returns:
         Push force at the end, N; 99th percentile of the deepest contact of a physics
@@ -129,14 +122,13 @@ def push_checks() -> Iterator[Check]:
                 links += len(np.unique(geoms)) - bool(len(geoms))
         again = 100 * float(play.rollout.repeated.sum()) / (len(_CURLS) * _PUSHES)
         environment.close()
-        name, note = f"{task}, full push: ", "contacts for each link that has one"
-        note = f"{contacts / max(links, 1):.2f} {note}"
-        yield Check.at_most(
-            f"{name}control steps done again", again, REPEATED, "%", note
-        )
+        each = f"{contacts / max(links, 1):.2f} contacts for each link that has one"
         deep = 1e3 * np.concatenate(depth)
-        note = f"99th percentile {np.percentile(deep[deep > 0.0], 99):.3f} mm"
-        yield Check.at_most(
-            f"{name}deepest penetration", deep.max(), DEEPEST, "mm", note
-        )
-        yield Check.at_most(f"{name}largest contact", force, HARDEST, "N")
+        usual = f"99th percentile {np.percentile(deep[deep > 0.0], 99):.3f} mm"
+        rows: dict[str, Any] = {
+            "control steps done again": (again, REPEATED, "%", each),
+            "deepest penetration": (deep.max(), DEEPEST, "mm", usual),
+            "largest contact": (force, HARDEST, "N"),
+        }
+        for what, row in rows.items():
+            yield Check.at_most(f"{task}, full push: {what}", *row)

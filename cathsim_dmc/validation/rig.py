@@ -23,7 +23,7 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.blood import StillBlood
-from cathsim_dmc.physics.effects import Effects, Episode, World, userdata_size
+from cathsim_dmc.physics.effects import Episode, userdata_size
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import theory
@@ -68,10 +68,7 @@ def in_tube(size: tuple[float, ...], **options: Any):
 def bare(lumen: Any = None, lattice: np.ndarray | None = None, **wall: Any):
     """MuJoCo's spec without a device, with the options of the tasks but no gravity.
 
-    Args:
-        lumen: field of the wall, geom 0, or None for no wall.
-        lattice: by which the wall moves, or None.
-        **wall: fields of the wall's geom.
+    The field `lumen` is geom 0 with the fields `wall`, moved by `lattice` if given.
     """
     spec = mujoco.MjSpec()
     spec.nuser_geom = 4
@@ -81,13 +78,8 @@ def bare(lumen: Any = None, lattice: np.ndarray | None = None, **wall: Any):
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     if lumen is not None:
         made = fields.carrier(lumen, lattice)
-        spec.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=made["pos"],
-            size=made["size"],
-            userdata=made["user"],
-            **wall,
-        )
+        wall |= {"pos": made["pos"], "size": made["size"], "userdata": made["user"]}
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, **wall)
     return spec
 
 
@@ -100,12 +92,10 @@ def slider(spec: mujoco.MjSpec, axes: Any, pos: Any = (0, 0, 0), **geom: Any):
 
 
 class Rig:
-    """A device, or coaxial ones, alone in the arena of the tasks.
+    """A device, or coaxial ones, alone in the arena of the tasks, with their settings.
 
-    It lies along +z, its base at insertion 0.
-
-    Integrator, time step, solver and contact parameters are those of the tasks.
-    Gravity is off; the default device is neutrally buoyant in blood.
+    It lies along +z, its base at insertion 0. Gravity is off; the default device is
+    neutrally buoyant in blood.
 
     Attributes:
         arena: to which a test adds its own fixtures before `compile`.
@@ -120,8 +110,6 @@ class Rig:
         *,
         straight: bool = False,
         gaps: Sequence[float] | None = None,
-        stroke: float = 0.1,
-        friction: float = FRICTION,
         **options: Any,
     ):
         """Makes the device.
@@ -131,16 +119,14 @@ class Rig:
             discretisation: Default of the tasks if None.
             straight: Whether devices lack their pre-shaped tips.
             gaps: (K,) m; 0 if None.
-            stroke: Longest insertion, m.
-            friction: Coulomb coefficient.
-            **options: Of the entity, such as `rotation` of a single device.
+            **options: Of the entity; by default a stroke of 0.1 m and `FRICTION`.
         """
         single = isinstance(device, str | devices.Device)
         chosen = [devices.get(one) for one in ([device] if single else device)]
         if straight:
             chosen = [dataclasses.replace(one, tip_shape=()) for one in chosen]
         kind, made = (Catheter, chosen[0]) if single else (DeviceStack, chosen)
-        options |= {"stroke": stroke, "friction": friction}
+        options = {"stroke": 0.1, "friction": FRICTION} | options
         self.catheter = kind(made, discretisation, **options)
         self.gaps = np.zeros(len(chosen)) if gaps is None else np.array(gaps)
         self.device = self.catheter.device
@@ -170,13 +156,11 @@ class Rig:
         """Adds a wall that sensors read.
 
         Args:
-            measure: Depth behind it, see `Field.sampled`.
-            low: Corner (3,) of the box in which it is known, m.
-            high: Likewise.
+            measure: Depth behind it between corners `low` and `high` (3,), m, see
+                `Field.sampled`.
             friction: Coulomb coefficient.
         """
-        # The tree of the anatomy stands for nothing.
-        anatomy = dataclasses.replace(tube(0.04, 1.5e-3), name="wall")
+        anatomy = tube(0.04, 1.5e-3)  # whose tree stands for nothing
         vars(anatomy)["lumen"] = Field.sampled(measure, np.array(low), np.array(high))
         wall = Phantom(anatomy, friction=friction)
         self.arena.attach(wall)
@@ -197,27 +181,22 @@ class Rig:
             size.nuserdata = userdata_size([blood], self.catheter)
         physics = mjcf.Physics.from_mjcf_model(self.arena.mjcf_model)
         self._physics = physics  # owns model and data
-        self.model = physics.model.ptr
-        self.data = physics.data.ptr
+        self.model, self.data = physics.model.ptr, physics.data.ptr
         self.name = self.catheter.mjcf_model.model
         self.head = self.model.site(f"{self.name}/head").id
         self.tip_body = self.model.body(f"{self.name}/link_{len(self.lengths) - 1}").id
         if isinstance(self.catheter, DeviceStack):
             chain_fields.write_still(self.catheter, self.model, self.gaps)
         if blood is not None:
-            links = ids(self.model, self.catheter.links)
-            index = types.SimpleNamespace(links=slice(int(links[0]), links[-1] + 1))
-            world = World(
-                self.model,
-                self.catheter,
-                index,  # type: ignore[arg-type]
-                0.0,
-                types.SimpleNamespace(qpos=self.data.qpos[None]),
-                lambda _, name: getattr(self.model, name),
-                self.data.userdata[None],
-            )
-            random = np.random.RandomState(0)
-            Effects([blood], world).restart(0, Episode(np.zeros(3)), random)
+            # What blood needs of a `World`; see `Effects` for its place in `userdata`.
+            parameters = self.data.userdata[None, 2:-1]
+            self.data.userdata[1] = parameters.size
+            first = slice(int(ids(self.model, self.catheter.links)[0]), None)
+            index = types.SimpleNamespace(links=first)
+            world: Any = types.SimpleNamespace(parameters=parameters, index=index)
+            world.num_simulations = 1
+            blood.bind(world)
+            blood.restart(0, Episode(np.zeros(3)), np.random.RandomState(0))
         mujoco.mj_forward(self.model, self.data)
 
     def qpos(self, joint: str) -> float:
@@ -277,12 +256,10 @@ class Rig:
 
         Args:
             force: (3,) dead load on the distal end, N; None leaves what is applied.
-            change: it is at rest when no joint moves by more over `RESTING_TIME`, rad
-                and m. The constraint solver's tolerance leaves less.
-            damping: least relaxation time of the hinges until then, s. Damped by its
-                material alone a device swings for minutes, and seems at rest as it
-                turns.
-            longest: time until then, s.
+            change: At rest no joint moves by more over `RESTING_TIME`, rad and m.
+            damping: Least relaxation time of the hinges until then, s. Damped by its
+                material alone a device swings for minutes.
+            longest: Time until then, s.
 
         Raises:
             RuntimeError: if it is not at rest by then, or the simulation diverges.

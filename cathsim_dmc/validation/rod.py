@@ -7,12 +7,7 @@ import mujoco
 import numpy as np
 from scipy.signal import lfilter
 
-from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.chain import (
-    MAX_PUSH_FORCE,
-    MAX_PUSH_SPEED,
-    MAX_ROTATION_SPEED,
-)
+from cathsim_dmc.entities import chain, devices
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation import damping, theory
@@ -23,17 +18,14 @@ CANTILEVER_BOUND = 2.0  # % of the deflection
 BUCKLING_BOUND = 5.0  # % of the load
 TWIST_BOUND = 2.0  # % of the angle
 # How every device of the library settles. The softest, the microcatheter, swings with a
-# period of 7 s, which this damping stops (critical: 2 over 1.2 rad/s), and its joints
-# never move by less than 5e-6 rad: its head wanders by 0.2 % of the deflection.
+# period of 7 s (critical damping: 2 over 1.2 rad/s), and its joints never move by less
+# than 5e-6 rad: its head wanders by 0.2 % of the deflection.
 LIBRARY_REST: dict[str, Any] = {"change": 1e-5, "damping": 1.5}
 END_ANGLES = (2.0, 15.0, 30.0, 45.0, 60.0)  # degrees
 # Fractions of the load of Euler at which the Southwell plot is taken.
 SOUTHWELL_FRACTIONS = np.array([0.5, 0.6, 0.7, 0.8, 0.9])
 # Columns of fewer links, whose load is off by π²/12n² (sliding), π²/3n² (fixed).
-SHORT_COLUMNS = (
-    *(("sliding", count) for count in (4, 6, 9)),
-    *(("fixed", count) for count in (8, 10, 12)),
-)
+SHORT_COLUMNS = {"sliding": (4, 6, 9), "fixed": (8, 10, 12)}
 _TURNING = 4.0  # s, until the lag is steady
 TORSION_JOINTS = 4  # default of the tasks with rotation
 TWIST = 0.35  # rad, of the whole device under the end torque; lag of the braked tip
@@ -48,7 +40,6 @@ class Cantilever(NamedTuple):
     """A cantilever under end load, simulated and as elastica."""
 
     end_angle: float  # of the elastica, rad
-    force: float  # N
     # (n + 1, 2), axial and transverse places of joints and head from the clamp on, m.
     simulated: np.ndarray
     expected: theory.Elastica
@@ -58,7 +49,7 @@ class Cantilever(NamedTuple):
         """Its deviation from the elastica."""
         angle, end = np.degrees(self.end_angle), 1e3 * self.expected.position[-1, 1]
         name = f"cantilever, {what + ', ' if what else ''}end at {angle:.0f}°"
-        note = f"{1e3 * self.force:.3g} mN, deflection {end:.1f} mm"
+        note = f"{1e3 * self.expected.force:.3g} mN, deflection {end:.1f} mm"
         return Check.at_most(name, 100 * self.deviation, CANTILEVER_BOUND, "%", note)
 
 
@@ -76,8 +67,7 @@ def cantilevers(
     Args:
         device: see `Rig`, as are `discretisation` and `gaps`.
         end_angles: of the elastica's end, degrees; they set the forces.
-        plane: direction of the force about the axis, rad. π/4 bends both hinges of
-            every joint.
+        plane: direction of the force about the axis, rad; π/4 bends all hinges.
         **rest: how it settles under each force, see `Rig.settle`.
     """
     rig = Rig(device, discretisation, straight=True, gaps=gaps)
@@ -92,14 +82,13 @@ def cantilevers(
         moved = rig.head_position - unloaded
         expected = shape.position[-1] - (total, 0.0)
         # What leaves the plane of the load is an error too.
-        error = np.array(
-            [moved[2], moved @ across, moved @ np.cross([0, 0, 1], across)]
-        )
+        axes = [0.0, 0.0, 1.0], across, np.cross([0, 0, 1], across)
+        error = np.array([moved @ axis for axis in axes])
         error[:2] -= expected
         points = np.vstack([rig.joints, rig.head_position]) + (0, 0, total)
         simulated = np.stack([points[:, 2], points @ across], axis=-1)
         off = float(np.linalg.norm(error) / np.linalg.norm(expected))
-        results.append(Cantilever(angle, shape.force, simulated, shape, off))
+        results.append(Cantilever(angle, simulated, shape, off))
     return results
 
 
@@ -128,9 +117,8 @@ def buckling(
     """Measures the critical load of a clamped-guided chain by a Southwell plot.
 
     The carriage clamps link 0; a guide that cannot turn holds another link by its
-    middle and pushes back along the axis. A sideways force bends the column a little;
-    under an axial load P the deflection grows by w, and w/P over w is a line of slope
-    1/P_cr (Southwell 1932).
+    middle. A sideways force bends the column a little; under an axial load P the
+    deflection grows by w, and w/P over w is a line of slope 1/P_cr (Southwell 1932).
 
     Args:
         end: "sliding" lets the guide move sideways, "fixed" holds it on the axis.
@@ -177,11 +165,7 @@ def buckling(
 def twist_under_torque(
     device: str = "steerable_5f", torsion_joints: int = TORSION_JOINTS
 ) -> tuple[float, float]:
-    """Torque (N·m) on the end of the straight device that GJ turns by `TWIST`.
-
-    Returns:
-        The torque, and the angle of the end that it gives, rad.
-    """
+    """Torque (N·m) that GJ turns by `TWIST`, and angle (rad) of the end under it."""
     rig, compliance = _torsion_rig(device, torsion_joints)
     torque = TWIST / compliance
     # The motor of the base is a speed servo: the base creeps, so wait for a time.
@@ -201,17 +185,16 @@ class TwistLag(NamedTuple):
     @property
     def lags(self) -> tuple[float, float]:
         """Lag in steady rotation, simulated and expected, rad."""
-        both = self.base - self.tip, self.expected
-        return tuple(float(lag[-50:].mean()) for lag in both)  # type: ignore
+        found = (self.base - self.tip)[-50:].mean()
+        return float(found), float(self.expected[-50:].mean())
 
     @property
     def rises(self) -> tuple[float, float]:
         """Times (s) at which the lags first meet 1 - 1/e of their final values."""
-        found = []
-        for lag in (self.base - self.tip, self.expected):
-            level = (1 - np.exp(-1)) * lag[-50:].mean()
-            index = int(np.argmax(lag >= level))
-            both = slice(index - 1, index + 1)
+        curves, found = (self.base - self.tip, self.expected), []
+        for lag, last in zip(curves, self.lags, strict=True):
+            level = (1 - np.exp(-1)) * last
+            both = np.argmax(lag >= level) - np.array([1, 0])
             found.append(float(np.interp(level, lag[both], self.time[both])))
         return found[0], found[1]
 
@@ -223,7 +206,7 @@ def twist_lag() -> TwistLag:
     obeys (b + Kτ) δ' + K δ = b ω: it rises to bω/K with the time constant b/K + τ.
     """
     rig, compliance = _torsion_rig("steerable_5f", TORSION_JOINTS)
-    brake = TWIST / compliance / MAX_ROTATION_SPEED
+    brake = TWIST / compliance / chain.MAX_ROTATION_SPEED
     rig.data.actuator(f"{rig.name}/rotation").ctrl[0] = 1.0
     timestep = rig.model.opt.timestep
     # The device is straight, so the rates of its hinges add up to that of the tip.
@@ -287,7 +270,7 @@ class Driven:
 
 def slip_force() -> float:
     """Least force (N) on a base at rest at which its clamp slips, to 0.5 %."""
-    for force in MAX_PUSH_FORCE * np.arange(0.9, 1.1, 0.005):
+    for force in chain.MAX_PUSH_FORCE * np.arange(0.9, 1.1, 0.005):
         driven = Driven()
         driven.move(0.4, 0.0, 0.9 * force)
         driven.move(1.0, 0.0, force)
@@ -324,9 +307,9 @@ def _checks(data: dict[str, Any]) -> Iterator[Check]:
     yield Check.at_most(name, held, HOLD_BOUND, "mm")
     driven.move(0.4, 1.0, JAM)
     moved, name = driven.move(1.0, 1.0, JAM), f"drive, full speed against {JAM:g} N"
-    yield Check.deviation(name, moved, MAX_PUSH_SPEED, SPEED_BOUND, "m/s")
+    yield Check.deviation(name, moved, chain.MAX_PUSH_SPEED, SPEED_BOUND, "m/s")
     name = "drive, force at which the clamp slips"
-    yield Check.deviation(name, slip_force(), MAX_PUSH_FORCE, SLIP_BOUND, "N")
+    yield Check.deviation(name, slip_force(), chain.MAX_PUSH_FORCE, SLIP_BOUND, "N")
     yield from damping.checks()
 
 
@@ -334,7 +317,8 @@ def validate_rod() -> Report:
     """Runs every check of the rod."""
     data: dict[str, Any] = {}
     checks = list(_checks(data))
-    data["short"] = [buckling(end, count) for end, count in SHORT_COLUMNS]
+    short = SHORT_COLUMNS.items()
+    data["short"] = [buckling(end, count) for end, each in short for count in each]
     findings = {
         "deflection in three-point bending of links of 17.5 mm, deviation, %": {
             f"{1e3 * span:.0f} mm, load on a {'joint' if on_joint else 'link'}": 100

@@ -1,8 +1,4 @@
-"""Closed forms for slender rods: elastica, and EI of a device along it.
-
-A rod is a sequence of uniform sections, from the clamp to the free end, given by
-their lengths (m) and bending stiffnesses EI (N·m²). SI units throughout.
-"""
+"""Closed forms for slender rods: elastica, and EI of a device along it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -33,6 +29,10 @@ def elastica(lengths: ArrayLike, stiffnesses: ArrayLike, end_angle: float) -> El
     The equation is EI θ'' = -F cos θ with θ = 0 at the clamp and θ' = 0 at the end
     (Love, A Treatise on the Mathematical Theory of Elasticity, ch. XIX). It is
     integrated from the end to the clamp; the force is the one that meets the clamp.
+
+    Args:
+        lengths: (S,) of uniform sections from the clamp to the free end, m.
+        stiffnesses: (S,) EI, N·m².
     """
     lengths, stiffnesses = np.asarray(lengths)[::-1], np.asarray(stiffnesses)[::-1]
 

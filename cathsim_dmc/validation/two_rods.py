@@ -1,7 +1,6 @@
 """Coaxial devices against two rods of one shape, each with its own twist.
 
-The reference minimises the bending and twist energy over the increments of shape and
-twists on a fine grid; it shares no code with the model but the devices' data.
+The reference shares no code with the model but the devices' data.
 """
 
 from collections.abc import Iterator, Sequence
@@ -37,16 +36,16 @@ CASES = (
 )
 TIP_BOUND = 1.0  # % of the length
 ROTATION_BOUND = 3.0  # °
+WORKING = ("wire_035_glide", "diagnostic_5f_simmons")
 # Free devices, and distances of their ends from the chain's end (m).
 SLIDES = (
     (("wire_035_glide", "berenstein_5f"), (0.0155, 0.0)),
     (("wire_035_glide", "berenstein_5f"), (0.0, 0.018)),
-    (("wire_035_glide", "diagnostic_5f_simmons"), (0.0065, 0.0)),
-    (("wire_035_glide", "diagnostic_5f_simmons"), (0.0, 0.025)),
+    (WORKING, (0.0065, 0.0)),
+    (WORKING, (0.0, 0.025)),
 )
 SLIDE_TURN = 0.6  # rad, of the base of the outer device
 RESISTANCE_BOUND = 5.0  # %
-WORKING = ("wire_035_glide", "diagnostic_5f_simmons")
 WITHDRAWN = 0.02  # m, of the wire, at two speeds (m/s)
 SPEEDS = (1e-3, 5e-4)
 _WIDE = 0.275, 0.07  # m, length and radius of a tube that nothing touches
@@ -75,7 +74,7 @@ def reference(
     length: float,
     held: np.ndarray | None = None,
 ) -> Rods:
-    """Minimises the energy of devices that share one shape.
+    """Minimises bending and twist energy of devices that share one shape.
 
     Args:
         devices: K, from the innermost outwards.
@@ -112,13 +111,9 @@ def reference(
         slope = [(by_twist / scales).ravel(), np.real(by_bend), np.imag(by_bend)]
         return 1e6 * value.sum() * _FINE / 2, 1e6 * np.concatenate(slope)
 
-    found = minimize(
-        energy,
-        np.zeros(scales.size + 2 * free),
-        jac=True,
-        method="L-BFGS-B",
-        options={"maxiter": 5000, "maxfun": 5000, "ftol": 1e-15, "gtol": 1e-9},
-    )
+    start = np.zeros(scales.size + 2 * free)
+    limits = {"maxiter": 5000, "maxfun": 5000, "ftol": 1e-15, "gtol": 1e-9}
+    found = minimize(energy, start, jac=True, method="L-BFGS-B", options=limits)
     _, turns, curvature = parts(found.x)
     last = [turns[k, torsion[k] > 0][-1] for k in range(len(devices))]
     return Rods(np.array(last), _end(curvature), found.fun / 1e6)
@@ -182,10 +177,7 @@ def simulate(
 
 
 def work(speed: float) -> tuple[float, float]:
-    """Withdraws a wire from a free catheter, without friction and weight.
-
-    Args:
-        speed: m/s.
+    """Withdraws a wire (m/s) from a free catheter, without friction and weight.
 
     Returns:
         Work of the drives, and change of the energy by `reference`, J.
@@ -212,27 +204,21 @@ def work(speed: float) -> tuple[float, float]:
     return float(done), last - first
 
 
-def in_half_circle(
-    names: Sequence[str],
-    gaps: Sequence[float],
-    rotation: Sequence[float],
-    beyond: float,
-) -> tuple[Rods, Rods]:
-    """Simulated devices held along half a circle, and their reference; `simulate`."""
+def in_half_circle(names, gaps, rotation, beyond: float) -> tuple[Rods, Rods, float]:
+    """Devices held in half a circle, as in `simulate`; their reference; length, m."""
     entity = DeviceStack(names)
     length = float(entity.link_lengths.sum())
     held = np.zeros(round((length - beyond) / _FINE), complex)
     held[-round(np.pi * BEND_RADIUS / _FINE) :] = 1 / BEND_RADIUS
     expected = reference(entity.devices, gaps, rotation, length, held)
-    return simulate(names, gaps, rotation, beyond), expected
+    return simulate(names, gaps, rotation, beyond), expected, length
 
 
 def checks() -> Iterator[Check]:
     """Pairs held in half a circle, and the axial force of a bend."""
     for case in CASES:
         names, _, rotation, _ = case
-        found, expected = in_half_circle(*case)
-        length = DeviceStack(names).link_lengths.sum()
+        found, expected, length = in_half_circle(*case)
         name = f"two rods in half a circle, {' in '.join(names)}"
         off = 100 * float(np.linalg.norm(found.end - expected.end)) / length
         yield Check.at_most(f"{name}, tip", off, TIP_BOUND, "% of its length")

@@ -67,11 +67,11 @@ def terminal_velocity(force: float) -> tuple[float, float]:
 
     blood_loops.install()
     radius = devices.get("steerable_5f").outer_radius
-    size = 2 + blood_loops.HEADER + blood_loops.OF_LINK + 1
+    size = blood_loops.HEADER + blood_loops.OF_LINK
     model = mujoco.MjModel.from_xml_string(f"""
         <mujoco>
           <option timestep="0.004" gravity="0 0 0" integrator="implicitfast"/>
-          <size nuserdata="{size}"/>
+          <size nuserdata="{2 + size + 1}"/>
           <worldbody>
             <body>
               <freejoint/>
@@ -80,8 +80,7 @@ def terminal_velocity(force: float) -> tuple[float, float]:
           </worldbody>
         </mujoco>""")
     data = mujoco.MjData(model)
-    data.userdata[1] = blood_loops.HEADER + blood_loops.OF_LINK
-    data.userdata[2:6] = blood_loops.MARK, BLOOD_DENSITY, BLOOD_VISCOSITY, 1
+    data.userdata[1:6] = size, blood_loops.MARK, BLOOD_DENSITY, BLOOD_VISCOSITY, 1
     data.xfrc_applied[1, 0] = force
     mujoco.mj_step(model, data, 2000)
     expected = brentq(lambda u: LINK * drag(u, 2 * radius) - force, 1e-6, 10.0)
@@ -138,24 +137,14 @@ def indentation(
     from cathsim_dmc.collision import carrying
 
     carrying.install()
-    size, ball = 1e-3, kind == "sphere"
     spec = bare(tube(0.2, radius).lumen)
-    geom = slider(
-        spec,
-        (1, 0, 0),
-        (radius - size - 1e-4, 0, 0.1),
-        type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"),
-        size=(size, 0.0 if ball else LINK / 2, 0),
-        mass=1e-3,
-        priority=1,
-    )
-    model, number = spec.compile(), geom.id
-    spring, weight = (
-        stiffness(radius, modulus, 1.5e-3, 1.0),
-        model.body_invweight0[1, 0],
-    )
-    law = reference(spring, weight, *SOLIMP[:2], RELAXATION)
-    model.geom_solref[number], model.geom_solimp[number] = law, SOLIMP
+    half = LINK / 2 if kind == "capsule" else 0.0
+    body = {"size": (1e-3, half, 0), "mass": 1e-3, "priority": 1}
+    body["type"] = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+    geom = slider(spec, (1, 0, 0), (radius - 1e-3 - 1e-4, 0, 0.1), **body)
+    model, spring = spec.compile(), stiffness(radius, modulus, 1.5e-3, 1.0)
+    law = reference(spring, model.body_invweight0[1, 0], *SOLIMP[:2], RELAXATION)
+    model.geom_solref[geom.id], model.geom_solimp[geom.id] = law, SOLIMP
     depths = []
     for load in loads:
         data = mujoco.MjData(model)
@@ -188,10 +177,8 @@ def _checks() -> Iterator[Check]:
         name = f"terminal velocity of a free link under {1e3 * force:g} mN"
         yield Check.deviation(name, *terminal_velocity(force), FLOW_BOUND, "m/s")
     for name in ANATOMIES:
-        lost = volume_defect(phantoms.load(name))
-        yield Check.at_most(
-            f"volume lost at the junctions of {name}", lost, VOLUME_BOUND
-        )
+        lost, name = volume_defect(phantoms.load(name)), f"the junctions of {name}"
+        yield Check.at_most(f"volume lost at {name}", lost, VOLUME_BOUND)
     deviation, flow = profile()
     name = "profile in a tube, deviation over the mean"
     yield Check.at_most(name, deviation, PROFILE_BOUND)

@@ -67,19 +67,17 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
     lost = ", ".join(astray)
     goals = f"of {', '.join(anatomy.goals) or 'none'}" + (lost and f", astray: {lost}")
     touch = "tubes that touch beyond the place where they part"
+    unpassed = "places of the centrelines that the device does not pass"
+    unreached = "goals that the device cannot reach in their vessel"
     rows = [
         ("handles of the surface", topology.handles(faces), 0, "", touch),
         ("edges of the surface without two triangles", loose, 0, "", made),
         ("separate parts of the surface", parts, 1),
         ("error of the field, 99th percentile", worst, bound, "mm", exact),
         ("memory of the field", anatomy.lumen.nbytes / 1e6, LARGEST_FIELD, "MB"),
-        (
-            "places of the centrelines that the device does not pass",
-            sum(narrow.values()), 0, "", passed,
-        ),
-        ("goals that the device cannot reach in their vessel", len(astray), 0, "",
-         goals),
-    ]  # fmt: skip
+        (unpassed, sum(narrow.values()), 0, "", passed),
+        (unreached, len(astray), 0, "", goals),
+    ]
     # Scans have rings of vessels, which are handles.
     rows = rows[bool(anatomy.scan) :]
     return [Check.at_most(f"{anatomy.name}: {what}", *row) for what, *row in rows]
@@ -91,8 +89,7 @@ def validate_anatomy(anatomy: Anatomy) -> Report:
     for one in check_tree(anatomy):
         name = f"{anatomy.name}: {one.name}, violations"
         checks.append(Check.at_most(name, int(not one.passed), 0, "", one.detail))
-    measured = measures.measure(anatomy.tree)
-    findings = {anatomy.name: {"measures": measured}}
+    findings = {anatomy.name: {"measures": measures.measure(anatomy.tree)}}
     return Report(f"anatomy of {anatomy.name}", checks, findings)
 
 

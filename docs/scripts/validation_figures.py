@@ -54,7 +54,7 @@ def _cantilevers(ax, bent):
         )
         end = 1e3 * one.expected.position[-1]
         ax.annotate(
-            f"{np.degrees(one.end_angle):.0f}°, {1e3 * one.force:.2g} mN",
+            f"{np.degrees(one.end_angle):.0f}°, {1e3 * one.expected.force:.2g} mN",
             end,
             xytext=(6, -2),
             textcoords="offset points",
@@ -130,14 +130,9 @@ def _lag(ax, lag):
 
 def pair(turned):
     figure, ((right,),) = canvas(1, 1)
-    for index, one in enumerate(turned):
-        right.plot(
-            np.degrees(one.base),
-            np.degrees(one.tip),
-            color=COLOURS[index],
-            label=one.name,
-        )
-    ends = [0, np.degrees(turned[0].base[-1])]
+    for colour, (name, (base, tip)) in zip(COLOURS, turned.items(), strict=False):
+        right.plot(np.degrees(base), np.degrees(tip), color=colour, label=name)
+    ends = [0, np.degrees(turned["straight tube"][0][-1])]
     right.plot(ends, ends, color="0.6", linewidth=0.8)
     right.set(title="torque", xlabel="base, °", ylabel="end of the device, °")
     right.legend(frameon=False)
