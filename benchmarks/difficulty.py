@@ -297,7 +297,7 @@ def _trials(
     simulation = BatchSimulation(task, seeds, num_threads=num_threads)
     trials = {}
     for policy in players:
-        steered = task.scene.coaxial or task.scene.device.steerable
+        steered = task.scene.catheter.coaxial or task.scene.catheter.device.steerable
         if policy == "expert" and not steered:
             continue
         player = policies.make_policy(policy, first_seed)

@@ -23,7 +23,7 @@ _DIGITS = 6  # significant ones of a number in a list
 _KEPT = frozenset(
     {
         *("anatomy", "access", "goal", "device", "rotation", "friction"),
-        *("shaft_link", "torsion_joints", "working_length", "physics_timestep"),
+        *("shaft_link", "working_length", "physics_timestep"),
         *("fluoroscopy", "vessel"),
     }
 )

@@ -260,7 +260,8 @@ def frame_rates(frames: int = 100) -> dict[str, float]:
     environment = load(observation="image")
     environment.reset()
     task = environment.task
-    scope, radius = task.rollout.fluoroscope, task.scene.catheter.device.outer_radius
+    (scope,) = task.rollout.case().angiograph.planes()
+    radius = task.scene.catheter.device.outer_radius
     one = [Shadow(task.readings.centreline, radius)]
     many = [Shadow(np.repeat(one[0].points[None], NUM_SIMULATIONS, axis=0), radius)]
     random_state = np.random.RandomState(0)

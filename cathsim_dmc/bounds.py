@@ -52,13 +52,7 @@ def number(
     *,
     positive: bool = False,
 ) -> float:
-    """A finite number in a closed range.
-
-    Args:
-        value: What was given.
-        unit: Unit of the bounds, for the message.
-        positive: Whether it must also be greater than zero.
-    """
+    """A finite number in a closed range; `positive` demands more than zero."""
     good = is_number(value) and low <= value <= high and (value > 0 or not positive)
     if not good:
         refuse(name, value, _allowed("a finite number", low, high, unit, positive))
@@ -238,26 +232,23 @@ def pixels(name: str, value: Any) -> tuple[int, int]:
     return int(values[0]), int(values[1])
 
 
-def mapping(name: str, value: Any, known: Iterable[str]) -> Mapping[str, Any]:
-    """A mapping with some of the known names."""
+def mapping(
+    name: str, value: Any, known: Iterable[str], others: str = ""
+) -> Mapping[str, Any]:
+    """A mapping with some of the known names; `others` says what else is allowed."""
     if not isinstance(value, Mapping) or set(value) - set(known):
-        refuse(name, value, f"a mapping with some of {', '.join(known)}")
+        refuse(name, value, f"{others}a mapping with some of {', '.join(known)}")
     return value
 
 
 def made(name: str, value: Any, kind: type, others: str = "") -> Any:
-    """A dataclass from a mapping of its fields; an object of it is taken as it is.
-
-    Args:
-        others: What else is allowed, for the message.
-    """
+    """A dataclass from a mapping of its fields, see `mapping`, or an object of it."""
     if isinstance(value, kind):
         return value
     known = [field.name for field in dataclasses.fields(kind)]
-    if not isinstance(value, Mapping) or set(value) - set(known):
-        refuse(name, value, f"{others}a mapping with some of {', '.join(known)}")
+    fields = mapping(name, value, known, others)
     try:
-        return kind(**value)
+        return kind(**fields)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
 

@@ -42,11 +42,7 @@ class _Together:
 
 @functools.cache
 def keep_together() -> None:
-    """Has numba compile all loops anew when the source of any of them changes.
-
-    Compiled code holds what it calls in other modules, of which numba's own stamp
-    knows nothing.
-    """
+    """Has numba compile all loops, which hold each other, anew when one changes."""
     from numba.core import caching
 
     # In the folder of the source, or of the user where that is read-only.

@@ -35,14 +35,6 @@ SUITE = containers.TaggedTasks()
 
 # Rewards are distances, not in [0, 1], and nothing is coloured by them.
 _TAG = "no_reward_visualization"
-# Constants of dm_control.suite that are computed from its domains at import.
-_TAGGED = {
-    "BENCHMARKING": "benchmarking",
-    "EASY": "easy",
-    "HARD": "hard",
-    "NO_REWARD_VIZ": _TAG,
-}
-_UNTAGGED = {"EXTRA": "BENCHMARKING", "REWARD_VIZ": "NO_REWARD_VIZ"}
 _CONFIG_FIELDS = tuple(field.name for field in dataclasses.fields(NavigationConfig))
 
 
@@ -151,7 +143,7 @@ def make_task(
         **{key: value for key, value in options.items() if key in _CONFIG_FIELDS}
     )
     # Checked before the anatomy is built, which takes seconds.
-    coaxial, living = config.devices is not None, config.vessel_options.living
+    coaxial, living = config.devices is not None, config.vessel.living
     observations.resolve(config.observation, coaxial, living)
     random = bounds.random_state("random", random)
     goal = own.pop("goal", definition.goal or "bca")
@@ -168,7 +160,7 @@ def make_task(
         anatomies, named = [load_anatomy(chosen, access)], [goal]
     chosen = {k: v for k, v in options.items() if k not in _CONFIG_FIELDS}
     if "farthest_shift" in definition.objective_options:
-        chosen["farthest_shift"] = config.ranges.farthest_shift
+        chosen["farthest_shift"] = config.randomisation.farthest_shift
     goals = list(map(placement.resolve_goal, anatomies, named))
     config = _one_length(config, anatomies, goals)
 
@@ -191,7 +183,10 @@ def _one_length(
     """The configuration with a device as long as the farthest goal needs."""
     if len(anatomies) == 1 or config.working_length is not None:
         return config
-    device, shift = longest_tip(chosen_devices(config)), config.ranges.farthest_shift
+    device, shift = (
+        longest_tip(chosen_devices(config)),
+        config.randomisation.farthest_shift,
+    )
     longest = max(
         placement.place_device(anatomy, goal, device, None, shift).working_length
         for anatomy, goal in zip(anatomies, goals, strict=True)
@@ -266,13 +261,8 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
 def _register_domain() -> None:
     """Registers the domain and its tasks in dm_control.suite; may be repeated."""
     dm_suite._DOMAINS[DOMAIN] = sys.modules[__name__]  # noqa: SLF001
-    tasks = dm_suite._get_tasks  # noqa: SLF001
-    dm_suite.ALL_TASKS = every = tasks(None)
-    for constant, tag in _TAGGED.items():
-        setattr(dm_suite, constant, tasks(tag))
-    for constant, others in _UNTAGGED.items():
-        left = set(every) - set(getattr(dm_suite, others))
-        setattr(dm_suite, constant, tuple(sorted(left)))
+    dm_suite.ALL_TASKS = every = dm_suite._get_tasks(None)  # noqa: SLF001
+    dm_suite.EXTRA = tuple(sorted(set(every) - set(dm_suite.BENCHMARKING)))
     grouped = dm_suite._get_tasks_by_domain(every)  # noqa: SLF001
     dm_suite.TASKS_BY_DOMAIN = grouped
 

@@ -46,9 +46,10 @@ def twin(task, seed=0, **changes):
             as observations, images, and what is randomised but for the goal.
     """
     config = dataclasses.replace(task.config, **changes)
-    assert config.ranges.farthest_shift == task.config.ranges.farthest_shift
+    ranges = config.randomisation, task.config.randomisation
+    assert ranges[0].farthest_shift == ranges[1].farthest_shift
     other = Navigation(task.scene, task.objective, config, seed, name=task.name)
-    assert not task._cases or other._fluoroscopy == task._fluoroscopy
+    assert not task._cases or config.fluoroscopy == task.config.fluoroscopy
     other._cases = task._cases
     return other
 

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from cathsim_dmc import agents, policies, suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.physics import forces
+from cathsim_dmc.physics.readings import part
 from cathsim_dmc.policies import attempts, pursuit
 from cathsim_dmc.policies.attempts import State
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.route import Place, locate
-from cathsim_dmc.tasks.rows import part
 
 TASKS = (
     "type1_bca",

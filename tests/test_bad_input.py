@@ -30,7 +30,6 @@ TASK = {
     "max_steps": whole(1),
     "friction": number(0, 2),
     "shaft_link": number(2e-3, 0.1),
-    "torsion_joints": whole(0, 1000, optional=True),
     "working_length": number(0.02, 3, optional=True),
     "physics_timestep": number(4e-5, 0.005),
     "outside_range": flag(),

@@ -268,12 +268,6 @@ def test_rest_shape_turns_by_the_arcs(name):
     assert rest[1::2].sum() == pytest.approx(turning - lost, rel=1e-9)
 
 
-@pytest.mark.parametrize("stroke", [0.0, -0.1])
-def test_stroke_must_be_positive(stroke):
-    with pytest.raises(ValueError, match=f"stroke is {stroke}"):
-        compiled(stroke=stroke)
-
-
 def test_an_unknown_device_lists_the_known():
     with pytest.raises(ValueError, match=r"no device.*steerable_5f.*lunderquist"):
         devices.get("amplatz")

@@ -1,16 +1,12 @@
 """Wall, sensors and arena of a compiled task."""
 
-import math
-
 import mujoco
 import numpy as np
 import pytest
 from dm_control import mjcf
 
-from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY, AngiographyArena
-from cathsim_dmc.entities.phantom import Phantom
 
 
 @pytest.fixture(scope="module")
@@ -153,12 +149,6 @@ def test_contacts_lie_on_the_wall_of_the_anatomy(environment, pressed):
     error = np.abs(depths + [depth / 2 for *_, depth in contacts])
     # In a narrow dead end the planes that stand for the wall meet it at an angle.
     assert np.median(error) < 0.02e-3 and error.max() < 0.4e-3
-
-
-@pytest.mark.parametrize("friction", [-0.1, 2.5, math.nan])
-def test_friction_outside_its_range(friction):
-    with pytest.raises(ValueError, match="friction is .* between 0 and 2"):
-        Phantom(phantoms.load("simple1"), friction)
 
 
 @pytest.mark.parametrize("rotation", [False, True])

@@ -124,13 +124,12 @@ def test_fluoroscopy_shows_the_vessel_where_it_is():
     task = suite.make_task(
         "simple1_bca", vessel={"motion": True}, observation="segmentation"
     )
-    batch = BatchSimulation(task, 1, seeds=0)
-    batch.reset()
+    environment = suite.environment(task)
+    environment.reset()
     for _ in range(50):  # to the end of inspiration
-        step = batch.step(np.zeros((1, 21)))
-    vessel_now = step.observation["segmentation"][0, ..., 1] > 0
-    machine = batch.rollout.case().angiograph
-    plane = machine.planes()[0]
-    there = plane.around(batch.rollout.moving.surface(0))
+        step = environment.step(np.zeros(21))
+    vessel_now = step.observation["segmentation"][..., 1] > 0
+    plane = task.rollout.case().angiograph.planes()[0]
+    there = plane.around(task.rollout.moving.surface(0))
     np.testing.assert_array_equal(vessel_now, there.vessel_mask)
     assert (vessel_now != plane.vessel_mask).mean() > 0.02

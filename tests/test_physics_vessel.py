@@ -171,7 +171,7 @@ def test_a_device_touches_a_living_wall_at_as_many_places_as_a_rigid_one(rigid, 
     ("given", "words"),
     [
         ("liquid", "rigid, silicone, living"),
-        (3, "mapping of flow, wall, motion"),
+        (3, "living, or a mapping with some of flow, wall, motion"),
         ({"wall": {"modulus": 1.0}}, "vessel wall: modulus is 1.0.*10000 to 1e.09 Pa"),
         ({"wall": {"thickness": (0.0, 1.0)}}, "vessel wall: thickness.*0.005 m"),
         ({"wall": {"support": None}}, "vessel wall: support is None"),

@@ -51,7 +51,7 @@ def test_the_fluoroscopy_of_a_state_shows_where_the_head_is(pushed):
     options = {"size": 96, "contrast": False}
     image = cathsim_dmc.fluoroscopy(env, **options)
     assert image.shape == (96, 96) and image.dtype == np.uint8
-    arm = dataclasses.replace(env.task.config.fluoroscopy_options, **options).carms(
+    arm = dataclasses.replace(env.task.config.fluoroscopy, **options).carms(
         env.task.scene.anatomy.surface.vertices
     )[0]
     column, row = arm.project(env.task.readings.head)[0].round().astype(int)

@@ -81,7 +81,7 @@ def test_the_record_follows_the_simulation(env, episode):
     assert meta["action_names"] == env.action_spec().name.split("\t")
     assert meta["task_kwargs"] == {"goal": "bca"}
     assert meta["versions"]["mujoco"] == mujoco.__version__
-    radius = env.task.scene.device.outer_radius
+    radius = env.task.scene.catheter.device.outer_radius
     np.testing.assert_allclose(meta["catheter_radius"], radius)
     assert set(meta["reward_terms"]) == set(env.task.objective.weights)
     link = meta["body_names"].index("catheter/link_2")

@@ -79,11 +79,8 @@ def test_success_through_a_wall_does_not_count(task):
 
 def test_the_stump_in_the_parent_is_not_the_branch(task):
     """A branch's centreline starts on its parent's; the branch starts at the ostium."""
-    before, after = task.branch.at(np.array([task.ostium - 1e-3, task.ostium + 1e-3]))[
-        0
-    ]
-    assert not task.in_branch(before)
-    assert task.in_branch(after)
+    around = task.branch.at(task.ostium + np.array([-1e-3, 1e-3])).position
+    assert task.in_branch(around).tolist() == [False, True]
 
 
 def test_reward_is_minus_the_distance_in_metres(anatomy):
@@ -237,21 +234,10 @@ def test_start_is_uniform_in_a_ball_of_a_millimetre():
 # Actions and options.
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("weights", "sparse", "mapping with some of distance, path"),
-        ("weights", {}, "some of distance"),
-        ("weights", {"sparse": 1.0}, "reward is.*sparse.*distance, path"),
-        ("weights", {"distance": float("nan")}, "finite"),
-        ("weights", {"distance": "1"}, "finite"),
-        ("goal_radius", 0.0, "above 0"),
-        ("goal_radius", float("nan"), "above 0"),
-    ],
-)
-def test_bad_options(task, field, value, message):
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(task, **{field: value})
+@pytest.mark.parametrize("value", ["sparse", {}, {"sparse": 1.0}])
+def test_an_unknown_reward_lists_the_terms(task, value):
+    with pytest.raises(ValueError, match="reward is.*some of distance, path"):
+        dataclasses.replace(task, weights=value)
 
 
 def test_a_success_rule_of_ones_own_sees_the_forces(anatomy):

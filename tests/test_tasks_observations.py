@@ -122,7 +122,7 @@ def test_segmentation_is_device_and_vessel(make):
     # Where the device is, the image is darker than that of the vessel alone.
     (shadow,) = env.task.rollout.shadows
     away = replace(shadow, points=shadow.points[0] + [1.0, 0.0, 0.0])
-    empty = env.task.rollout.fluoroscope.render([away])
+    empty = env.task.rollout.case().angiograph.planes()[0].render([away])
     assert (after["image"][device] < empty[device]).all()
     far = after["image"] == empty
     assert far.mean() > 0.9 and not (device & far[..., 0]).any()
@@ -137,7 +137,7 @@ def test_tracking_follows_device_and_goal_in_space_and_on_the_screen(make):
     np.testing.assert_array_equal(points[-1], task.readings.head)
     line = task.readings.centreline
     assert all((point == line).all(-1).any() for point in points)
-    carm = task.rollout.fluoroscope.carm
+    carm = task.rollout.case().angiograph.planes()[0].carm
     pixels = seen["tracking_pixels"].reshape(-1, 2)
     np.testing.assert_allclose(pixels, carm.project(points)[0])
     np.testing.assert_allclose(

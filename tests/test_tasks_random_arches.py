@@ -7,10 +7,10 @@ from test_parity import PICTURES, SIMULATIONS, Pair, actions
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.physics.readings import part
 from cathsim_dmc.policies.pursuit import Plan
 from cathsim_dmc.tasks import cases, placement
 from cathsim_dmc.tasks.physics_errors import ESCAPE_INTERVAL
-from cathsim_dmc.tasks.rows import part
 
 POOL = 3
 STEPS = 55  # past the first look for an escape

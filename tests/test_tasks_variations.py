@@ -17,7 +17,7 @@ from cathsim_dmc.physics.randomisation import (
     Randomisation,
     start_displacement,
 )
-from cathsim_dmc.tasks import objectives as objectives
+from cathsim_dmc.tasks import objectives
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +74,12 @@ def test_draws_lie_in_their_ranges(seed):
     for name in (*drawn, "delay"):
         low, high = getattr(DEFAULT_RANGES, name)
         assert low <= getattr(episode, name) <= high
-    deviation = episode.deviation
-    for name in ("primary", "secondary"):
-        angle = getattr(deviation, name)
-        assert DEFAULT_RANGES.view[0] <= angle <= DEFAULT_RANGES.view[
-            1
-        ] and angle == int(angle)
+    deviation, (low, high) = episode.deviation, DEFAULT_RANGES.view
+    for angle in (deviation.primary, deviation.secondary):
+        assert low <= angle <= high and angle == int(angle)
     for name in ("gain", "kerma"):
-        assert getattr(DEFAULT_RANGES, name)[0] <= getattr(deviation, name)
-        assert getattr(deviation, name) <= getattr(DEFAULT_RANGES, name)[1]
+        low, high = getattr(DEFAULT_RANGES, name)
+        assert low <= getattr(deviation, name) <= high
 
 
 def test_a_composer_variation_is_a_range_too():
@@ -124,10 +121,8 @@ def test_the_model_takes_what_was_drawn_and_gives_it_back(make):
         np.testing.assert_allclose(ratio, ratio[0])
         dofs = model.jnt_dofadr[at["hinges"]]
         damping = model.dof_damping[dofs] / usual["dof_damping"][dofs]
-        torque = (
-            model.actuator_gainprm[at["motors"], 0]
-            / usual["actuator_gainprm"][at["motors"], 0]
-        )
+        gains = model.actuator_gainprm, usual["actuator_gainprm"]
+        torque = np.divide(*(gain[at["motors"], 0] for gain in gains))
         np.testing.assert_allclose(damping, ratio[0])
         np.testing.assert_allclose(torque, ratio[0])
         angle = 2 * np.arctan2(

@@ -15,14 +15,14 @@ class AngiographyArena(composer.Arena):
     The patient lies on the back: gravity points to +y.
     """
 
-    def _build(self, device_density: float = 1100.0, name: str = "arena"):
+    def _build(self, device_density: float = 1100.0):
         """Sets the physics.
 
         Args:
             device_density: mean density of the device, kg/m³; gravity is reduced by
                 its buoyancy in blood.
         """
-        super()._build(name=name)
+        super()._build(name="arena")
         root = self._mjcf_root
         # composer.Arena bounds masses and inertias from below and sets no-slip
         # iterations; a catheter's links are lighter than these bounds.
@@ -53,16 +53,14 @@ class AngiographyArena(composer.Arena):
         light = root.worldbody.add("light", name="ceiling", castshadow=False)
         light.pos, light.dir, light.diffuse = (0, -1.5, 0.3), (0, 1, 0), [0.45] * 3
 
-    def add_camera(self, name: str, target, distance: float, xyaxes, fovy=30.0):
+    def add_camera(self, name: str, target, distance: float, xyaxes) -> None:
         """Adds a camera that looks at a point.
 
         Args:
             target: point (3,) on the optical axis, m.
             distance: distance from the point, m.
             xyaxes: right and up directions (6,) of the image.
-            fovy: vertical field of view, degrees.
         """
         position = target + distance * np.cross(xyaxes[:3], xyaxes[3:])
-        return self._mjcf_root.worldbody.add(
-            "camera", name=name, pos=position, xyaxes=xyaxes, fovy=fovy
-        )
+        place = {"pos": position, "xyaxes": xyaxes, "fovy": 30.0}
+        self._mjcf_root.worldbody.add("camera", name=name, **place)

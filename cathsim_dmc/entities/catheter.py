@@ -23,7 +23,6 @@ class Catheter(Chain):
         rotation: bool = False,
         friction: float = 0.0,
         timestep: float = TIMESTEP,
-        name: str = "catheter",
     ):
         """Builds the chain.
 
@@ -34,7 +33,6 @@ class Catheter(Chain):
             rotation: whether the base has a rotation joint.
             friction: Coulomb coefficient; MuJoCo takes the larger of the two geoms'.
             timestep: physics step with which the chain will be simulated, s.
-            name: name of the entity.
         """
         device = devices.get(device)
         self.devices = (device,)
@@ -68,7 +66,6 @@ class Catheter(Chain):
             stroke=stroke,
             rotation=rotation,
             timestep=timestep,
-            name=name,
         )
 
 
@@ -86,15 +83,8 @@ def _rest_angles(device: devices.Device, lengths: np.ndarray):
 
 
 def _twists(device: devices.Device, lengths: np.ndarray, count: int):
-    """Compliance of the torsion hinges, rad/(N·m), by link.
-
-    The hinges divide the joints of the chain evenly. Each one lies in the middle of its
-    part and has the compliance of all of it, ∫ds/GJ; the last one includes the distal
-    half link.
-    """
+    """Compliance of the torsion hinges, rad/(N·m), by link: of equal parts, ∫ds/GJ."""
     last = len(lengths) - 1
-    if count > last:
-        raise ValueError(f"torsion_joints is {count}, but the chain has {last} joints")
     if count == 0:
         return {}
     half = _half_compliances(device, lengths, "torsional_stiffness")

@@ -129,22 +129,11 @@ class Chain(composer.ModelWrapperEntity):
         stroke: float,
         rotation: bool,
         timestep: float,
-        name: str,
     ) -> None:
-        """Builds base, links, head, motors and sensors; `devices` are there.
-
-        Args:
-            links: what the chain is made of.
-            surface: attributes of the geoms, see `contact`.
-            stroke: longest insertion, m.
-            rotation: whether the base has a rotation joint.
-            timestep: physics step with which the chain will be simulated, s.
-        """
-        if not stroke > 0:
-            raise ValueError(f"stroke is {stroke} m; it must be positive")
+        """Builds base, links, head, motors and sensors; `devices` are there."""
         self.device = self.devices[-1]
         self.stroke, self.timestep, self.link_lengths = stroke, timestep, links.lengths
-        root = mjcf.RootElement(model=name)
+        root = mjcf.RootElement(model="catheter")
         root.compiler.angle = "radian"
         super()._build(root)
         bodies = [self._add_base(links, rotation)]

@@ -1,22 +1,11 @@
 """Coaxial devices: the properties of the chain that represents them.
 
-Devices are numbered from the innermost outwards. The end of the chain is the farthest
-of their ends; device k ends `gap_k` before it. At a distance s from the end of the
-chain,
-
-    EI(s) = Σ EI_k(s),    κ(s) EI(s) = Σ EI_k(s) κ_k(s),
-
-over the devices present there. κ_k is the curvature of the unloaded shape of device k,
-turned by its local rotation. A hinge has the integrals of 1/EI and κ over its two
-links, with a weight that falls linearly from 1 at the hinge to 0 at their far ends. The
-chain then has the angle and the mean position of each bend of the rod, wherever the end
-of a device lies in a link, and all properties are continuous in insertion and rotation.
-
-SI units. Directions across the chain are complex numbers x + iy in frames that do not
-twist along the chain: a joint bent by a small `bend_y` about y and `bend_x` about x
-leads towards bend_y - i bend_x, and a rotation by φ about the device multiplies by
-exp(iφ). The frames of the links twist, because two hinges do (`hinge_loops.bent`). What
-devices do to each other is in `coaxial_loops`.
+docs/pair_model.md has the equations. Devices are numbered from the innermost outwards;
+device k ends `gap_k` before the end of the chain. Directions across the chain are
+complex numbers x + iy in frames that do not twist along it: a joint bent by a small
+`bend_y` about y and `bend_x` about x leads towards bend_y - i bend_x, and a rotation by
+φ about the device multiplies by exp(iφ). The frames of the links twist, because two
+hinges do (`hinge_loops.bent`).
 """
 
 import itertools
@@ -110,10 +99,7 @@ def weight_density(device: Device) -> float:
 
 
 def _pieces(device: Device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Start of the uniform pieces of a device, m from its end; their EI and EI κ.
-
-    Positive curvature bends towards +x.
-    """
+    """Starts of uniform pieces, m from the end; their EI and EI κ, κ > 0 towards +x."""
     curved, end = [], 0.0
     for arc in reversed(device.tip_shape):
         curved.append((end, end + arc.length, np.copysign(1 / arc.radius, arc.angle)))

@@ -1,10 +1,9 @@
 """Coaxial devices: what they do to each other and to the chain, compiled.
 
-`coaxial` defines the quantities. All functions are of one simulation: `gaps` (K,),
-distance from the end of each device to the end of the chain, m, 0 for the one that
-leads; `turns` (K, J), rotation of each device at each joint, rad; `bends` (J,) complex,
-bending angles of the joints, rad; `tables` of a `coaxial.Stack`. K devices, J joints,
-L = J + 1 links. Arrays are C-contiguous.
+Functions of one simulation; K devices, J joints, L = J + 1 links. `gaps` (K,), distance
+from the end of each device to the end of the chain, m; `turns` (K, J), rotation of each
+device at each joint, rad; `bends` (J,) complex, bending angles of the joints, rad;
+`tables` of a `coaxial.Stack`. Arrays are C-contiguous.
 """
 
 import math
@@ -65,11 +64,7 @@ class Links(NamedTuple):
 
 @compiled
 def _weight(place, joint, nodes, lengths):
-    """Integral of the weight of a joint from the end of the chain to a place.
-
-    The weight rises along the link distal of the joint and falls along the proximal
-    one.
-    """
+    """Integral of the weight of a joint from the end of the chain to a place."""
     ahead, behind = lengths[joint + 1], lengths[joint]
     offset = place - nodes[joint + 1]
     rise = min(max(offset + ahead, 0.0), ahead)
@@ -167,8 +162,7 @@ def restoring(overlap, bends, turns):
     """Restoring torques of the shapes of the devices, and their stiffness.
 
     The energy of a joint bent by θ is |θ - Σ R_k e_k|²/2C, e_k = exp(iφ_k), and that of
-    two devices against each other -S cos(φ_k - φ_l). The derivative by a rotation turns
-    a shaped device into the plane of a curved vessel and makes it whip.
+    two devices against each other -S cos(φ_k - φ_l).
 
     Returns:
         (2, K, J): torque on each device about its axis, N·m, and minus its derivative
@@ -201,11 +195,7 @@ def restoring(overlap, bends, turns):
 
 @compiled
 def _pull(place, load, turns, gaps, edges, bending, moment, piece, device):
-    """Force (N) at a place that bears a bending moment: |EI κ|²/2EI - Σ EI_k κ_k²/2.
-
-    It is the derivative of the energy by the length of the rod. One device has a given
-    piece there.
-    """
+    """Force (N) at a place that bears a bending moment: |EI κ|²/2EI - Σ EI_k κ_k²/2."""
     total, whole, own = 0.0, load, 0.0
     for k in range(len(gaps)):
         here = piece if k == device else _piece(place - gaps[k], edges[k])
@@ -218,17 +208,13 @@ def _pull(place, load, turns, gaps, edges, bending, moment, piece, device):
 
 @compiled
 def axial(tables, overlap, gaps, bends, turns, slopes):
-    """Axial forces by which the joints resist the sliding of the devices.
+    """Axial forces (K, J), N, of the joints, positive where a device must be pushed.
 
     Minus the derivative of the energy by the gap of a device, at given bends and
     rotations of its rod; that of the leading device is minus the others' sum.
 
     Args:
-        slopes: (K, J), torque of `restoring` times the derivative of `turns` by the
-            gap, N.
-
-    Returns:
-        (K, J), N, positive where a device must be pushed forward.
+        slopes: (K, J), N, torque of `restoring` times the derivative of `turns` by gap.
     """
     nodes, lengths, edges, bending, moment = tables
     devices, joints = turns.shape
@@ -266,9 +252,7 @@ def axial(tables, overlap, gaps, bends, turns, slopes):
 def pressure(lengths, overlap, bends, turns, axial, start, ways, coefficient, factor):
     """Lateral forces of each device on the lumen of the next one, and friction.
 
-    The force of a device with the moment M and the compression P is M'' + Pκ per
-    length. P is EI (κ² - κ_k²)/2, the axial forces of the joints distal of the place,
-    and their friction.
+    With the moment M and the compression P, the force is M'' + Pκ per length.
 
     Args:
         lengths: (L,), of the links, m.

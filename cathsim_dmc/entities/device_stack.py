@@ -22,11 +22,10 @@ LEAD = 0.03
 class DeviceStack(Chain):
     """Coaxial devices, each pushed and turned at its base, on one chain of links.
 
-    The end of the chain is that of the device that reaches farthest, the leading one;
-    the properties of the links change as the devices slide, see `coaxial`. The chain
-    has one motor, which drives the leading device. `physics.sliding` moves the devices
-    and writes the properties into the model once per control step. An action has two
-    entries for each device, from the innermost outwards: translation and rotation.
+    The chain ends with the device that reaches farthest, the leading one, and has one
+    motor, which drives that. `physics.sliding` moves the devices and writes the
+    properties of the links once per control step. An action has two entries for each
+    device, from the innermost outwards: translation and rotation.
 
     Attributes:
         device_names: Kind of each device, such as "guidewire" and "catheter".
@@ -50,7 +49,6 @@ class DeviceStack(Chain):
         friction: float = FRICTION,
         lumen_friction: float = LUMEN_FRICTION,
         timestep: float = TIMESTEP,
-        name: str = "catheter",
     ):
         """Builds the chain.
 
@@ -99,7 +97,6 @@ class DeviceStack(Chain):
             stroke=stroke,
             rotation=False,
             timestep=timestep,
-            name=name,
         )
         self.device_names = _names(self.devices)
         self.action_names = tuple(

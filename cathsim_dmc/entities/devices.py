@@ -173,11 +173,7 @@ _COIL = 10e-3
 
 
 def _hydrophilic_wire(
-    name: str,
-    outer: float,
-    cores: tuple[float, float],
-    bend: Arc,
-    tip_links: int,
+    name: str, outer: float, cores: tuple[float, float], bend: Arc, tip_links: int
 ) -> Device:
     """A jacketed wire with a nitinol core.
 

@@ -24,14 +24,7 @@ def unit(angle):
 
 @compiled
 def _hinges(bend, first):
-    """Angles of two hinges, x and y, that bend a joint by a complex angle.
-
-    Exact up to `_LARGEST_BEND`, in proportion beyond it.
-
-    Args:
-        bend: in the frame of the link before the joint.
-        first: hinge that is nearer to that link, 0 for x and 1 for y.
-    """
+    """Angles of the hinges x and y for a bend; the first of them is x (0) or y (1)."""
     angle = abs(bend)
     if angle == 0.0:
         return 0.0, 0.0
@@ -83,10 +76,7 @@ def _twist_rates(x, y, first):
 
 @compiled
 def bent(angles):
-    """Bends of the joints, and twists of the links before them.
-
-    The twist is that of the chain's frames against frames that do not twist along the
-    chain, in which bends and rotations of the devices are measured.
+    """Bends of the joints, and twists of the links before them, see `coaxial`.
 
     Args:
         angles: (2 J,), positions of the hinges in the order of the chain, rad.

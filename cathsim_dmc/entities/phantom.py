@@ -32,7 +32,6 @@ class Phantom(composer.ModelWrapperEntity):
         friction: float = FRICTION,
         goal_radius: float = 8e-3,
         drawn: bool = True,
-        name: str = "phantom",
     ):
         """Builds the wall.
 
@@ -41,10 +40,8 @@ class Phantom(composer.ModelWrapperEntity):
             drawn: whether its surface is there to be seen; a point stands for it if
                 not, so that the models have as many geoms.
         """
-        if not 0 <= friction <= 2:
-            raise ValueError(f"friction is {friction}; it must be between 0 and 2")
         self.anatomy, self._friction = anatomy, friction
-        root = mjcf.RootElement(model=name)
+        root = mjcf.RootElement(model="phantom")
         super()._build(root)
         self.body = root.worldbody.add("body", name="wall")
         shape = {"type": "sphere", "size": [_UNSEEN]}

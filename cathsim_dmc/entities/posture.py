@@ -12,9 +12,7 @@ def joints_along(
 ) -> NDArray[np.float64]:
     """Angles of the bending hinges that place every node of a chain on a line.
 
-    Link 0 of a `Chain` slides along +z; every other link bends about x, then about y of
-    the previous link, or in the other order (`x_first`). Torsion hinges stand at zero.
-    The rows are the positions of `Chain.bends` in order.
+    Torsion hinges stand at zero. The rows are the positions of `Chain.bends` in order.
 
     Args:
         link_lengths: (n,) lengths of the links from proximal to distal, m.

@@ -1,21 +1,14 @@
 """Follower of a CathBot-like catheter robot: geometry and joints, no forces.
 
-A main rail carries four platforms on prismatic joints. From the patient
-backwards: front clamps, catheter rotary unit, rear clamps, guidewire rotary
-unit. The two pairs of clamps grip one device in turn while it advances, or one of two
-devices each; the rotary units turn the devices and let them slide between rollers.
+A main rail carries four platforms. From the patient backwards: front clamps, catheter
+rotary unit, rear clamps, guidewire rotary unit. The two pairs of clamps grip one device
+in turn while it advances, or one of two devices each; the rotary units turn the devices
+and let them slide between rollers.
 
-**Frame.** ``+z`` runs along the device towards the patient, the origin is the
-proximal mouth of the introducer sheath and the device lies on the ``z`` axis.
-``+y`` is down: posterior in the LPS frame of a supine patient, so a robot attached
-without rotation lies on the table below the device. ``+x`` is then the patient's
-left.
-
-**Motion** is perfect, as in the published system: the joints of the device are driven,
-and the robot is posed accordingly. :func:`postures` gives every robot joint as a
-function of insertion and rotation; the task writes the joints into the simulation.
-They are slides and hinges without load (gravity compensated, no actuator, no contact,
-no limit in the solver), so they do not move between two poses.
+``+z`` runs along the device towards the patient, the origin is the proximal mouth of
+the introducer sheath, ``+y`` is down and ``+x`` the patient's left. `postures` gives
+every joint as a function of insertion and rotation, and the task poses them: slides and
+hinges without load, which do not move between two poses.
 """
 
 from pathlib import Path
@@ -58,10 +51,7 @@ def _clamp(insertion, offset):
     """Travel of a pair's platform from home, and opening of each of its jaws, m.
 
     A platform moves with the device while its jaws are closed, opening or closing, and
-    returns in between:
-    ``travel = phase - stroke / 2 - cycle * smoothstep(return progress)``. Position and
-    speed are continuous. Both depend on the insertion alone, so a withdrawal reverses
-    the motion.
+    returns in between.
     """
     # The jaws are closed over phases [0, STROKE].
     phase = (insertion + offset) % CYCLE

@@ -38,11 +38,7 @@ class Sheath(composer.ModelWrapperEntity):
     """
 
     def _build(
-        self,
-        centreline: np.ndarray,
-        device_radius: float,
-        link_length: float = 0.0,
-        name: str = "sheath",
+        self, centreline: np.ndarray, device_radius: float, link_length: float = 0.0
     ):
         """Builds the bore.
 
@@ -65,7 +61,7 @@ class Sheath(composer.ModelWrapperEntity):
         line = Centreline(centreline, np.full(len(centreline), self.bore_radius))
         _refuse_sharp_bends(line)
         self.vertices, self.length = line.points, line.length
-        root = mjcf.RootElement(model=name)
+        root = mjcf.RootElement(model="sheath")
         super()._build(root)
         body = root.worldbody.add("body", name="bore")
         inwards = _sagitta(line, link_length) / 2

@@ -1,14 +1,12 @@
 """Twist of coaxial devices: a one-dimensional rod along each of them.
 
-The M + 1 nodes of a rod are those of the chain when the device reaches its end. The
-rotary unit holds node 0; the last node is the device's end. A segment has the torque
-GJ/l (Δφ + τ Δφ'), as the torsion hinges of a single catheter have. The rod has no
-inertia: it is in equilibrium with its loads at the end of every control step.
+The M + 1 nodes of a rod are those of the chain when the device reaches its end; the
+rotary unit holds the first. The rod has no inertia: it is in equilibrium with its loads
+at the end of every control step (docs/pair_model.md).
 
-Functions of one simulation; K devices, J = M - 1 joints of the chain, which are the
-inner nodes of a device that reaches its end. `angles` (K, M + 1) are rotations of the
-nodes, rad; `gaps` (K,) the distance from the end of each device to that of the chain,
-m; `nodes` (M + 1,) distances from a device's end, from proximal to distal, m.
+Functions of one simulation; K devices, J = M - 1 joints. `angles` (K, M + 1) are
+rotations of the nodes, rad; `gaps` (K,) the distance from the end of each device to
+that of the chain, m; `nodes` (M + 1,) distances from a device's end, m.
 """
 
 from collections.abc import Sequence
@@ -114,11 +112,7 @@ def _balance(diagonal, beside, load, pivot, move):
 
 @compiled
 def _balance_sticking(diagonal, beside, load, friction, least, move):
-    """Balance with Coulomb friction: each node sticks, or slides in one direction.
-
-    Newton's method on the friction law, which is linear up to `least`, the largest
-    movement of a sticking node. The last iterate is the result.
-    """
+    """Balance with Coulomb friction, linear up to `least`, by Newton's method."""
     count = len(load)
     way = np.zeros(count)
     stiff, pull, pivot = np.empty(count), np.empty(count), np.empty(count)

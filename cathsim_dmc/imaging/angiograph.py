@@ -119,9 +119,7 @@ def _blank(machines: Sequence[Planes], channels: int) -> np.ndarray:
     return np.empty(shape, np.uint8)
 
 
-def _each(
-    machines: Sequence[Planes],
-) -> Iterator[tuple[int, np.ndarray, Fluoroscope]]:
+def _each(machines: Sequence[Planes]) -> Iterator[tuple[int, np.ndarray, Fluoroscope]]:
     """Number of a plane, indices of the devices before it, and its fluoroscope."""
     groups: dict[int, list[int]] = {}
     for index, planes in enumerate(machines):

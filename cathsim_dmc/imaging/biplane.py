@@ -1,10 +1,8 @@
 """Biplane reconstruction: device, vessel and route in space from two X-ray images.
 
-Both C-arms know their geometry. The device is what the live image shows and the mask
-image of the empty vessel does not (digital subtraction): the marker at its tip is dark
-in both planes, and the shaft is followed backwards from it. The vessel is the visual
-hull of its outlines in both roadmaps: points that both planes see inside. The route is
-the way from the device to the goal marker that keeps to the middle of the hull.
+The device is followed backwards from the marker at its tip in what the live images show
+and the mask images do not (digital subtraction). The vessel is the visual hull of its
+outlines in both roadmaps; the route to the goal marker keeps to the middle of the hull.
 """
 
 from functools import cache, cached_property

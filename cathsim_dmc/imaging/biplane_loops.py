@@ -115,10 +115,7 @@ def _peaks(image, least, found):
 
 @compiled
 def _marker(images, matrices, least, widest, point):
-    """Writes where the marker is: dark in both planes. Returns how dark, 0 if nowhere.
-
-    The two rays are at most `widest` (px) apart.
-    """
+    """Writes where the marker is, rays `widest` px apart at most; returns how dark."""
     first, second = np.zeros((PEAKS, 3)), np.zeros((PEAKS, 3))
     counts = _peaks(images[0], least, first), _peaks(images[1], least, second)
     best, places, there = 0.0, np.empty((2, 2)), np.empty(3)
@@ -154,10 +151,7 @@ def _line(images, matrices, full, point, direction, way):
 
 @compiled
 def _next(images, matrices, directions, way, full, point, last, tried):
-    """Number of the direction in which the device goes on, -1 if none.
-
-    The direction before is zero at the first point; those tried are left out.
-    """
+    """Number of the direction in which the device goes on after another, -1 if none."""
     best, chosen = 0.25, -1
     first = (last * last).sum() == 0.0
     for k in range(len(directions)):
@@ -175,10 +169,7 @@ def _next(images, matrices, directions, way, full, point, last, tried):
 
 @compiled
 def _follow(images, matrices, directions, way, full, tried, line):
-    """Writes points behind the first; returns their number with it.
-
-    Directions beside that of the first step are marked as tried.
-    """
+    """Writes points behind the first; returns their number. Marks what it has tried."""
     last, places, there = np.zeros(3), np.empty((2, 2)), np.empty(3)
     none = np.zeros(len(directions), dtype=np.bool_)
     for number in range(1, len(line)):

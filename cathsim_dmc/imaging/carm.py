@@ -1,11 +1,9 @@
 """The C-arm: position of X-ray source and detector about the patient.
 
-Frames. The world is the patient frame LPS in metres (+x left, +y posterior, +z
-superior). Pixel coordinates are (column, row): column grows to the right, row
-downwards, whole numbers are pixel *centres*, so (0, 0) is the centre of the top left
-pixel and the image spans [-0.5, columns - 0.5] x [-0.5, rows - 0.5]. The observer
-looks from the detector towards the source: the patient's left is on the right of an
-AP image and the head is up.
+Pixel coordinates are (column, row): column grows to the right, row downwards, whole
+numbers are pixel *centres*, so (0, 0) is the centre of the top left pixel. The observer
+looks from the detector towards the source: the patient's left is on the right of an AP
+image and the head is up.
 """
 
 from collections.abc import Mapping

@@ -1,15 +1,11 @@
 """Shadow of a slender device: its optical depth, frame by frame.
 
-A device is a polyline with a radius: a chain of capsules whose axis is a smooth curve
-through the joints. Its shadow is drawn with sub-pixel accuracy even when it is thinner
-than a pixel, and keeps its weight: summed over the image, path length times pixel area
-is the volume of the device, wherever it moves and however it turns.
-
-The chord of a ray through a round rod, as a function of the ray's distance from the
-axis, is a half ellipse; a uniform disc swept along the projected axis leaves exactly
-that profile, whatever the direction. So the shadow of a device is a sum of discs,
-and what a pixel receives of a disc is the area the two share, which has a closed
-form: nothing is tabulated, and nothing is lost between pixels.
+A device is a chain of capsules whose axis is a smooth curve through the joints. The
+chord of a ray through a round rod, as a function of the ray's distance from the axis,
+is a half ellipse: the profile that a uniform disc leaves when it is swept along the
+projected axis. So a shadow is a sum of discs, and a pixel receives of each the area
+that the two share. Summed over the image, path length times pixel area is the volume of
+the device, wherever it is.
 """
 
 import math
@@ -161,11 +157,7 @@ def _chord(joints, link):
 
 @compiled
 def _turn(joints, link, other):
-    """Tangent less chord of a link where it meets another, times its length.
-
-    The tangent is that of the parabola through the three joints; zero if the other
-    link is none, has no length or is not finite.
-    """
+    """Tangent less chord of a link where it meets another, times its length."""
     if 0 <= other < len(joints) - 1:
         x, y, z, length = _chord(joints, link)
         u, v, w, beside = _chord(joints, other)
@@ -192,8 +184,7 @@ def _bends(joints, link):
 def _add_devices(images, cameras, radii, focal, material):
     """Adds devices to images (B, rows, columns); returns the widest radius in view, px.
 
-    Joints (B, n, 3) in camera coordinates and radii (B, n - 1) in m, focal length in
-    px; material: attenuation of device and marker, 1/m, and length of the marker, m.
+    Material: attenuation of device and marker, 1/m, and length of the marker, m.
     """
     widest = 0.0
     scratch = np.empty((3, 2 * _WIDEST + 2))
@@ -210,10 +201,7 @@ def _add_devices(images, cameras, radii, focal, material):
 
 @compiled
 def _add_link(image, camera, part, scratch):
-    """Adds a link, whose distal end is `to_tip` (m) from the tip, up to `_WIDEST`.
-
-    Returns its length, m, and the radius of its shadow, px, 0 if it is not in view.
-    """
+    """Adds a link; returns its length, m, and radius, px, 0 if it is not in view."""
     link, radii, focal, material, to_tip = part
     rows, columns = image.shape
     radius = radii[link]

@@ -1,8 +1,7 @@
 """View of a camera in the head of a device, without OpenGL.
 
-Each ray steps forward by the depth of the lumen's field, which no wall is nearer than,
-until it meets the wall (sphere tracing). The camera looks along +z of the head, with +x
-to the right and +y down; a lamp beside it lights the wall.
+Sphere tracing: each ray steps forward by the depth of the lumen's field until it meets
+the wall. The camera looks along +z of the head, with +x to the right and +y down.
 """
 
 import math

@@ -1,10 +1,8 @@
 """Path length of X-rays through a closed surface: once per anatomy and view.
 
 The length of a ray inside a closed surface is the sum of the distances at which it
-leaves minus the sum of those at which it enters. Triangles are rasterised with
-integer edge functions and a fill rule that gives a ray through a shared edge to
-exactly one of the two triangles; so entries and exits always match, and the sum is
-the exact chord of the triangle mesh for every ray.
+leaves minus the sum of those at which it enters. Integer edge functions and a fill rule
+give a ray through a shared edge to exactly one triangle, so the sum is exact.
 """
 
 import numpy as np
@@ -62,11 +60,7 @@ def surface_thickness(carm: CArm, surface: Surface, supersample: int = 3) -> np.
 
 @compiled
 def _add_surface(image, corners, inverse, faces):
-    """Adds the depths (m) at which rays leave a surface, less those where they enter.
-
-    Corners (V, 2) int64 are columns and rows times `_SUBDIVISIONS`, inverse (V,) is one
-    over their depth, 1/m.
-    """
+    """Adds depths (m) at which rays leave a surface, less those where they enter."""
     rows, columns = image.shape
     for face in range(len(faces)):
         i, j, k = faces[face]
@@ -99,11 +93,7 @@ def _add_surface(image, corners, inverse, faces):
 
 @compiled
 def _edge(x, y, ax, ay, bx, by):
-    """Edge function of a ray, -1 where it is on the edge and not the triangle's.
-
-    A ray exactly on an edge belongs to the triangle for which the edge points up, or is
-    level and points right: each direction wins exactly once.
-    """
+    """Edge function of a ray, -1 on an edge that points neither up nor level right."""
     dx, dy = bx - ax, by - ay
     value = dx * (y - ay) - dy * (x - ax)
     if value == 0 and not (dy < 0 or (dy == 0 and dx > 0)):

@@ -1,24 +1,16 @@
 """Drag of still blood across the links of the device, in every physics step.
 
-On a length l of a device of diameter d that moves across its axis through blood with a
-velocity u, Re = ρ|u|d/µ,
-
-    F = -½ ρ d l C_d |u| u,
-    C_d = 1.18 + 6.8 / Re^0.89 + 1.96 / √Re - 0.0004 Re / (1 + 3.64e-7 Re²)
-
-(Sucker and Brauer 1975, Wärme- und Stoffübertragung 8, 149; Re from 1e-4 to 2e5):
-viscous like that of a slender body at a small Re, quadratic at a large one. Drag along
-the axis and by rotation about it are left out, and so is the history of the motion. The
-blood that the device carries is part of the mass of its links
-(`entities.coaxial.carried_mass`).
+On a length l and a diameter d, at a velocity u across the axis and Re = ρ|u|d/µ, it is
+-½ ρ d l C_d |u| u, C_d = 1.18 + 6.8 / Re^0.89 + 1.96 / √Re - 0.0004 Re / (1 + 3.64e-7
+Re²) (Sucker and Brauer 1975, Wärme- und Stoffübertragung 8, 149; Re from 1e-4 to 2e5).
+docs/physics.md says what is left out.
 """
 
-import numpy as np
+from numpy.random import RandomState
 
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.chain import Chain
-from cathsim_dmc.physics.effects import Effect, World
-from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.effects import Effect, Episode, World
 
 BLOOD_VISCOSITY = 3.5e-3  # Pa·s, of whole blood at high shear rates
 
@@ -44,9 +36,7 @@ class StillBlood(Effect):
         # See `blood_loops.OF_LINK`; the first are the blood's velocity, world frame.
         self.velocity, self._links = links[..., :3], links
 
-    def restart(
-        self, index: int, episode: Episode, random_state: np.random.RandomState
-    ) -> None:
+    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Fills one simulation with blood at rest."""
         factor = 1.0 if episode.viscosity is None else episode.viscosity
         viscosity, first = factor * BLOOD_VISCOSITY, self.world.index.links.start

@@ -1,10 +1,9 @@
 """Drives of the base: position servos that follow the command until their clamp slips.
 
-The actuator integrates its command to the place where the servo pulls, MuJoCo's `act`.
-Its force is limited to that at which the clamp slips, like Coulomb friction. Once in a
-control step `act` is set to where the servo, under the load that it bears, holds the
-base at the place that it has been told; where the clamp has slipped, that place is
-where the base stands.
+The actuator integrates its command to the place where the servo pulls, MuJoCo's `act`,
+with the force at which the clamp slips at most. Once in a control step `act` is set to
+where the servo, under its load, holds the base at the place that it has been told;
+where the clamp has slipped, that place is where the base stands.
 """
 
 import types

@@ -1,24 +1,22 @@
 """Effects on the simulation: forces, fields of the model, commands of the drives.
 
-An effect is a small class, listed by a task: `suite.make_task(name, effects=[...])`.
-It restarts with each episode and acts once in a control step on the arrays of all
-simulations. Where it must act in every physics step, it has a function that is
-compiled and that MuJoCo calls, so that no Python runs in the loop; see `Effect.forces`.
+A task lists them: `suite.make_task(name, effects=[...])`. An effect restarts with each
+episode and acts once in a control step on the arrays of all simulations; in every
+physics step acts a function that is compiled and that MuJoCo calls, `Effect.forces`.
 """
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.random import RandomState
 
+from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.imaging.angiograph import Deviation
 from cathsim_dmc.physics.readings import MARK, Bodies, ModelIndex, Readings
-
-if TYPE_CHECKING:
-    from cathsim_dmc.anatomy import Anatomy
 
 # Numbers of `userdata` before the parameters of an effect: its mark and their number.
 _HEADER = 2
@@ -111,12 +109,10 @@ class Effect:
         """Finds what it acts on; no episode has begun yet."""
         self.world = world
 
-    def enter(self, index: int, anatomy: "Anatomy") -> None:
+    def enter(self, index: int, anatomy: Anatomy) -> None:
         """Takes the anatomy of one simulation, before an episode begins in it."""
 
-    def restart(
-        self, index: int, episode: Episode, random_state: np.random.RandomState
-    ) -> None:
+    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Begins an episode of one simulation, whose device lies at its start.
 
         Args:
@@ -182,14 +178,12 @@ class Effects:
             parameters = self._user[:, first:start]
             effect.bind(dataclasses.replace(world, parameters=parameters))
 
-    def enter(self, index: int, anatomy: "Anatomy") -> None:
+    def enter(self, index: int, anatomy: Anatomy) -> None:
         """Takes the anatomy of one simulation; see `Effect.enter`."""
         for effect in self._effects:
             effect.enter(index, anatomy)
 
-    def restart(
-        self, index: int, episode: Episode, random_state: np.random.RandomState
-    ) -> None:
+    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Begins an episode of one simulation; see `Effect.restart`."""
         self._user[index, list(self._labels)] = list(self._labels.values())
         for effect in self._effects:

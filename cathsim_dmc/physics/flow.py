@@ -1,30 +1,15 @@
 """Blood that flows: a pulsatile flow past the links of the device.
 
-The inflow follows `blood_loops.beat` at a heart rate; time scales with its period. At a
-way s from the heart it comes s / c later, c the pulse wave velocity. Branches take
-their shares (`anatomy.circulation`). Across the lumen of radius R the velocity is
-blunted, u = Q / πR² · (n + 2) / n · (1 - (r/R)ⁿ) with n = 9, as one-dimensional models
-of the aorta have it (Smith, Pullan and Hunter 2002; openBF). Womersley's profile is
-that of a developed flow; the aorta is shorter than its entrance length, and measured
-profiles are flat (the Stokes layer at 1 Hz is 1 mm thick).
-
-In a moving vessel (`anatomy.motion`), with the gradient A = ∂X/∂x of the place at rest,
-the velocity v(X) at rest, over the radius that the lumen has grown to, becomes
-det A A⁻¹ v(X), which conserves the volume through every section (Piola), and the
-velocity A⁻¹ ∂u/∂t of the vessel's space is added.
-
-The velocity at each link is taken once a control step where the link is, its course in
-time in every physics step. Across the link the drag is that of `blood`, from the
-velocity relative to the link; along it, the blood rubs like a flow between the link of
-radius a and the wall, 2πµu / ln(R/a) per length.
+docs/vessel_model.md has the equations and their sources. The velocity at each link is
+taken once a control step where the link is, its course in time (`blood_loops.beat`) in
+every physics step.
 """
-
-from __future__ import annotations
 
 import dataclasses
 import math
 
 import numpy as np
+from numpy.random import RandomState
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy
@@ -32,13 +17,12 @@ from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, carried, courses, warp
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.physics.blood import StillBlood
-from cathsim_dmc.physics.drawn import Range, drawable, drawn
-from cathsim_dmc.physics.effects import World
+from cathsim_dmc.physics.effects import Episode, World
 from cathsim_dmc.physics.motion import Moving
-from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
 from cathsim_dmc.physics.readings import Readings
 
-# Exponent of the profile across the lumen.
+# Exponent of the profile across the lumen (Smith, Pullan and Hunter 2002; openBF).
 EXPONENT = 9
 # Distance over which the flow of a vessel passes into that of its branch, m.
 _BLEND = 5e-4
@@ -61,15 +45,15 @@ class FlowOptions:
             shares of all outlets by their radii cubed, as in a scan.
     """
 
-    rate: Range = 60.0
-    peak: Range = 0.72
-    phase: Range = 0.0
-    wave_speed: Range = 4.6
+    rate: Drawn = 60.0
+    peak: Drawn = 0.72
+    phase: Drawn = 0.0
+    wave_speed: Drawn = 4.6
     split: str = "measured"
 
     def __post_init__(self):
         bounds.choice("split", self.split, ("measured", "murray"))
-        drawable(self, _LIMITS)
+        check_drawn(self, _LIMITS)
 
 
 _LIMITS = {
@@ -106,9 +90,7 @@ class Flow(StillBlood):
         if self._options is not None and self._options.split == "murray":
             self._circulations[index] = Circulation.of(anatomy.tree, True)
 
-    def restart(
-        self, index: int, episode: Episode, random_state: np.random.RandomState
-    ) -> None:
+    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Draws rate, peak and phase of the heart, and pulse wave velocity."""
         super().restart(index, episode, random_state)
         if self._options is None:

@@ -1,26 +1,22 @@
 """A vessel that moves: pulsation, heartbeat and breathing (`anatomy.motion`).
 
 The wall of a moving vessel is the field at rest, looked up at x - u(x, t) in every
-physics step, from the time and the parameters of the simulation. Its contacts see the
-velocity of the wall (`collision.carrying`): friction carries a device along. An episode
-begins at rest, at the end of diastole and of expiration, and moves in full after
-`motion_loops.RAMP`.
+physics step (docs/vessel_model.md). An episode begins at rest, at the end of diastole
+and of expiration, and moves in full after `motion_loops.RAMP`.
 """
-
-from __future__ import annotations
 
 import dataclasses
 from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.random import RandomState
 
 from cathsim_dmc.anatomy import Anatomy, Surface, motion_loops
 from cathsim_dmc.anatomy.motion import Motion
 from cathsim_dmc.entities.chain import Chain
-from cathsim_dmc.physics.drawn import Range, drawable, drawn
-from cathsim_dmc.physics.effects import Effect, World
-from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.effects import Effect, Episode, World
+from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
 from cathsim_dmc.physics.readings import Readings
 
 _LIMITS = {
@@ -56,17 +52,17 @@ class MotionOptions:
             expiration.
     """
 
-    heart: Range = 5.5e-3
-    breathing: Range = 1.0
-    distensibility: Range = 0.02
-    rate: Range | None = None
-    phase: Range | None = None
-    wave_speed: Range | None = None
-    breath_rate: Range = 15.0
-    breath_phase: Range = 0.0
+    heart: Drawn = 5.5e-3
+    breathing: Drawn = 1.0
+    distensibility: Drawn = 0.02
+    rate: Drawn | None = None
+    phase: Drawn | None = None
+    wave_speed: Drawn | None = None
+    breath_rate: Drawn = 15.0
+    breath_phase: Drawn = 0.0
 
     def __post_init__(self):
-        drawable(self, _LIMITS)
+        check_drawn(self, _LIMITS)
 
     def check(self, anatomy: Anatomy) -> None:
         """Raises ValueError if the largest amplitudes fold an anatomy."""
@@ -111,9 +107,7 @@ class Moving(Effect):
         self._motions[index], self._surfaces[index] = anatomy.motion, anatomy.surface
         self._inlets[index] = anatomy.inlet.position, anatomy.inlet.direction
 
-    def restart(
-        self, index: int, episode: Episode, random_state: np.random.RandomState
-    ) -> None:
+    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Draws amplitudes, rates and phases."""
         given = {name: getattr(self._options, name) for name in _LIMITS}
         given |= {name: OF_HEART[name] for name in OF_HEART if given[name] is None}

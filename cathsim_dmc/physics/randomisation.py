@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from dm_control.composer import variation
-from dm_control.composer.variation import distributions
+from numpy.random import RandomState
 
 from cathsim_dmc import bounds
 from cathsim_dmc.entities.chain import hinge_time
@@ -25,6 +25,7 @@ START_JITTER = 1e-3  # m
 
 # Lowest and highest value of a uniform distribution, or any composer Variation.
 Range = Sequence[float] | variation.Variation
+Drawn = float | Sequence[float]  # a number, or a range (low, high) that is drawn from
 
 # Least and largest value of what is drawn, far beyond what differs between sessions,
 # within what can be simulated.
@@ -46,12 +47,31 @@ _MOST_NOISE = 0.01  # m
 
 
 def start_displacement(
-    random_state: np.random.RandomState, ball: float = START_JITTER
+    random_state: RandomState, ball: float = START_JITTER
 ) -> np.ndarray:
     """Random displacement (3,) of the tip: uniform in a ball of that radius, m."""
     direction = random_state.normal(size=3)
     radius = ball * random_state.uniform() ** (1 / 3)
     return radius * direction / np.linalg.norm(direction)
+
+
+def check_drawn(options: Any, limits: Mapping[str, tuple[float, float, str]]) -> None:
+    """Checks numbers and ranges against limits; ValueError names a field."""
+    for name, (low, high, unit) in limits.items():
+        value = getattr(options, name)
+        if isinstance(value, str | float) or bounds.is_number(value):
+            bounds.number(name, value, low, high, unit)
+        elif value is not None or getattr(type(options), name) is not None:
+            ends = bounds.interval(name, value, low, high, unit)
+            object.__setattr__(options, name, ends)
+
+
+def drawn(value: Drawn, random_state: RandomState) -> float:
+    """A number as it is, or one drawn from a range (low, high)."""
+    if isinstance(value, Sequence):
+        low, high = value
+        return float(random_state.uniform(low, high))
+    return float(value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,14 +152,12 @@ class Randomisation:
         """How much farther in an episode may begin, m."""
         return 0.0 if self.start_insertion is None else self.start_insertion[1]
 
-    def draw_in(
-        self, random_state: np.random.RandomState, anatomies: int
-    ) -> tuple[int, Episode]:
+    def draw_in(self, random_state: RandomState, anatomies: int) -> tuple[int, Episode]:
         """Draws the number of one of so many anatomies, then an episode in it."""
         number = int(random_state.randint(anatomies)) if anatomies > 1 else 0
         return number, self.draw(random_state)
 
-    def draw(self, random_state: np.random.RandomState) -> Episode:
+    def draw(self, random_state: RandomState) -> Episode:
         """Draws an episode; what is None takes nothing from the source."""
 
         def value(name: str) -> float | None:
@@ -147,29 +165,28 @@ class Randomisation:
             if chosen is None:
                 return None
             if not isinstance(chosen, variation.Variation):
-                chosen = distributions.Uniform(*map(float, chosen))
-                return float(variation.evaluate(chosen, random_state=random_state))
+                return drawn(chosen, random_state)
             # Only now is it known what somebody's own distribution gives.
-            drawn = variation.evaluate(chosen, random_state=random_state)
-            return bounds.number(f"{name}, as drawn,", drawn, *_RANGES[name])
+            found = variation.evaluate(chosen, random_state=random_state)
+            return bounds.number(f"{name}, as drawn,", found, *_RANGES[name])
 
         displacement = start_displacement(random_state, self.start_radius)
         names = "friction", "stiffness", "loss", "viscosity"
-        drawn: dict[str, Any] = {name: value(name) for name in names}
+        given: dict[str, Any] = {name: value(name) for name in names}
         primary, secondary = value("view"), value("view")
         gain, kerma = value("gain"), value("kerma")
-        drawn |= {"goal_shift": value("goal_shift"), "roll": value("roll")}
+        given |= {"goal_shift": value("goal_shift"), "roll": value("roll")}
         if self.delay is not None:
             low, high = map(int, self.delay)
-            drawn["delay"] = int(random_state.randint(low, high + 1))
-        drawn["insertion"] = value("start_insertion")
+            given["delay"] = int(random_state.randint(low, high + 1))
+        given["insertion"] = value("start_insertion")
         deviation = Deviation(
             primary=round(primary or 0.0),
             secondary=round(secondary or 0.0),
             gain=1.0 if gain is None else gain,
             kerma=1.0 if kerma is None else kerma,
         )
-        return Episode(displacement, deviation=deviation, **drawn)
+        return Episode(displacement, deviation=deviation, **given)
 
 
 # Friction and EI over what real devices and lubrication show (the friction that is
@@ -203,8 +220,8 @@ class RandomisedModel(Effect):
 
     def __init__(self, randomisation: Randomisation):
         """Names the fields of the model that the randomisation changes."""
-        self._drawn = [n for n in _WRITTEN if getattr(randomisation, n) is not None]
-        self.model_fields = tuple({f for name in self._drawn for f in _WRITTEN[name]})
+        drawn = [n for n in _WRITTEN if getattr(randomisation, n) is not None]
+        self.model_fields = tuple({field for n in drawn for field in _WRITTEN[n]})
 
     def bind(self, world: World) -> None:
         """Finds the elements in the model, as it is without randomisation."""
@@ -220,15 +237,11 @@ class RandomisedModel(Effect):
         self._base = world.index.links.start
         self._stiffness = model.jnt_stiffness[self._hinges].copy()
 
-    def restart(
-        self, index: int, episode: Episode, random_state: np.random.RandomState
-    ) -> None:
+    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Writes what was drawn into the model of one simulation."""
-        field = self.world.field
-        drawn = {name: getattr(episode, name) for name in self._drawn}
-        if (friction := drawn.get("friction")) is not None:
-            field(index, "geom_friction")[self._geoms, 0] = friction
-        stiffness, loss = drawn.get("stiffness"), drawn.get("loss")
+        field, stiffness, loss = self.world.field, episode.stiffness, episode.loss
+        if episode.friction is not None:
+            field(index, "geom_friction")[self._geoms, 0] = episode.friction
         if loss is not None or stiffness is not None:
             device, timestep = self.world.chain.device, self.world.chain.timestep
             factor = 1.0 if stiffness is None else stiffness
@@ -242,8 +255,8 @@ class RandomisedModel(Effect):
                 ("actuator_gainprm", (self._motors, 0)),
             ):
                 field(index, name)[where] = self._nominal[name][where] * stiffness
-        if (roll := drawn.get("roll")) is not None:
-            half = roll / 2
+        if episode.roll is not None:
+            half = episode.roll / 2
             turn = np.array([np.cos(half), 0.0, 0.0, np.sin(half)])
             quaternion = np.empty(4)
             mujoco.mju_mulQuat(quaternion, self._nominal["body_quat"][self._base], turn)
@@ -263,9 +276,7 @@ class ActionDelay(Effect):
         self._past = np.zeros((world.num_simulations, self._longest + 1, num_actions))
         self._delay = np.zeros(world.num_simulations, dtype=int)
 
-    def restart(
-        self, index: int, episode: Episode, random_state: np.random.RandomState
-    ) -> None:
+    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Begins an episode of one simulation, with drives at rest."""
         self._past[index] = 0.0
         self._delay[index] = episode.delay

@@ -1,9 +1,7 @@
 """Quantities that a task reads from the simulator, for one simulation or for many.
 
-A `ModelIndex` finds the quantities of a compiled model by name once. Its `reader` finds
-them in any object with MuJoCo's array names: an `mujoco.MjData`, with arrays such as
-qpos (nq,), or a `mujoco.batch.Batch`, with arrays such as qpos (N, nq), and takes them
-step after step. Every array has the leading axes of the source, written `...` below.
+Arrays have the leading axes of their source, written `...` below: none of an
+`mujoco.MjData`, with arrays such as qpos (nq,), N of a `mujoco.batch.Batch`.
 """
 
 from collections.abc import Callable, Sequence
@@ -69,7 +67,6 @@ class CoaxialReadings(NamedTuple):
             at zero insertion, m; negative for one that has been withdrawn farther.
         rotation: (N, K), of the rotary units, rad.
         tip_rotation: (N, K), of the ends of the devices, rad.
-        twist: (N, K), torque of the rotary units on the devices at rest, N·m.
         points: (N, K, P, 3), points of each device `DEVICE_PLACES` from its end,
             m, world frame, see `sliding`; the last one is its end.
         leading_load: (N,), N, axial force in the device that reaches farthest where it
@@ -84,7 +81,6 @@ class CoaxialReadings(NamedTuple):
     insertion: np.ndarray
     rotation: np.ndarray
     tip_rotation: np.ndarray
-    twist: np.ndarray
     points: np.ndarray
     leading_load: np.ndarray
     lumen_friction: np.ndarray
@@ -197,6 +193,24 @@ class ModelIndex:
     def contacts(self, sensordata: np.ndarray) -> forces.Contacts:
         """Contacts with the wall from sensor rows (..., nsensordata)."""
         return forces.Contacts.from_sensor(sensordata[..., self.wall_contacts])
+
+
+def part(measured: Any, rows: np.ndarray | slice | int) -> Any:
+    """Rows of all arrays of a named tuple, and of the tuples in it; None is kept."""
+    if measured is None or isinstance(measured, np.ndarray):
+        return measured if measured is None else measured[rows]
+    return type(measured)._make(part(value, rows) for value in measured)
+
+
+def merged(old: Any, new: Any, rows: np.ndarray) -> Any:
+    """A named tuple with `new` in some rows of its arrays (N, ...); `old` stays."""
+    if old is None or isinstance(old, np.ndarray):
+        array = old if old is None else old.copy()
+        if array is not None:
+            array[rows] = new
+        return array
+    pairs = zip(old, new, strict=True)
+    return type(old)._make(merged(before, now, rows) for before, now in pairs)
 
 
 def ids(model: mujoco.MjModel, elements: Sequence[Any]) -> np.ndarray:

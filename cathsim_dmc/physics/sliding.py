@@ -1,14 +1,14 @@
 """The devices of N simulations, moved by the actions.
 
-Once in a control step, before its physics steps, coaxial devices are moved along and
-about their axis; `chain_fields` then writes the properties of the chain. Where each
-device is and how it is turned lies in MuJoCo's `userdata`, so it is part of the state
-that is saved, dumped and replayed.
+Once in a control step, coaxial devices are moved along and about their axis;
+`chain_fields` then writes the properties of the chain. Where each device is and how it
+is turned lies in MuJoCo's `userdata`, which is part of the state that is saved.
 """
 
 import operator
 
 import numpy as np
+from numpy.random import RandomState
 
 from cathsim_dmc.entities.chain import (
     MAX_PUSH_FORCE,
@@ -61,9 +61,7 @@ class SingleDevice(Effect):
         self._drives = Drives(world.model, world.arrays)
         self.slipped = self._drives.slipped
 
-    def restart(
-        self, index: int, episode: Episode, random_state: np.random.RandomState
-    ) -> None:
+    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Holds the base of one simulation where it stands."""
         self._drives.hold(index)
 
@@ -137,9 +135,7 @@ class SlidingDevices(SingleDevice):
 
     # The course of an episode.
 
-    def restart(
-        self, index: int, episode: Episode, random_state: np.random.RandomState
-    ) -> None:
+    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Puts the devices of one simulation to the start of the chain."""
         super().restart(index, episode, random_state)
         gaps = self._entity.start_gaps
@@ -188,10 +184,7 @@ class SlidingDevices(SingleDevice):
         return command
 
     def _clamped(self, told: np.ndarray, leaders: np.ndarray) -> np.ndarray:
-        """Ways (N, K) of devices whose clamps slip at the largest force, m.
-
-        The clamp of the leading device slips in the physics steps.
-        """
+        """Ways (N, K), m; the leading device's clamp slips in the physics steps."""
         excess = np.abs(self._axial) - MAX_PUSH_FORCE
         excess[np.arange(len(excess)), leaders] = -1.0
         if (excess < 0.0).all():
@@ -206,13 +199,7 @@ class SlidingDevices(SingleDevice):
         return self._hinges[index], *drawn, self._fields[index]
 
     def _settle(self, rate: np.ndarray, lead: np.ndarray, state: Readings) -> None:
-        """Turns the devices, writes the chains, and computes the forces of the drives.
-
-        Args:
-            rate: (N, K) in [-1, 1], of the rotation of each device.
-            lead: (N,), insertion of the chain, m.
-            state: Readings after the last control step.
-        """
+        """Turns the devices, writes the chains, computes the forces of the drives."""
         nodes, turned = self._stack.nodes, MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
         gaps = sliding_loops.gaps(np.ascontiguousarray(self._insertion))
         # Nothing rubs in the sheath.
@@ -274,8 +261,6 @@ class SlidingDevices(SingleDevice):
             insertion=insertion,
             rotation=self._angles[..., 0].copy(),
             tip_rotation=self._angles[..., -1].copy(),
-            twist=self._rods.stiffness[:, 0]
-            * (self._angles[..., 0] - self._angles[..., 1]),
             points=sliding_loops.points(line, gaps[..., None] + DEVICE_PLACES, nodes),
             leading_load=load,
             lumen_friction=np.abs(self._drag).sum(axis=1),
@@ -301,7 +286,7 @@ class SlidingDevices(SingleDevice):
 
 
 def made(entity: DeviceStack, fields: ChainFields) -> tuple:
-    """What `sliding_loops.settle` takes of coaxial devices."""
+    """What `sliding_loops.settle` takes: of devices, of their drives (SI), places."""
     stack = entity.stack
     devices = stack.tables, entity.rods, stack.arms, stack.of_links
     drives = entity.lumen_friction, CONTROL_TIMESTEP, MAX_TORQUE

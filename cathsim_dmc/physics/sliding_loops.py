@@ -37,9 +37,7 @@ def settle(
     """Turns the devices of one simulation and writes the properties of its chain.
 
     Args:
-        made: `tables` of the `coaxial.Stack`, its `torsion.Rods`, `arms` and
-            `of_links`; Coulomb coefficient between devices, control step, s, and torque
-            at which a clamp slips, N·m; `places` of the `ChainFields`.
+        made: see `sliding.made`.
         gaps: (K,), way from the end of each device to that of the chain, m.
         turned: (K,), by how much the bases are turned, rad.
         force: (L,), of the wall on the links, N.

@@ -1,17 +1,14 @@
 """The physics steps of a control step, for N simulations and whoever runs them.
 
-    begin → physics steps → end
-
-`Stepper` does what is the same in every simulator: it notices warnings, does a control
-step again with shorter physics steps, switches actuators off. `SingleStepper` adapts
-the simulation that composer steps, `simulation.batch` those of `mujoco.batch`.
+`SingleStepper` adapts the simulation that composer steps to `Stepper`,
+`simulation.batch` those of `mujoco.batch`.
 """
 
 import abc
 import math
 import types
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -24,13 +21,6 @@ PHYSICS_TIMESTEP = TIMESTEP
 CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 _ACTUATION = mujoco.mjtDisableBit.mjDSBL_ACTUATION.value
-
-
-class Anatomic(Protocol):
-    """An anatomy."""
-
-    def write(self, model: mujoco.MjModel) -> None:
-        """Puts the anatomy into a compiled model, in place of the one in it."""
 
 
 class Stepper(abc.ABC):
@@ -72,8 +62,8 @@ class Stepper(abc.ABC):
         return getattr(self._model_of(index), name)
 
     @abc.abstractmethod
-    def load(self, index: int, case: Anatomic) -> None:
-        """Puts an anatomy into the model of one simulation."""
+    def load(self, index: int, case: Any) -> None:
+        """Has a `tasks.cases.Case` write itself into the model of one simulation."""
 
     @abc.abstractmethod
     def states(self) -> np.ndarray:
@@ -144,10 +134,9 @@ class Stepper(abc.ABC):
         self._change(indices, "disableflags", lambda flags: flags & ~_ACTUATION)
 
     def _depth_at_end(self, depth: np.ndarray, warned: np.ndarray) -> np.ndarray:
-        """Depth (N,) m of the deepest contact in a control step and at its end.
+        """Depth (N,) m of the deepest contact in a control step, and at its end.
 
-        The last physics step's contacts are those of its beginning. Where a link may
-        have gone too deep in it, they are looked for once more.
+        Contacts are looked for once more where a link may have gone too deep.
         """
         if not self._views:  # a batch looks for them each time
             names = ("qvel", "cdof", "xpos", "subtree_com")
@@ -200,7 +189,7 @@ class SingleStepper(Stepper):
         views = {name: getattr(data, name) for name in (*fields, "ctrl", "userdata")}
         self.arrays = types.SimpleNamespace(**{n: v[None] for n, v in views.items()})
         self.warnings = data.warning.number[None]
-        self._case: Anatomic | None = None
+        self._case: Any = None
         self._sensor = data.sensordata[self._contacts]
         # Of each physics step; 0 where there is no contact.
         self._rows = np.zeros((substeps, len(self._sensor)))
@@ -224,7 +213,7 @@ class SingleStepper(Stepper):
     def _model_of(self, index: int) -> mujoco.MjModel:
         return self._model
 
-    def load(self, index: int, case: Anatomic) -> None:
+    def load(self, index: int, case: Any) -> None:
         """Puts an anatomy into the model; the data begin anew."""
         if case is not self._case:
             case.write(self._model)

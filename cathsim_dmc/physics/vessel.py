@@ -1,7 +1,7 @@
 """The option `vessel` of a task: blood that flows, a wall that gives and moves."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -55,12 +55,10 @@ class VesselReadings(NamedTuple):
 def read(
     effects: Sequence[Effect], time: np.ndarray, state: Readings, rows: np.ndarray
 ) -> VesselReadings | None:
-    """State of the vessels; None where none of them lives.
+    """State of the vessels at times (N,), s; None where none of them lives.
 
     Args:
         effects: Of the task.
-        time: (N,), s, of the episodes.
-        state: At that time.
         rows: (N, M * 14), of the wall's sensor.
     """
     if not any(isinstance(effect, Flow) for effect in effects):
@@ -107,13 +105,9 @@ class VesselOptions:
             return value
         if isinstance(value, str):
             value = PRESETS[bounds.choice("vessel", value, PRESETS)]
-        if not isinstance(value, Mapping):
-            allowed = (
-                f"one of {', '.join(PRESETS)}, or a mapping of {', '.join(_KINDS)}"
-            )
-            bounds.refuse("vessel", value, allowed)
-        bounds.mapping("vessel", value, _KINDS)
-        return cls(**{name: _part(name, part) for name, part in value.items()})
+        named = f"one of {', '.join(PRESETS)}, or "
+        parts = bounds.mapping("vessel", value, _KINDS, named)
+        return cls(**{name: _part(name, part) for name, part in parts.items()})
 
     @property
     def living(self) -> bool:

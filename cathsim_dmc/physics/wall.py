@@ -1,36 +1,22 @@
 """A wall that gives: contacts as springs of the stiffness of the vessel where they are.
 
-A tube of radius R, thickness t, Young's modulus E and Poisson's ratio ν = ½ gives under
-a point load f by f / k, between two limits:
-
-- held by what surrounds it, like a shallow shell (Reissner 1946),
-  k = 4 E t² / (R √(3 (1 - ν²)));
-- free to become oval over a length of R √(R/t), k = E' t³ / (12 · 0.149 R³) · R √(R/t)
-  with E' = E / (1 - ν²), the ring between two loads.
-
-`support` s goes from one to the other, k = k_free^(1-s) k_held^s. In MuJoCo, a contact
-at rest obeys f = K d(r)² r / ((1 - d(r)) Â), with K the stiffness of `solref`, d the
-impedance at a depth r, and Â the inverse weight of the link. Both are set for each link
-once a control step. The spring is linear to a quarter of `STIFFENING` and up to eleven
-times as stiff beyond; it obeys the rule of `entities.contact`, α(1 + m) < 2. Two planes
-for one place of a hollow wall share the spring. What is stiffer than the contact with
-the rigid wall has that contact's law.
+docs/vessel_model.md has the equations. The contact of each link is set once a control
+step. It obeys the rule of `entities.contact`, α(1 + m) < 2; what is stiffer than the
+contact with the rigid wall has that contact's law.
 """
-
-from __future__ import annotations
 
 import dataclasses
 import math
 
 import numpy as np
+from numpy.random import RandomState
 
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import CONTACT_SOLIMP, CONTACT_SOLREF
-from cathsim_dmc.physics.drawn import Range, drawable, drawn
-from cathsim_dmc.physics.effects import Effect, World
+from cathsim_dmc.physics.effects import Effect, Episode, World
 from cathsim_dmc.physics.flow import Flow
-from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
 from cathsim_dmc.physics.readings import Readings
 
 STIFFENING = 3e-3  # m, indentation from which the wall is as stiff as it gets
@@ -64,12 +50,12 @@ class WallOptions:
             oval, or between.
     """
 
-    modulus: Range = 0.45e6
-    thickness: Range | None = None
-    support: Range = 1.0
+    modulus: Drawn = 0.45e6
+    thickness: Drawn | None = None
+    support: Drawn = 1.0
 
     def __post_init__(self):
-        drawable(self, _LIMITS)
+        check_drawn(self, _LIMITS)
 
 
 def rigid_stiffness(weight: np.ndarray) -> np.ndarray:
@@ -106,9 +92,7 @@ class Wall(Effect):
         self._radius = np.zeros((count, len(links)))
         self._material = np.ones((count, len(_LIMITS)))
 
-    def restart(
-        self, index: int, episode: Episode, random_state: np.random.RandomState
-    ) -> None:
+    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Draws what the wall is made of."""
         self._radius[index] = 0.0
         given = [getattr(self._options, name) for name in _LIMITS]
@@ -163,14 +147,12 @@ def contacts(radius, material, geoms, weight, rigid, laws, relaxation, solref, s
     Args:
         radius: (n,) of the lumen around them, m, 0 for none.
         material: (3,) modulus, thickness and support.
-        geoms: (n,) numbers of the links' geoms.
-        weight: (n,) inverse weights, 1/kg.
-        rigid: (n,) stiffness of the rigid wall's contact, N/m.
+        geoms, weight, rigid: (n,) numbers of the links' geoms, inverse weights, 1/kg,
+            and stiffness of the rigid wall's contact, N/m.
         laws: (2, 7) of the rigid wall and of one that gives: `solimp`, then `solref`,
             that of the latter not used.
         relaxation: of a wall that gives, s.
-        solref: (ngeom, 2), written.
-        solimp: (ngeom, 5), written.
+        solref, solimp: (ngeom, 2 and 5), written.
     """
     first, last = laws[1, 0], laws[1, 1]
     for n in range(len(geoms)):

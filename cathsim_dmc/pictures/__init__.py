@@ -78,5 +78,5 @@ def fluoroscopy(env: Any, seed: int = 0, **options: Any) -> np.ndarray:
     """
     from cathsim_dmc.pictures.moment import xray
 
-    base: FluoroscopyOptions = navigation_of(env).config.fluoroscopy_options
+    base: FluoroscopyOptions = navigation_of(env).config.fluoroscopy
     return xray(Moment.of(env), dataclasses.replace(base, **options), seed)

@@ -122,7 +122,7 @@ def write(
 
 def film_options(task: Any) -> FluoroscopyOptions:
     """The task's own X-ray view and a second plane, in the size of a screen."""
-    options = task.config.fluoroscopy_options
+    options = task.config.fluoroscopy
     return dataclasses.replace(
         options,
         size=_FILM_SIZE,

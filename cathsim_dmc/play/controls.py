@@ -62,7 +62,7 @@ class Controls:
     def of(cls, scene: Scene) -> "Controls":
         """The controls of the devices in a scene."""
         chain = scene.catheter
-        if scene.coaxial:
+        if scene.catheter.coaxial:
             return cls(devices=len(chain.devices))
         return cls(len(chain.tip_motors) // 2, chain.rotation is not None)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc.physics.readings import merged, part
 from cathsim_dmc.policies.attempts import State
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
 from cathsim_dmc.policies.policy import Policy
@@ -16,7 +17,6 @@ from cathsim_dmc.policies.pursuit import Plan
 from cathsim_dmc.policies.view import View
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.route import locate
-from cathsim_dmc.tasks.rows import merged, part
 
 
 class _Plans:
@@ -33,7 +33,7 @@ class _Plans:
         state = rollout.resting, rollout.wall_force, rollout.devices
         for case in dict.fromkeys(cases):
             if case not in self._plans:
-                kind = CoaxialPlan if case.scene.coaxial else Plan
+                kind = CoaxialPlan if case.scene.catheter.coaxial else Plan
                 self._plans[case] = kind.for_case(case)
             rows = np.array([i for i, one in enumerate(cases) if one is case])
             yield self._plans[case], rows, tuple(part(one, rows) for one in state)

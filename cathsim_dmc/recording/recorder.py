@@ -194,7 +194,7 @@ class EpisodeRecorder:
             "control_timestep": float(self._env.control_timestep()),
             "action_names": self._env.action_spec().name.split("\t"),
             "body_names": [model.id2name(i, "body") for i in range(model.nbody)],
-            "catheter_radius": [float(task.scene.device.outer_radius)]
+            "catheter_radius": [float(task.scene.catheter.device.outer_radius)]
             * len(task.scene.catheter.links),
             **{name: rows[name] for name in peaks},
             "reward_terms": {

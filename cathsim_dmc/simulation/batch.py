@@ -18,7 +18,8 @@ from mujoco import batch as mujoco_batch
 
 from cathsim_dmc import bounds
 from cathsim_dmc.physics import forces
-from cathsim_dmc.physics.stepper import Anatomic, Stepper
+from cathsim_dmc.physics.stepper import Stepper
+from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.step import Step
@@ -212,7 +213,7 @@ class _BatchStepper(Stepper):
             getattr(self._copy, name)[:] = self.batch.expand(name)[index]
         return self._copy
 
-    def load(self, index: int, case: Anatomic) -> None:
+    def load(self, index: int, case: Case) -> None:
         """There is one anatomy."""
 
     def states(self) -> np.ndarray:
@@ -254,14 +255,14 @@ class _PoolStepper(_BatchStepper):
         model = self.batch.model
         self._own = own
         self._models = [copy.copy(model) if own else model for _ in self.rows]
-        self._loaded: dict[int | Anatomic, Any] = {}
+        self._loaded: dict[int | Case, Any] = {}
 
     field = Stepper.field
 
     def _model_of(self, index: int) -> mujoco.MjModel:
         return self._models[index]
 
-    def load(self, index: int, case: Anatomic) -> None:
+    def load(self, index: int, case: Case) -> None:
         if self._own:
             if self._loaded.get(index) is not case:
                 case.write(self._models[index])

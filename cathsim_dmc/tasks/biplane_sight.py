@@ -12,7 +12,7 @@ from cathsim_dmc.imaging import biplane
 from cathsim_dmc.imaging import biplane_loops as loops
 from cathsim_dmc.imaging.biplane import Biplane
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
-from cathsim_dmc.tasks.route import AHEAD, Route, into_frame, locate
+from cathsim_dmc.tasks.route import Route, into_frame, look_ahead
 
 # A device with fewer points counts as lost.
 _FEWEST = 7
@@ -53,9 +53,6 @@ class BiplaneSight:
             handles: (K, 3, 3), orientation of the handle, its axes in columns.
             numbers: (K,) of the simulations.
             fresh: Whether they begin an episode.
-
-        Returns:
-            Arrays (K, ...) by name, m, in the frame of the tip.
         """
         rows = []
         for k, number in enumerate(numbers.tolist()):
@@ -113,12 +110,11 @@ def _seen(
     back = (line[-1] - line[-2]) / biplane.TRACE_SPACING
     device = np.stack([np.interp(places, ways, axis) for axis in line.T], axis=1)
     device = device + beyond * back
-    place = locate(route, head)
-    ahead = place.arc_length + AHEAD
+    ahead = look_ahead([route], np.zeros(1, int), head[None], frame[None])
     return {
-        "points": into_frame(route.at(ahead) - head, frame).ravel(),
-        "radii": np.interp(ahead, route.arc_length, route.radii),
+        "points": ahead.points.ravel(),
+        "radii": ahead.radii[0],
         "goal": into_frame((goal - head)[None], frame)[0],
         "device": into_frame(device - head, frame).ravel(),
-        "deviation": np.atleast_1d(place.excess),
+        "deviation": ahead.excess,
     }

@@ -1,9 +1,7 @@
 """Cases of a task: anatomies that take turns in one compiled model.
 
-All anatomies are compiled once. Wherever their models differ, in the key of the wall's
-field and in where device and sheath stand, the fields are kept and written into the
-model of the first: nothing is compiled when an episode gets another anatomy, and
-everything that was bound to the model stays bound.
+All anatomies are compiled once. What differs between their models is kept and written
+into the model of the first, and everything that was bound to that stays bound.
 """
 
 import functools
@@ -14,7 +12,6 @@ import numpy as np
 
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.imaging.angiograph import Angiograph
-from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.chain_fields import write_still
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
@@ -40,7 +37,6 @@ class Case:
         objective: Objective,
         model: mujoco.MjModel,
         config: NavigationConfig,
-        fluoroscopy: FluoroscopyOptions | None = None,
         fields: Fields | None = None,
     ):
         """Lets the device settle; `write` writes the fields into a model."""
@@ -48,11 +44,8 @@ class Case:
         index = ModelIndex(model, scene.catheter, scene.robot)
         if isinstance(scene.catheter, DeviceStack):
             write_still(scene.catheter, model)
-        farthest = config.ranges.farthest_insertion
-        self.start = StartPosture(
-            scene, model, index, config.start_along_route, farthest
-        )
-        self._fluoroscopy = fluoroscopy
+        self.start = StartPosture(scene, model, index, config)
+        self._fluoroscopy = config.fluoroscopy
         self.fields = fields or {}
         self._statistics = {n: np.copy(getattr(model.stat, n)) for n in _STATISTICS}
 
@@ -64,17 +57,13 @@ class Case:
             getattr(model, name)[: len(value)] = value
 
     @functools.cached_property
-    def angiograph(self) -> Angiograph | None:
-        """The angiography machine before this anatomy; None where there is none."""
-        if self._fluoroscopy is None:
-            return None
+    def angiograph(self) -> Angiograph:
+        """The angiography machine before this anatomy."""
         return Angiograph(self.scene.anatomy.surface, self._fluoroscopy)
 
 
 def compile_together(
-    rooms: Iterable[tuple[Scene, Objective]],
-    config: NavigationConfig,
-    fluoroscopy: FluoroscopyOptions | None = None,
+    rooms: Iterable[tuple[Scene, Objective]], config: NavigationConfig
 ) -> tuple[Case, ...]:
     """Compiles scenes so that any of them can be written into a model of the first.
 
@@ -84,7 +73,6 @@ def compile_together(
         rooms: Scenes of one device, not compiled yet, with success and reward in each;
             the first one alone is drawn.
         config: Options of the task.
-        fluoroscopy: Set-up of the angiography machines, None for none.
 
     Raises:
         ValueError: if the scenes differ in more than wall and places.
@@ -102,7 +90,7 @@ def compile_together(
         else:
             fields = _differences(host, model, scene, first)
             sizes |= {name: len(value) for name, value in fields.items()}
-        case = Case(scene, objective, model, config, fluoroscopy, fields)
+        case = Case(scene, objective, model, config, fields)
         case.scene = first.in_anatomy(scene)
         scene.anatomy.lumen.release()
         found.append(case)

@@ -58,10 +58,9 @@ class CommonChain:
         self._share = np.round(share, 9)[:, None]  # without rounding errors at joints
 
     def joints(self, values: np.ndarray) -> np.ndarray:
-        """Values (..., J) of the joints shown, from those (..., j) of the chain.
+        """Values (..., J) of the joints shown, of those (..., j) of the chain.
 
-        Base and torsion come first, then the bending hinges, of which those behind the
-        simulated links are 0.
+        Base and torsion come first, then the bending hinges, 0 behind the simulated.
         """
         taken = values.take(self._joints, axis=-1)
         taken[..., self._missing] = 0.0

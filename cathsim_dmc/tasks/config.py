@@ -3,8 +3,7 @@
 import copy
 import dataclasses
 import warnings
-from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -25,7 +24,6 @@ from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, PHYSICS_TIMESTEP
 from cathsim_dmc.physics.vessel import VesselOptions
 
 MAX_STEPS = 2000  # published
-_MOST_JOINTS = 1000
 WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
 _FRICTION = (0.0, 2.0)  # Coulomb coefficient
 # Least and largest numbers. A link is longer than its radius and shorter than the
@@ -41,7 +39,7 @@ _NUMBERS = {
 _LONGEST_TIMESTEP = 5e-3  # s
 _STIFFEST = 5e-3  # N·m², EI
 # Composer does the last two of them itself.
-_FEWEST_SUBSTEPS, _MOST_SUBSTEPS = 2, 1000
+_SUBSTEPS = (2, 1000)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,8 +60,6 @@ class NavigationConfig:
         max_steps: Number of control steps until the episode is truncated.
         friction: Coulomb coefficient between device and wall.
         shaft_link: Length of the longest link of the shaft, m.
-        torsion_joints: Number of torsion hinges along the shaft; None for 4 with
-            rotation and a torsionally rigid shaft without.
         working_length: Simulated length of the device, m; None for what the goal needs.
             Observations have one shape whatever it is.
         physics_timestep: Length of a physics step, s; it divides the control step.
@@ -91,30 +87,29 @@ class NavigationConfig:
     max_steps: int = MAX_STEPS
     friction: float = FRICTION
     shaft_link: float = 0.0175
-    torsion_joints: int | None = None
     working_length: float | None = None
     physics_timestep: float = PHYSICS_TIMESTEP
     outside_range: bool = False
-    fluoroscopy: FluoroscopyOptions | Mapping[str, Any] = FluoroscopyOptions()
-    endoluminal_size: int | Sequence[int] = 128
-    randomisation: Randomisation | Mapping[str, Any] | bool = False
+    # With the types that they have after validation.
+    fluoroscopy: FluoroscopyOptions = FluoroscopyOptions()
+    endoluminal_size: tuple[int, int] = (128, 128)
+    randomisation: Randomisation = Randomisation()
     effects: Sequence[Effect] = ()
-    vessel: str | Mapping[str, Any] | VesselOptions = "rigid"
+    vessel: VesselOptions = VesselOptions()
 
     def __post_init__(self):
         self._check_devices()
         self._check_numbers()
         self._check_range()
-        for name, made in (
-            (
-                "fluoroscopy",
-                bounds.made("fluoroscopy", self.fluoroscopy, FluoroscopyOptions),
+        vars(self).update(
+            fluoroscopy=bounds.made(
+                "fluoroscopy", self.fluoroscopy, FluoroscopyOptions
             ),
-            ("randomisation", Randomisation.make(self.randomisation)),
-            ("vessel", VesselOptions.make(self.vessel)),
-        ):
-            object.__setattr__(self, name, made)
-        if self.start_along_route is not None and self.ranges.start_insertion:
+            endoluminal_size=bounds.pixels("endoluminal_size", self.endoluminal_size),
+            randomisation=Randomisation.make(self.randomisation),
+            vessel=VesselOptions.make(self.vessel),
+        )
+        if self.start_along_route is not None and self.randomisation.start_insertion:
             raise ValueError(
                 "start_along_route and randomisation start_insertion both say where an "
                 "episode begins; leave one of the two out"
@@ -125,34 +120,12 @@ class NavigationConfig:
         ):
             bounds.refuse("effects", self.effects, "a list of physics.effects.Effect")
 
-    # Fields with their types after validation.
-
-    @property
-    def ranges(self) -> Randomisation:
-        """`randomisation` as an object."""
-        return cast(Randomisation, self.randomisation)
-
-    @property
-    def fluoroscopy_options(self) -> FluoroscopyOptions:
-        """`fluoroscopy` as an object."""
-        return cast(FluoroscopyOptions, self.fluoroscopy)
-
-    @property
-    def endoluminal_resolution(self) -> tuple[int, int]:
-        """(rows, columns) of endoluminal views."""
-        return bounds.pixels("endoluminal_size", self.endoluminal_size)
-
-    @property
-    def vessel_options(self) -> VesselOptions:
-        """`vessel` as an object."""
-        return cast(VesselOptions, self.vessel)
-
     def effects_on(self, chain: Chain) -> list[Effect]:
         """The effects of one rollout, in the order in which they act."""
         own = [copy.copy(effect) for effect in self.effects]
-        delay = ActionDelay(self.ranges.longest_delay)
-        model = RandomisedModel(self.ranges)
-        blood, walls = self.vessel_options.effects()
+        delay = ActionDelay(self.randomisation.longest_delay)
+        model = RandomisedModel(self.randomisation)
+        blood, walls = self.vessel.effects()
         return [blood, model, delay, *walls, *own, devices_of(chain)]
 
     def _check_devices(self):
@@ -167,7 +140,7 @@ class NavigationConfig:
                 "['wire_035_glide', 'berenstein_5f']",
             )
         object.__setattr__(self, "devices", tuple(self.devices))
-        for name in ("device", "rotation", "torsion_joints"):
+        for name in ("device", "rotation"):
             if getattr(self, name) != getattr(type(self), name):
                 raise ValueError(
                     f"{name} is {getattr(self, name)!r}, but devices is "
@@ -181,18 +154,12 @@ class NavigationConfig:
                 bounds.number(name, value, *limits)
         bounds.switch("rotation", self.rotation)
         bounds.whole("max_steps", self.max_steps, 1, bounds.MOST_STEPS)
-        bounds.pixels("endoluminal_size", self.endoluminal_size)
         if (shares := self.start_along_route) is not None:
             bounds.interval("start_along_route", shares, 0.0, bounds.MOST_START_SHARE)
-        if self.torsion_joints is not None:
-            bounds.whole("torsion_joints", self.torsion_joints, 0, _MOST_JOINTS)
         timestep = bounds.number("physics_timestep", self.physics_timestep)
-        substeps = CONTROL_TIMESTEP / timestep if timestep else 0
-        least, most = _FEWEST_SUBSTEPS, _MOST_SUBSTEPS
-        if not (
-            least - 1e-6 <= substeps <= most + 1e-6
-            and abs(substeps - round(substeps)) < 1e-6
-        ):
+        substeps, (least, most) = CONTROL_TIMESTEP / (timestep or np.inf), _SUBSTEPS
+        whole = round(substeps)
+        if not least <= whole <= most or abs(substeps - whole) >= 1e-6:
             bounds.refuse(
                 "physics_timestep",
                 self.physics_timestep,
@@ -223,11 +190,11 @@ class NavigationConfig:
 
     def _check_views(self):
         """Check that the C-arms are possible at the largest deviations of the view."""
-        view = self.ranges.view
+        view = self.randomisation.view
         ends = view if isinstance(view, Sequence) else (0.0,)
         for deviation in {round(end) for end in ends}:
             try:
-                self.fluoroscopy_options.carms(np.zeros((1, 3)), (deviation, deviation))
+                self.fluoroscopy.carms(np.zeros((1, 3)), (deviation, deviation))
             except ValueError as error:
                 raise ValueError(
                     f"randomisation: view is {view!r}, but fluoroscopy has no view "

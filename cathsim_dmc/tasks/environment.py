@@ -13,14 +13,10 @@ _SETTINGS = ("buffer_size", "delay", "aggregator", "corruptor")
 class Environment(composer.Environment):
     """`composer.Environment`, but for the first reset and plain steps.
 
-    Composer compiles at construction and once more at the first reset, for tasks that
-    change their MJCF model before an episode. Where nothing does and
-    `recompile_mjcf_every_episode` is off, the first model is kept: an environment is
-    there in two thirds of the time, and `physics` stays what it is. What is to change
-    in the MJCF model changes before the environment is made, see `suite.environment`.
-
-    Where nobody but the task does anything between physics steps, and no observable is
-    delayed, buffered or of an entity, these steps run in one loop.
+    Composer compiles at construction and once more at the first reset. Where nothing
+    changes the MJCF model in between, the first model is kept. Where nobody but the
+    task does anything between physics steps, and no observable is delayed, buffered or
+    of an entity, these steps run in one loop.
     """
 
     _plain = False

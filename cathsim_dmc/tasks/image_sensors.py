@@ -8,55 +8,43 @@ from cathsim_dmc.imaging import angiograph as angiographs
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.biplane_sight import BiplaneSight
+from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.common_chain import CommonChain
-from cathsim_dmc.tasks.observation_kind import BIPLANE
+from cathsim_dmc.tasks.observation_kind import BIPLANE, FLUOROSCOPY
 
 
 class ImageSensors:
     """Captures the images that the observations ask for, of N simulations.
 
     Attributes:
-        planes: Of the machine before each simulation; empty without fluoroscopy.
+        planes: Of the machine before each simulation; none without fluoroscopy.
         images: The last images (N, ...) by name; "past_1" is the one before "past_0".
     """
 
     def __init__(
-        self,
-        names: Sequence[str],
-        angiograph: angiographs.Angiograph | None,
-        num_simulations: int,
-        chain: CommonChain,
+        self, names: Sequence[str], case: Case, num_simulations: int, chain: CommonChain
     ):
         """Prepares the sensors.
 
         Args:
             names: Of the observations.
-            angiograph: Angiography machine; None without fluoroscopic observations.
+            case: With the angiography machine before the first episode.
             num_simulations: N.
             chain: The device as observations show it.
         """
         self._names, self._chain, self._count = names, chain, num_simulations
         self.planes: list[angiographs.Planes] = []
         self._sight, self._noise = BiplaneSight(num_simulations), False
-        if angiograph is not None:
-            self.planes = [angiograph.planes()] * num_simulations
-            self._noise = angiograph.options.noise
-            if observations.needs(names, BIPLANE) and angiograph.options.planes < 2:
+        if observations.needs(names, FLUOROSCOPY, BIPLANE):
+            options = case.angiograph.options
+            self.planes = [case.angiograph.planes()] * num_simulations
+            self._noise = options.noise
+            if observations.needs(names, BIPLANE) and options.planes < 2:
                 raise ValueError(
                     "the observation 'biplane' needs two planes: give fluoroscopy a "
                     "biplane, such as {'view': [60, 0], 'biplane': [-30, 0]}"
                 )
         self.images: dict[str, np.ndarray] = {}
-
-    def restart(
-        self,
-        index: int,
-        angiograph: angiographs.Angiograph | None,
-        deviation: angiographs.Deviation,
-    ) -> None:
-        """Begins an episode of one simulation with its machine and its deviation."""
-        if angiograph is not None:
-            self.planes[index] = angiograph.planes(deviation)
 
     def capture(
         self,
@@ -75,7 +63,7 @@ class ImageSensors:
             begins: Whether they begin an episode: the images fill their history. All
                 are captured otherwise.
             points: Centrelines of the chains (N, n, 3), tracked points of coaxial
-                devices (N, m, 3), and goals (3,) or (N, 3), m.
+                devices (N, m, 3), and goals (N, 3), m.
             handles: (N, 3, 3), orientation of the handles, axes in columns.
             random_states: N sources of quantum noise, None for images without.
             around: Moves the vessel before the machine of a simulation.
@@ -95,10 +83,9 @@ class ImageSensors:
                 else:
                     self.images[f"past_{age}"] = self.images[f"past_{age - 1}"].copy()
             if self._wants("biplane"):
-                ends = np.broadcast_to(points[-1], (self._count, 3))[rows, None]
                 # The roadmaps show the vessel at rest.
                 resting = [self.planes[index] for index in rows]
-                marked = angiographs.pixels(resting, ends)[:, :, 0]
+                marked = angiographs.pixels(resting, points[-1][rows, None])[:, :, 0]
                 given = resting, image, marked, handles[rows], rows, begins
                 for key, value in self._sight.see(*given).items():
                     self.hold(f"biplane_{key}", value, rows)
@@ -106,8 +93,7 @@ class ImageSensors:
             self.hold("masks", angiographs.masks(planes, own), rows)
         if self._wants("tracking_2d"):
             line, devices, goal = points
-            goal = np.broadcast_to(goal, (self._count, 3))[rows, None]
-            seen = self._chain.tracked(line[rows]), devices[rows], goal
+            seen = self._chain.tracked(line[rows]), devices[rows], goal[rows, None]
             pixels = angiographs.pixels(planes, np.concatenate(seen, axis=-2))
             self.hold("pixels", pixels, rows)
 

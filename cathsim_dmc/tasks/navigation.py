@@ -12,20 +12,14 @@ from dm_control import composer
 from cathsim_dmc import bounds
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.effects import Effect
-from cathsim_dmc.physics.readings import CoaxialReadings
+from cathsim_dmc.physics.readings import CoaxialReadings, part
 from cathsim_dmc.physics.stepper import SingleStepper, Stepper
 from cathsim_dmc.tasks import cases, observations
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective, Shiftable
-from cathsim_dmc.tasks.observation_kind import (
-    BIPLANE,
-    FLUOROSCOPY,
-    FrameObservable,
-    Sizes,
-)
+from cathsim_dmc.tasks.observation_kind import FrameObservable, Sizes
 from cathsim_dmc.tasks.rollout import Rollout
-from cathsim_dmc.tasks.rows import part
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.step import Step, info_types
 
@@ -83,30 +77,29 @@ class Navigation(composer.Task):
         self._objective = objective
         self.config = config = config or NavigationConfig()
         self._random_state = bounds.random_state("random", random)
-        if config.ranges.goal_shift and not isinstance(objective, Shiftable):
+        if config.randomisation.goal_shift and not isinstance(objective, Shiftable):
             raise ValueError(
                 f"randomisation shifts the goal, but {type(objective).__name__} has no "
                 "shifted(shift): derive it from tasks.objectives.Shiftable, or leave "
                 "goal_shift out"
             )
         self.num_actions = len(scene.catheter.action_names)
-        living = config.vessel_options.living
-        self._names = observations.resolve(config.observation, scene.coaxial, living)
-        self._fluoroscopy = None
-        if observations.needs(self._names, FLUOROSCOPY, BIPLANE):
-            self._fluoroscopy = config.fluoroscopy_options
+        living = config.vessel.living
+        self._names = observations.resolve(
+            config.observation, scene.catheter.coaxial, living
+        )
         self.set_timesteps(CONTROL_TIMESTEP, config.physics_timestep)
         self._cases: tuple[cases.Case, ...] = ()
         if others is not None:
             rooms = itertools.chain([(scene, objective)], others)
-            self._cases = cases.compile_together(rooms, config, self._fluoroscopy)
+            self._cases = cases.compile_together(rooms, config)
         self._compiled = False
         self._observables = None
         self._step: Step | None = None
 
     def make_rollout(self, model: mujoco.MjModel, stepper: Stepper) -> Rollout:
         """The course of the task's episodes; see `Rollout`."""
-        own = self._scene, self._objective, model, self.config, self._fluoroscopy
+        own = self._scene, self._objective, model, self.config
         chosen = self._cases or [cases.Case(*own)]
         return Rollout(chosen, self.config, model, stepper)
 
@@ -167,16 +160,16 @@ class Navigation(composer.Task):
             actions=self.num_actions,
             joints=common.num_joints,
             links=common.num_links,
-            devices=len(chain.devices) if self._scene.coaxial else 0,
-            fluoroscopy=config.fluoroscopy_options,
-            endoluminal=config.endoluminal_resolution,
+            devices=len(chain.devices) if self._scene.catheter.coaxial else 0,
+            fluoroscopy=config.fluoroscopy,
+            endoluminal=config.endoluminal_size,
         )
         return observations.entry_specs(self._names, sizes)
 
     @property
     def info_types(self) -> dict[str, type]:
         """Type of each figure of `info`: float or bool."""
-        return info_types(self._objective.terms, self.config.vessel_options.living)
+        return info_types(self._objective.terms, self.config.vessel.living)
 
     def action_spec(self, physics) -> dm_env.specs.BoundedArray:
         """Bounds [-1, 1] for each actuator."""
@@ -204,7 +197,7 @@ class Navigation(composer.Task):
         self._step = None
         self.rollout.begin(_ONLY, [random_state])
         goal = self._scene.phantom.goals.get(self._scene.goal.name)
-        if goal is not None and self.config.ranges.goal_shift:
+        if goal is not None and self.config.randomisation.goal_shift:
             physics.bind(goal).pos = self.goal_position
 
     def before_step(self, physics, action, random_state):

@@ -13,7 +13,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Centreline, Goal
 from cathsim_dmc.anatomy.geodesic import LumenDistance
 from cathsim_dmc.physics import forces, readings
-from cathsim_dmc.tasks.rows import part
+from cathsim_dmc.physics.readings import part
 
 _NOTHING = np.zeros(())
 GOAL_RADIUS = 8e-3  # m, δ of the published task

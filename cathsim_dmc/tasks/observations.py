@@ -9,10 +9,10 @@ import numpy as np
 
 from cathsim_dmc.imaging.options import FARTHEST_WALL
 from cathsim_dmc.physics.sliding import DEVICE_PLACES
-from cathsim_dmc.tasks.coaxial_observations import COAXIAL_OBSERVATIONS
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
 from cathsim_dmc.tasks.observation_kind import (
     BIPLANE,
+    COAXIAL,
     FLUOROSCOPY,
     LIVING,
     ROUTE,
@@ -32,7 +32,7 @@ SEQUENCE_LENGTH = 3
 OBSERVATIONS = ObservationTable()
 
 
-_actions, _joints = map(attrgetter, ("actions", "joints"))
+_actions, _joints, _devices = map(attrgetter, ("actions", "joints", "devices"))
 
 
 def _fluoroscopic(key: str, channels: int, unit: str, meaning: str) -> Entry:
@@ -205,38 +205,24 @@ def tracking_2d(frame: Frame) -> Observation:
     }
 
 
-def _ahead(
-    name: str, way: str, lumen: str, goal: str, device: str, inside: str
-) -> tuple[Entry, ...]:
+def _ahead(name: str, way: str) -> tuple[Entry, ...]:
     """Entries of a route ahead, whose names begin with `name`."""
     places = f"every {1e3 * AHEAD[1]:g} mm from the place of the head on, tip frame"
-    count = TRACKED_POINTS - 1
-    device = f"along the device{device}, proximal to the head and without it, tip frame"
-    out = f"by how much the head is out of {inside}, in radii there; negative inside"
+    points, count = f"{len(AHEAD)} points of {way}, {places}", TRACKED_POINTS - 1
+    device = "points along the device, proximal to the head and without it, tip frame"
+    out = "by how much the head is out of the lumen, in radii there; negative inside"
     return (
-        Entry(
-            f"{name}_points",
-            3 * len(AHEAD),
-            "m",
-            f"{len(AHEAD)} points of {way}, {places}",
-        ),
-        Entry(f"{name}_radii", len(AHEAD), "m", f"of the lumen {lumen}", 0),
-        Entry(f"{name}_goal", 3, "m", f"{goal}, tip frame"),
-        Entry(f"{name}_device", 3 * count, "m", f"{count} points {device}"),
+        Entry(f"{name}_points", 3 * len(AHEAD), "m", points),
+        Entry(f"{name}_radii", len(AHEAD), "m", "of the lumen at these points", 0),
+        Entry(f"{name}_goal", 3, "m", "centre of the goal, tip frame"),
+        Entry(f"{name}_device", 3 * count, "m", f"{count} {device}"),
         Entry(f"{name}_deviation", 1, "radius", out, -1),
         _action(f"{name}_action"),
     )
 
 
 @OBSERVATIONS.row(
-    *_ahead(
-        "route",
-        way="the centreline of the route",
-        lumen="at these points",
-        goal="centre of the goal",
-        device="",
-        inside="the lumen of the route",
-    ),
+    *_ahead("route", "the centreline of the route"),
     needs=ROUTE,
     joined=("drives", "devices"),
 )
@@ -257,17 +243,7 @@ def route(frame: Frame) -> Observation:
     }
 
 
-@OBSERVATIONS.row(
-    *_ahead(
-        "biplane",
-        way="the route through both roadmaps",
-        lumen="there in the roadmaps",
-        goal="goal marker of both planes",
-        device=" in both live images",
-        inside="the route through the roadmaps",
-    ),
-    needs=BIPLANE,
-)
+@OBSERVATIONS.row(*_ahead("biplane", "the route through both roadmaps"), needs=BIPLANE)
 def biplane(frame: Frame) -> Observation:
     """The entries of `route`, reconstructed from the images of two planes."""
     parts = "points", "radii", "goal", "device", "deviation"
@@ -338,32 +314,67 @@ def vessel(frame: Frame) -> Observation:
     }
 
 
-def _endoluminal(
-    key: str, unit: str, meaning: str, high: float, dtype: type[np.number]
-) -> Entry:
-    def shape(sizes: Sizes) -> tuple[int, ...]:
-        return (*sizes.endoluminal, 1)
-
-    meaning += ", over a right angle from the head along its axis; right and down: x "
-    meaning += "and y of the tip frame"
-    return Entry(key, shape, unit, meaning, 0, high, dtype)
-
-
-_shown(
-    _endoluminal(
-        "endoluminal", "grey level", "wall lit by a lamp at the head", 255, np.uint8
-    )
-)
-_shown(
-    _endoluminal(
+for _key, _unit, _seen, _high, _dtype in (
+    ("endoluminal", "grey level", "wall lit by a lamp at the head", 255, np.uint8),
+    (
         "endoluminal_distance",
         "m",
         "way to the wall along the ray of each pixel",
         FARTHEST_WALL,
         np.float32,
-    )
-)
+    ),
+):
+    _seen += ", over a right angle from the head along its axis; right and down: x and "
+    _seen += "y of the tip frame"
+    _shown(Entry(_key, lambda s: (*s.endoluminal, 1), _unit, _seen, 0, _high, _dtype))
 
-OBSERVATIONS.update(COAXIAL_OBSERVATIONS)
+
+@OBSERVATIONS.row(
+    Entry(
+        "device_insertion",
+        _devices,
+        "m",
+        "of each device from the innermost outwards: way of its end, 0 where the "
+        "chain's end is at the start of the stroke",
+    ),
+    Entry("device_rotation", _devices, "rad", "of the rotary unit of each device"),
+    needs=COAXIAL,
+)
+def drives(frame: Frame) -> Observation:
+    """How far the operator has pushed and turned each coaxial device."""
+    state = frame.devices
+    assert state is not None
+    return {"device_insertion": state.insertion, "device_rotation": state.rotation}
+
+
+@OBSERVATIONS.row(
+    Entry("device_tip_rotation", _devices, "rad", "of the end of each device"),
+    Entry(
+        "device_points",
+        lambda sizes: 3 * sizes.devices * len(DEVICE_PLACES),
+        "m",
+        f"{len(DEVICE_PLACES)} points along each device, every "
+        f"{1e3 * DEVICE_PLACES[-2]:g} mm, proximal to its end, world frame",
+    ),
+    Entry(
+        "device_load",
+        2,
+        "N",
+        "axial force in the device that reaches farthest where it leaves the others, "
+        "and friction between the devices",
+    ),
+    needs=COAXIAL,
+)
+def devices(frame: Frame) -> Observation:
+    """Shape of each coaxial device and the load on it."""
+    state = frame.devices
+    assert state is not None
+    return {
+        "device_tip_rotation": state.tip_rotation,
+        "device_points": flat(state.points, 3),
+        "device_load": np.stack([state.leading_load, state.lumen_friction], axis=-1),
+    }
+
+
 resolve, observe, needs = OBSERVATIONS.resolve, OBSERVATIONS.observe, OBSERVATIONS.needs
 entries, entry_specs = OBSERVATIONS.entries, OBSERVATIONS.entry_specs

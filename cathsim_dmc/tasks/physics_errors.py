@@ -22,21 +22,17 @@ _MOUTH = 2e-3
 MAX_FORCE = 50.0
 
 
-def escaped(
-    anatomy: Anatomy, centreline: np.ndarray, along: np.ndarray | None = None
-) -> np.ndarray:
+def escaped(anatomy: Anatomy, centreline: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Whether devices have left the lumen.
 
     Args:
         centreline: (..., n, 3), nodes of the devices, m, world frame.
-        along: (3,) unit vector of the sheath, which need not stand as the vessel does;
-            None for the inlet's direction.
+        along: (3,) unit vector of the sheath, which need not stand as the vessel does.
 
     Returns:
         (...) bool: some node past the inlet lies more than 2 mm outside the lumen.
     """
     inlet = anatomy.inlet
-    along = inlet.direction if along is None else along
     beyond = (centreline - inlet.position) @ along > _MOUTH
     # Farther from the inlet than the sheath reaches, a node may also lie behind the
     # plane of the inlet, in a vessel that turns back.
@@ -58,7 +54,7 @@ def find(
     """Physics errors of N simulations in the last control step.
 
     Args:
-        scene_of: function from the number of a simulation to its scene.
+        scene_of: gives the scene of a simulation by its number.
         diverged: (N,) bool, MuJoCo warned.
         steps: (N,), control steps of the episodes.
         centreline: (N, n, 3), nodes of the devices, m.

@@ -108,8 +108,7 @@ def place_device(
     route = anatomy.route(goal, farthest_shift)
     way = min(_way_to_branching(anatomy), anatomy.route(goal).length)
     start_depth = min(
-        device.tip_length + _FREE_LENGTH,
-        max(_LARGEST_SHARE * way, _LEAST_START_DEPTH),
+        device.tip_length + _FREE_LENGTH, max(_LARGEST_SHARE * way, _LEAST_START_DEPTH)
     )
     if working_length is None:
         needed = max(route.length, start_depth) + _SPARE_STROKE + _BASE_LENGTH

@@ -1,9 +1,6 @@
 """The course of an episode, for any number of simulations and whoever steps them.
 
-    begin → (forward pass) → start → command → (physics steps) → finish → command → …
-
-The composer environment steps a `Rollout` of one simulation, the batched simulation
-one of N; so both draw, command, judge and observe alike, bit for bit.
+begin → (forward pass) → start → command → (physics steps) → finish → command → …
 """
 
 import logging
@@ -12,16 +9,16 @@ from typing import cast
 
 import mujoco
 import numpy as np
+from numpy.random import RandomState
 
 from cathsim_dmc.imaging import endoluminal
 from cathsim_dmc.imaging.angiograph import Planes
 from cathsim_dmc.imaging.device import Shadow
-from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics import vessel as vessels
 from cathsim_dmc.physics.effects import Effects, World
 from cathsim_dmc.physics.motion import Moving
-from cathsim_dmc.physics.readings import CoaxialReadings, ModelIndex, Readings
+from cathsim_dmc.physics.readings import ModelIndex, Readings
 from cathsim_dmc.physics.sliding import SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, Stepper
 from cathsim_dmc.tasks import observations, physics_errors
@@ -62,12 +59,6 @@ class Rollout:
         vessel: State of the vessels; None for rigid ones with blood at rest.
     """
 
-    readings: Readings
-    resting: Readings
-    wall_force: forces.WallForce
-    devices: CoaxialReadings | None
-    vessel: vessels.VesselReadings | None
-
     def __init__(
         self,
         cases: Sequence[Case],
@@ -86,12 +77,14 @@ class Rollout:
         count, scene = stepper.num_simulations, cases[0].scene
         self._case_of = np.zeros(count, dtype=int)
         self._state = state = stepper.arrays
-        living = config.vessel_options.living
-        self._names = observations.resolve(config.observation, scene.coaxial, living)
+        living = config.vessel.living
+        self._names = observations.resolve(
+            config.observation, scene.catheter.coaxial, living
+        )
         self.index = ModelIndex(model, scene.catheter, scene.robot)
         self._read = self.index.reader(state)
         self._listed = listed = config.effects_on(scene.catheter)
-        stepper.deepest = config.vessel_options.deepest
+        stepper.deepest = config.vessel.deepest
         moving = [effect for effect in listed if isinstance(effect, Moving)]
         self.moving: Moving | None = moving[0] if moving else None
         self._devices = cast(SingleDevice, listed[-1])
@@ -109,11 +102,10 @@ class Rollout:
         if observations.needs(self._names, ROUTE):
             self._routes = [Route.of(case.objective) for case in cases]
         self._chain = CommonChain(scene.catheter, config.shaft_link)
-        machine = cases[0].angiograph
-        self._sensors = ImageSensors(self._names, machine, count, self._chain)
-        self._tracking = TrackingNoise(config.ranges.tracking_noise)
+        self._sensors = ImageSensors(self._names, cases[0], count, self._chain)
+        self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
-        self._random_states: list[np.random.RandomState] | None = None
+        self._random_states: list[RandomState] | None = None
         self._goal_shift = np.zeros(count)
         self.steps = np.zeros(count, dtype=int)
         self._action = np.zeros((count, len(scene.catheter.action_names)))
@@ -125,9 +117,7 @@ class Rollout:
 
     # The course of an episode.
 
-    def begin(
-        self, indices: np.ndarray, random_states: Sequence[np.random.RandomState]
-    ) -> None:
+    def begin(self, indices: np.ndarray, random_states: Sequence[RandomState]) -> None:
         """Draws new episodes and puts the devices to their start.
 
         A forward pass must follow, then `start`.
@@ -157,16 +147,16 @@ class Rollout:
             objective, rows = self._cases[number].objective, slice(None)
             if len(numbers) > 1:
                 rows = np.flatnonzero(self._case_of == number)
-            if self._config.ranges.goal_shift is not None:
+            if self._config.randomisation.goal_shift is not None:
                 # Navigation has made sure that it can be shifted.
                 shiftable = cast(Shiftable, objective)
                 objective = shiftable.shifted(self._goal_shift[rows])
             self.objectives.append((objective, rows))
             self.resting_goal[rows] = objective.goal
 
-    def _draw(self, index: int, random_state: np.random.RandomState) -> None:
+    def _draw(self, index: int, random_state: RandomState) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
-        ranges = self._config.ranges
+        ranges = self._config.randomisation
         number, episode = ranges.draw_in(random_state, len(self._cases))
         if len(self._cases) > 1:
             self.case(index).scene.anatomy.lumen.release()
@@ -174,10 +164,10 @@ class Rollout:
             self._stepper.load(index, self.case(index))
             self._effects.enter(index, self.case(index).scene.anatomy)
         case = self.case(index)
-        posture = case.start.draw(random_state)
-        case.start.write(self._state.qpos[index], episode, posture)
+        case.start.write(self._state.qpos[index], episode, random_state)
         self._effects.restart(index, episode, random_state)
-        self._sensors.restart(index, case.angiograph, episode.deviation)
+        if self._sensors.planes:
+            self._sensors.planes[index] = case.angiograph.planes(episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
 
     def _pose_robot(self) -> None:
@@ -242,13 +232,7 @@ class Rollout:
         return state if self.moving is None else self.moving.at_rest(state)
 
     def _step(self, rows: np.ndarray, begins: bool = False) -> Step:
-        """Judges and observes what was measured.
-
-        Args:
-            rows: (K,) numbers of the simulations whose images are captured: all, or
-                those that have just begun an episode.
-            begins: Whether these have begun an episode, so that none ends.
-        """
+        """Judges and observes; captures images of all, or of those that have begun."""
         actions = self._action, self._previous_action
         distance = straight(self.resting.head, self.resting_goal)
         failed = np.array([error is not None for error in self._errors])
@@ -309,16 +293,11 @@ class Rollout:
             [rest if moving is None else moving.warp(index) for index in indices],
             state.head[indices],
             state.head_frame[indices],
-            self._config.endoluminal_resolution,
+            self._config.endoluminal_size,
         )
         return {"endoluminal": grey, "endoluminal_distance": distance}
 
     # What others may read.
-
-    @property
-    def repeated(self) -> np.ndarray:
-        """Number (N,) of control steps done again in shorter physics steps, a view."""
-        return self._stepper.repeated
 
     def case(self, index: int = 0) -> Case:
         """Anatomy and objective of the episode of one simulation."""
@@ -332,7 +311,7 @@ class Rollout:
 
     def around(self, planes: Planes, index: int = 0) -> Planes:
         """A machine's planes with one simulation's vessel where it is now."""
-        if self.moving is None:
+        if self.moving is None or self._random_states is None:  # at rest until then
             return planes
         surface = self.moving.surface(index)
         return tuple(plane.around(surface) for plane in planes)
@@ -346,8 +325,3 @@ class Rollout:
     def slipped(self) -> np.ndarray:
         """Way by which the clamps have slipped, see `SingleDevice.slipped`."""
         return self._devices.slipped.copy()
-
-    @property
-    def fluoroscope(self) -> Fluoroscope | None:
-        """Frontal C-arm of the first simulation, or None without fluoroscopy."""
-        return self._sensors.planes[0][0] if self._sensors.planes else None

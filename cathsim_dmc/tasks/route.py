@@ -52,19 +52,16 @@ class Route:
         return np.stack(axes, axis=-1) + beyond[..., None] * last
 
 
-@dataclasses.dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """Place of a head on a route.
 
     Attributes:
         arc_length: (...), m.
-        radius: (...), of the lumen there, m.
         excess: (...), by how much the head is out of the route's tube, in radii there;
             negative inside.
     """
 
     arc_length: np.ndarray
-    radius: np.ndarray
     excess: np.ndarray
 
 
@@ -96,8 +93,7 @@ def locate(route: Route, head: np.ndarray, last: np.ndarray | None = None) -> Pl
         rank = rank - 1.0 * (inside & nearby)
     index = rank.argmin(-1)
     excess = np.take_along_axis(outside, index[..., None], -1)[..., 0]
-    radius = route.radii[index]
-    return Place(route.arc_length[index], radius, excess / radius)
+    return Place(route.arc_length[index], excess / route.radii[index])
 
 
 class Ahead(NamedTuple):

@@ -70,13 +70,17 @@ class Scene:
             drawn: Whether the surface of the lumen is there to be seen.
         """
         goal = placement.resolve_goal(anatomy, goal)
-        config.vessel_options.check(anatomy)
+        config.vessel.check(anatomy)
         chosen, length = chosen_devices(config), config.working_length
         place = placement.place_device(
-            anatomy, goal, longest_tip(chosen), length, config.ranges.farthest_shift
+            anatomy,
+            goal,
+            longest_tip(chosen),
+            length,
+            config.randomisation.farthest_shift,
         )
         catheter = _chain(chosen, place, config)
-        if config.vessel_options.wall is not None:
+        if config.vessel.wall is not None:
             soften(catheter)
         radius = catheter.device.outer_radius
         bore = straight(place.working_length - place.start_depth)
@@ -90,7 +94,7 @@ class Scene:
             sheath=Sheath(bore, device_radius=radius),
             robot=Robot(device_radius=radius),
         )
-        moving = config.vessel_options.motion is not None
+        moving = config.vessel.motion is not None
         user_data = effects.userdata_size(config.effects_on(catheter), catheter)
         scene._attach(user_data, moving)
         low, high = anatomy.lumen.box
@@ -136,16 +140,6 @@ class Scene:
         if moving:
             add_clock(self.arena.mjcf_model)
 
-    @property
-    def coaxial(self) -> bool:
-        """Whether the devices are coaxial ones, each moved by itself."""
-        return self.catheter.coaxial
-
-    @property
-    def device(self) -> devices.Device:
-        """What the catheter is made of; of several devices, the outermost."""
-        return self.catheter.device
-
 
 def chosen_devices(config: NavigationConfig) -> tuple[devices.Device, ...]:
     """The devices of a task, from the innermost outwards."""
@@ -164,9 +158,7 @@ def _chain(
     place: placement.Placement,
     config: NavigationConfig,
 ) -> Chain:
-    torsion = config.torsion_joints
-    if torsion is None:
-        torsion = _TORSION_JOINTS if config.rotation else 0
+    torsion = _TORSION_JOINTS if config.rotation else 0
     length, link = place.working_length, config.shaft_link
     discretisation = devices.Discretisation(length, link, torsion)
     common = {

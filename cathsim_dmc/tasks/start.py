@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -13,6 +13,7 @@ from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.effects import Episode
 from cathsim_dmc.physics.randomisation import START_JITTER
 from cathsim_dmc.physics.readings import ModelIndex
+from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.scene import Scene
 
 _SETTLING_TIME = 2.0  # s, after which the device rests
@@ -40,10 +41,8 @@ class StartPosture:
     """Joint positions of the device at the start of an episode.
 
     The device is laid along the centreline of the vessel and let go, with motors and
-    base at rest: a bent elastic device comes to lie against the wall. This is done
-    once, on the compiled model without randomisation, so it is the same for every
-    simulation and every seed. An episode starts there at rest, the head displaced by
-    what was drawn.
+    base at rest, once, on the compiled model without randomisation. An episode starts
+    there at rest, the head displaced by what was drawn.
     """
 
     def __init__(
@@ -51,18 +50,13 @@ class StartPosture:
         scene: Scene,
         model: mujoco.MjModel,
         index: ModelIndex,
-        along_route: Sequence[float] | None = None,
-        farthest: float = 0.0,
+        config: NavigationConfig,
     ):
         """Lets the device settle.
 
         Args:
             index: Places of the task's quantities in the model.
-            along_route: Least and largest share of the way to the goal that the head
-                has made, for episodes that do not begin at the inlet; None for those
-                that do.
-            farthest: How much farther in an episode may begin, m. Where that is more
-                than half of the way to the goal, starts are closer in proportion.
+            config: Says where an episode may begin.
 
         Raises:
             ValueError: if the device comes to rest outside the lumen or in its wall.
@@ -74,30 +68,26 @@ class StartPosture:
         way = np.linalg.norm(np.diff(place.line, axis=0), axis=-1).sum()
         way -= float(np.sum(scene.catheter.link_lengths)) + START_JITTER
         self._ahead: list[_Posture] = []
-        if along_route is not None:
+        if (along_route := config.start_along_route) is not None:
             low, high = (share * way for share in along_route)
             advances = np.linspace(low, high, _STARTS_ALONG_ROUTE)
             self._ahead = _settled(settle, advances)
             if not self._ahead:
                 raise ValueError(
                     f"start_along_route is {tuple(along_route)}: "
-                    f"{scene.device.name!r} can be laid nowhere there in "
+                    f"{scene.catheter.device.name!r} can be laid nowhere there in "
                     f"{scene.anatomy.name!r}; give smaller shares"
                 )
         self._starts = [rest]
         self._scale = 1.0
-        if farthest:
+        if farthest := config.randomisation.farthest_insertion:
             reach = min(farthest, _LARGEST_START * way)
             count = math.ceil(reach / _START_SPACING)
             self._starts += _settled(settle, np.linspace(reach / count, reach, count))
             self._scale = reach / farthest
 
-    def draw(self, random_state: np.random.RandomState) -> int | None:
-        """Draws where along the route an episode starts; None for the inlet."""
-        return random_state.randint(len(self._ahead)) if self._ahead else None
-
     def write(
-        self, qpos: np.ndarray, episode: Episode, number: int | None = None
+        self, qpos: np.ndarray, episode: Episode, random_state: np.random.RandomState
     ) -> None:
         """Writes the start configuration of one simulation.
 
@@ -107,10 +97,11 @@ class StartPosture:
         Args:
             qpos: (nq,), written in place; joints of other entities are left alone.
             episode: What was drawn for it.
-            number: What `draw` returned: a device that lies along the route is not
+            random_state: Draws where along the route a device lies, which is then not
                 displaced.
         """
-        if number is not None:
+        if self._ahead:
+            number = random_state.randint(len(self._ahead))
             self._ahead[number].write(qpos, np.zeros(3), episode.roll)
             return
         wanted = self._scale * (episode.insertion or 0.0)
@@ -120,11 +111,7 @@ class StartPosture:
 
 
 class _Posture:
-    """A device at rest, and how its joints displace its head.
-
-    Attributes:
-        advance: How much farther in than the first posture, m.
-    """
+    """A device at rest, so far advanced (m), and how its joints displace its head."""
 
     def __init__(
         self,
@@ -162,7 +149,7 @@ class _Posture:
         self._shares = 1.0 - ahead / beyond[self._free + 1]
         self._anatomy = scene.anatomy
         depth = scene.anatomy.lumen(self._nodes)
-        self._least = np.minimum(depth, scene.device.outer_radius)
+        self._least = np.minimum(depth, scene.catheter.device.outer_radius)
         self._least[:-1] -= _PRESSED
 
     def clear_of_wall(self, displacement: np.ndarray) -> np.ndarray:
@@ -177,18 +164,14 @@ class _Posture:
     def write(
         self, qpos: np.ndarray, displacement: np.ndarray, roll: float | None
     ) -> None:
-        """Writes the posture.
+        """Writes the posture (nq,), the head displaced by (3,) m in the inlet's frame.
 
-        Args:
-            qpos: (nq,), written in place; joints of other entities are left alone.
-            displacement: (3,) of the head in the frame of the inlet, whose z points
-                into the lumen, m.
-            roll: Angle by which the device is turned about its own axis, rad: its
-                hinges stand otherwise, its shape is the same.
+        A device that is turned about its axis has other angles and the same shape.
         """
         angles, step = self._angles, self._steps @ displacement
         if roll:
-            turn, directions = _turn(-roll), self._directions.copy()
+            c, s = np.cos(-roll), np.sin(-roll)
+            turn, directions = np.array([[c, -s], [s, c]]), self._directions.copy()
             directions[:, :2] = self._directions[:, :2] @ turn.T
             angles = bends_of(directions)
             step = np.concatenate([step[:1], turn @ step[1:]])
@@ -247,12 +230,7 @@ def _refuse_outside(
     else:
         return
     raise ValueError(
-        f"{scene.device.name!r} {found} before an episode begins: the sheath before "
-        f"its inlet or the first {1e3 * place.start_depth:.0f} mm do not fit; enter it "
-        "elsewhere, or take a device with a shorter or softer tip"
+        f"{scene.catheter.device.name!r} {found} before an episode begins: the sheath "
+        f"before its inlet or the first {1e3 * place.start_depth:.0f} mm do not fit; "
+        "enter it elsewhere, or take a device with a shorter or softer tip"
     )
-
-
-def _turn(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s], [s, c]])

@@ -120,7 +120,7 @@ def push_checks() -> Iterator[Check]:
                 geoms = geoms[(geoms == wall).any(axis=1)]
                 contacts += len(geoms)
                 links += len(np.unique(geoms)) - bool(len(geoms))
-        again = 100 * float(play.rollout.repeated.sum()) / (len(_CURLS) * _PUSHES)
+        again = 100 * float(play.stepper.repeated.sum()) / (len(_CURLS) * _PUSHES)
         environment.close()
         each = f"{contacts / max(links, 1):.2f} contacts for each link that has one"
         deep = 1e3 * np.concatenate(depth)

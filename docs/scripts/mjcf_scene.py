@@ -72,7 +72,7 @@ def write_mjcf(
             f"{task} draws from {env.task.num_anatomies} anatomies; give pool=1 for "
             "the scene of one"
         )
-    if env.task.scene.coaxial:
+    if env.task.scene.catheter.coaxial:
         raise ValueError(
             f"{task} changes its model in every control step, as one device slides in "
             "another; no file holds that: give a task with a single device"
@@ -119,7 +119,7 @@ def describe(env: Any) -> dict[str, Any]:
         "links": [each.full_identifier for each in catheter.links],
         "head": catheter.head.full_identifier,
         "insertion": catheter.insertion.full_identifier,
-        "device_radius": scene.device.outer_radius,
+        "device_radius": scene.catheter.device.outer_radius,
         "sensors": {
             "wall_contacts": "wall_contacts",
             "load_cell": "load_cell",
