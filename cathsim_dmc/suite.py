@@ -1,10 +1,5 @@
 """The task suite `cathsim`, a domain of `dm_control.suite`.
 
-```python
-from cathsim_dmc import suite
-env = suite.load("cathsim", "type1_lcca")
-```
-
 Importing this module registers the domain, so that `dm_control.suite.load` and
 TorchRL's `DMControlEnv` know it too.
 """
@@ -107,14 +102,6 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
     _register_domain()
 
 
-def _definition(name: str) -> TaskDefinition:
-    if name not in TASKS:
-        raise ValueError(
-            f"no task {name!r} in domain {DOMAIN!r}; there are {', '.join(TASKS)}"
-        )
-    return TASKS[name]
-
-
 def make_task(
     name: str, random: np.random.RandomState | int | None = None, **options: Any
 ) -> Navigation:
@@ -131,7 +118,7 @@ def make_task(
     Raises:
         ValueError: if the task or an option does not exist; lists those that do.
     """
-    definition = _definition(name)
+    definition = TASKS[bounds.choice(f"task of {DOMAIN}", name, TASKS)]
     options = {**definition.options, **options}
     if unknown := sorted(set(options) - {*task_options(name)}):
         raise ValueError(
@@ -167,11 +154,8 @@ def make_task(
     def room(number: int) -> tuple[Scene, Objective]:
         anatomy, goal = anatomies[number], goals[number]
         objective = definition.objective(anatomy, goal, **chosen)
-        radius, drawn = objective.goal_radius, number == 0
-        return (
-            Scene.build(anatomy, goal, config, goal_radius=radius, drawn=drawn),
-            objective,
-        )
+        looks = {"goal_radius": objective.goal_radius, "drawn": number == 0}
+        return Scene.build(anatomy, goal, config, **looks), objective
 
     others = map(room, range(1, len(anatomies))) if len(anatomies) > 1 else None
     return Navigation(*room(0), config, random, others=others, name=name)
@@ -183,10 +167,8 @@ def _one_length(
     """The configuration with a device as long as the farthest goal needs."""
     if len(anatomies) == 1 or config.working_length is not None:
         return config
-    device, shift = (
-        longest_tip(chosen_devices(config)),
-        config.randomisation.farthest_shift,
-    )
+    device = longest_tip(chosen_devices(config))
+    shift = config.randomisation.farthest_shift
     longest = max(
         placement.place_device(anatomy, goal, device, None, shift).working_length
         for anatomy, goal in zip(anatomies, goals, strict=True)
@@ -221,7 +203,7 @@ def load(
         ValueError: if domain, task or an option does not exist; lists those that do.
     """
     if domain_name == DOMAIN:
-        _definition(task_name)
+        bounds.choice(f"task of {DOMAIN}", task_name, TASKS)
     if domain_name not in dm_suite._DOMAINS:  # noqa: SLF001
         raise ValueError(
             f"no domain {domain_name!r}; there are {DOMAIN} and those of "

@@ -172,7 +172,7 @@ def test_a_head_that_stands_still_is_withdrawn_and_tried_again():
     for step in range(24):
         # The first gains a millimetre a step, the second nothing.
         arc = np.array([0.1 + 1e-3 * step, 0.1])
-        place = Place(arc, np.full(2, 0.01), np.full(2, -0.5))
+        place = Place(arc, np.full(2, -0.5))
         state = attempts.advance(options, state, place, insertion)
         retracted.append(state.retracting.copy())
         insertion = insertion - 1e-3 * state.retracting

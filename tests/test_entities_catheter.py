@@ -269,7 +269,9 @@ def test_rest_shape_turns_by_the_arcs(name):
 
 
 def test_an_unknown_device_lists_the_known():
-    with pytest.raises(ValueError, match=r"no device.*steerable_5f.*lunderquist"):
+    with pytest.raises(
+        ValueError, match=r"device is 'amplatz'.*steerable_5f.*lunderquist"
+    ):
         devices.get("amplatz")
 
 

@@ -52,20 +52,3 @@ def test_points_behind_the_source_have_no_pixel():
     pixels, depth = carm.project([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     assert np.isnan(pixels[0]).all() and depth[0] < 0.0
     assert np.isfinite(pixels[1]).all()
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"primary": np.nan}, "primary"),
-        ({"secondary": 2.0}, "secondary"),
-        ({"magnification": 0.0}, "magnification"),
-        ({"detector_size": -1.0}, "detector_size"),
-        ({"source_detector": 0.5}, "source_detector"),
-        ({"resolution": (0, 4)}, "resolution"),
-        ({"isocentre": (1.0, 2.0)}, "isocentre"),
-    ],
-)
-def test_wrong_fields_are_named(fields, message):
-    with pytest.raises(ValueError, match=message):
-        CArm(**fields)

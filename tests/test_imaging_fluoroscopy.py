@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_imaging_device import RADIUS, curve
-from test_imaging_thickness import ball, tube
+from test_imaging_thickness import ball
 
 from cathsim_dmc.imaging import (
     CArm,
@@ -20,8 +20,8 @@ from cathsim_dmc.imaging import (
 
 @pytest.fixture(scope="module")
 def vessel():
-    """A tube round the catheter of `curve`."""
-    return tube(curve(links=60), 0.01, sides=32)
+    """A ball that the catheter of `curve` enters."""
+    return ball([0.02, 0, 0.01], 0.03)
 
 
 @pytest.fixture(scope="module")

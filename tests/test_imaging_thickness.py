@@ -32,40 +32,6 @@ def pixel_mean(image, supersample):
     return image.reshape(rows, supersample, columns, supersample).mean(axis=(1, 3))
 
 
-def tube(line, radius, sides=48):
-    """Triangle tube round a polyline, closed by fans."""
-    line = np.asarray(line, dtype=float)
-    radius = np.broadcast_to(radius, len(line))
-    tangent = np.gradient(line, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    helper = np.eye(3)[np.argmin(np.abs(tangent).max(axis=0))]
-    u = np.cross(tangent, helper)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    v = np.cross(tangent, u)
-    angle = np.arange(sides) * 2 * np.pi / sides
-    # Outer polygon of the area of the circle: chords then agree in the mean.
-    size = radius * np.sqrt(2 * np.pi / sides / np.sin(2 * np.pi / sides))
-    ring = line[:, None] + size[:, None, None] * (
-        np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None]
-    )
-    vertices = ring.reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(len(line) - 1), np.arange(sides), indexing="ij")
-    a, b = i * sides + j, i * sides + (j + 1) % sides
-    c, d = a + sides, b + sides
-    faces = np.concatenate(
-        [np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)]
-    )
-    last = (len(line) - 1) * sides
-    k = np.arange(sides)
-    n = len(vertices)
-    vertices = np.concatenate([vertices, line[[0, -1]]])
-    fans = [
-        np.stack([np.full(sides, n), (k + 1) % sides, k], -1),
-        np.stack([np.full(sides, n + 1), last + k, last + (k + 1) % sides], -1),
-    ]
-    return Surface(vertices, np.concatenate([faces, *fans]))
-
-
 def ball(centre, radius, subdivisions=5):
     mesh = trimesh.creation.icosphere(subdivisions, radius)
     return Surface(mesh.vertices + centre, mesh.faces)
@@ -108,37 +74,15 @@ def test_volume_is_seen_from_everywhere(primary, secondary, x, z, supersample):
 def test_no_ray_slips_between_triangles():
     # A lattice that falls exactly on ray positions: every vertex and edge is hit.
     carm = CArm(resolution=(32, 32))
-    n = 17
-    grid = np.linspace(4, 20, n)
-    x, y = np.meshgrid(grid, grid)
-    pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
-    front = unproject(carm, pixels, np.full(len(pixels), 0.80))
-    back = unproject(carm, pixels, np.full(len(pixels), 0.70))
-    vertices = np.concatenate([front, back])
-    i, j = np.meshgrid(np.arange(n - 1), np.arange(n - 1), indexing="ij")
-    a = (i * n + j).ravel()
-    b, c, d = a + 1, a + n, a + n + 1
-    # Rows run down: seen from the detector (front), a, c, b is counter-clockwise.
-    sheet = np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)])
-    faces = np.concatenate([sheet, sheet[:, ::-1] + n * n])
-    vertices, faces = closed_sides(vertices, faces)
-    image = surface_thickness(carm, Surface(vertices, faces), 1)
+    box = trimesh.creation.box().subdivide().subdivide().subdivide().subdivide()
+    places = 12 + 16 * box.vertices[:, :2], 0.75 + 0.1 * box.vertices[:, 2]
+    # Rows run down: columns, rows and depth are a left-handed frame.
+    lattice = Surface(unproject(carm, *places), box.faces[:, ::-1])
+    image = surface_thickness(carm, lattice, 1)
     inside = image[4:20, 4:20] / carm.slant()[4:20, 4:20]
     np.testing.assert_allclose(inside, 0.10, rtol=1e-9)
     image[4:21, 4:21] = 0.0
     assert (image == 0.0).all()
-
-
-def closed_sides(vertices, faces):
-    """Join the rims of two sheets by a band of triangles."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    known = {tuple(e) for e in edges.tolist()}
-    half = len(vertices) // 2
-    rim = [(a, b) for a, b in known if (b, a) not in known and a < half]
-    band = []
-    for a, b in rim:
-        band += [(b, a, a + half), (b, a + half, b + half)]
-    return vertices, np.concatenate([faces, np.array(band)])
 
 
 def test_two_bodies_add_and_a_hollow_one_subtracts():
@@ -152,9 +96,10 @@ def test_two_bodies_add_and_a_hollow_one_subtracts():
 
 
 def test_parts_outside_the_image_are_cut_off():
-    line = np.linspace([0, 0, -0.4], [0, 0, 0.4], 60)
-    image = surface_thickness(CArm.view("AP"), tube(line, 0.01))
-    middle = surface_thickness(CArm.view("AP"), tube(line[10:50], 0.01))
+    image, middle = (
+        surface_thickness(CArm.view("AP"), Surface(rod.vertices, rod.faces))
+        for rod in (trimesh.creation.cylinder(0.01, height) for height in (0.8, 0.5))
+    )
     np.testing.assert_allclose(image, middle, atol=1e-6)
 
 

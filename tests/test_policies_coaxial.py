@@ -73,7 +73,7 @@ def fresh(arc_length, insertion, **values):
 
 
 def attempt(state, arc_length, insertion, excess=-0.5):
-    place = Place(np.array([arc_length]), np.array([5e-3]), np.array([excess]))
+    place = Place(np.array([arc_length]), np.array([excess]))
     return attempts.advance(CoaxialSettings(), state, place, np.array([insertion]))
 
 

@@ -305,13 +305,7 @@ def pressure(lengths, overlap, bends, turns, axial, start, ways, coefficient, fa
 def wall_friction(arms, outermost, force, coefficient):
     """Limits (K, J) of the friction torque of the wall on the devices, N·m.
 
-    Each joint has half of its two links.
-
-    Args:
-        arms: (K,), radius of each device by its friction ratio, m.
-        outermost: of an `Overlap`.
-        force: (L,), force of the wall on the links, N.
-        coefficient: Coulomb coefficient of an uncoated device on the wall.
+    The arms (K,) are radii by friction ratio, m, the forces (L,) those on the links, N.
     """
     devices, links = outermost.shape
     torque = np.empty((devices, links - 1))

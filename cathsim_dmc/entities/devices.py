@@ -231,11 +231,7 @@ def get(device: "str | Device") -> Device:
     """Returns a device by name, or as given; ValueError if there is none."""
     if isinstance(device, Device):
         return device
-    if not isinstance(device, str) or device not in DEVICES:
-        raise ValueError(
-            f"no device is named {device!r}; known devices: {', '.join(DEVICES)}"
-        )
-    return DEVICES[device]
+    return DEVICES[bounds.choice("device", device, DEVICES)]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,34 +28,27 @@ FIELDS = (
 )
 
 
-class ChainFields:
-    """Places in a model of what changes as the devices slide.
+def places_of(model: mujoco.MjModel, chain: DeviceStack) -> tuple:
+    """Places of the elements of a chain in a compiled model, which `write` takes.
 
-    Attributes:
-        qpos: Places of the hinges in `qpos`, in the order of the chain.
-        places: What `write` takes of the chain: (3,) first hinge among joints, degrees
-            of freedom and positions; number of the first link; (L,) geoms of the links;
-            (L,) which of a link's axes of inertia lies along it; (L,) half lengths of
-            their cylinders, m; (K,) relaxation times of the materials, physics step, s.
+    Returns:
+        (3,) first hinge among joints, degrees of freedom and positions; number of the
+        first link; (L,) geoms of the links; (L,) which of a link's axes of inertia lies
+        along it; (L,) half lengths of their cylinders, m; (K,) relaxation times of the
+        materials, physics step, s.
     """
-
-    def __init__(self, model: mujoco.MjModel, chain: DeviceStack):
-        """Finds the elements of the chain in a compiled model."""
-        bodies = ids(model, chain.links)
-        joints = np.sort(ids(model, chain.bends))
-        places = [joints, model.jnt_dofadr[joints], model.jnt_qposadr[joints]]
-        # Both kinds of elements follow each other, from proximal to distal.
-        if any((np.diff(each) != 1).any() for each in [bodies, *places]):
-            raise ValueError(f"the links of {chain!r} do not follow each other")
-        hinges = np.array([each[0] for each in places], dtype=np.intp)
-        geoms = ids(model, chain.link_geoms).astype(np.intp)
-        half_lengths = model.geom_size[geoms, 1].copy()
-        # MuJoCo orders the axes of inertia in its own way.
-        axes = model.body_inertia[bodies].argmin(axis=-1)
-        material = chain.rods.times, chain.timestep
-        self.places = hinges, int(bodies[0]), geoms, axes, half_lengths, *material
-        first = int(hinges[2])
-        self.qpos = slice(first, first + 2 * (len(geoms) - 1))
+    bodies, joints = ids(model, chain.links), np.sort(ids(model, chain.bends))
+    places = [joints, model.jnt_dofadr[joints], model.jnt_qposadr[joints]]
+    # Both kinds of elements follow each other, from proximal to distal.
+    if any((np.diff(each) != 1).any() for each in [bodies, *places]):
+        raise ValueError(f"the links of {chain!r} do not follow each other")
+    hinges = np.array([each[0] for each in places], dtype=np.intp)
+    geoms = ids(model, chain.link_geoms).astype(np.intp)
+    half_lengths = model.geom_size[geoms, 1].copy()
+    # MuJoCo orders the axes of inertia in its own way.
+    axes = model.body_inertia[bodies].argmin(axis=-1)
+    material = chain.rods.times, chain.timestep
+    return hinges, int(bodies[0]), geoms, axes, half_lengths, *material
 
 
 def write_still(
@@ -79,7 +72,7 @@ def write_still(
     rest = unloaded_hinges(coaxial_loops.rest_angles(overlap.rest, turns))
     links = stack.links(overlap, entity.friction)
     fields = tuple(getattr(model, name) for name in FIELDS)
-    write(fields, ChainFields(model, entity).places, overlap, rest, links, np.ones(2))
+    write(fields, places_of(model, entity), overlap, rest, links, np.ones(2))
 
 
 @compiled
@@ -88,7 +81,7 @@ def write(fields, places, overlap, rest, links, factors):
 
     Args:
         fields: live `FIELDS`.
-        places: of `ChainFields`.
+        places: of `places_of`.
         overlap: of the devices.
         rest: (J, 2), angles of the free hinges about x and y, rad.
         links: properties of the links.

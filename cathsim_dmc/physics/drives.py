@@ -25,11 +25,7 @@ class Drives:
     """
 
     def __init__(self, model: mujoco.MjModel, arrays: Any):
-        """Finds the servos.
-
-        Args:
-            arrays: `qpos`, `qvel` and `act` (N, ...), views.
-        """
+        """Finds the servos; the arrays are views, `qpos`, `qvel` and `act` (N, ...)."""
         found = np.flatnonzero(
             model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR.value
         )

@@ -108,7 +108,7 @@ class Flow(StillBlood):
         found = self._at(0.5 * (nodes[:, :-1] + nodes[:, 1:]))
         self.radius = found[..., 4]
         given = self._header[:, 2], self._link_radii, self._options is not None
-        fill(found, self._wave_speed, *given, self._links)
+        _fill(found, self._wave_speed, *given, self._links)
         return action
 
     def heart(self, index: int) -> dict[str, float]:
@@ -175,7 +175,7 @@ def moving_velocities(
 
 
 @compiled
-def fill(found, speed, viscosity, radii, flowing, links):
+def _fill(found, speed, viscosity, radii, flowing, links):
     """Writes the parameters of links (N, L, 8), see `blood_loops.OF_LINK`."""
     for index in range(len(found)):
         for n in range(len(radii)):

@@ -21,7 +21,7 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import postures
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.physics import sliding_loops
-from cathsim_dmc.physics.chain_fields import FIELDS, ChainFields
+from cathsim_dmc.physics.chain_fields import FIELDS, places_of
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.physics.effects import Effect, Episode, World
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
@@ -80,11 +80,7 @@ class SingleDevice(Effect):
         return postures(held)
 
     def shadows(self, line: np.ndarray) -> list[Shadow]:
-        """The devices as X-rays meet them, from the innermost outwards.
-
-        Args:
-            line: (N, L + 1, 3), `Readings.centreline`.
-        """
+        """The devices as X-rays meet them, from the innermost outwards, on a line."""
         first = line[:, :1] + self._behind * (line[:, :1] - line[:, 1:2])
         return [Shadow(np.concatenate([first, line], axis=1), self._radius)]
 
@@ -119,11 +115,10 @@ class SlidingDevices(SingleDevice):
         # Views: writing to them writes the state.
         self._insertion = world.parameters[:, :count]
         self._angles = world.parameters[:, count:].reshape(total, count, -1)
-        fields = ChainFields(world.model, self._entity)
-        self._hinges, self._made = (
-            self._qpos[:, fields.qpos],
-            made(self._entity, fields),
-        )
+        places = places_of(world.model, self._entity)
+        self._made = made(self._entity, places)
+        first = places[0][2]
+        self._hinges = self._qpos[:, first : first + 2 * len(self._stack.spans)]
         self._fields: list[tuple[np.ndarray, ...]] = [()] * total
         # Factors of all stiffnesses, and of all loss factors.
         self._friction, self._factors = np.zeros(total), np.ones((total, 2))
@@ -245,11 +240,7 @@ class SlidingDevices(SingleDevice):
         return postures(np.array(ends))
 
     def read(self, readings: Readings) -> CoaxialReadings:
-        """State of the devices.
-
-        Args:
-            readings: of the same control step.
-        """
+        """State of the devices at readings of the same control step."""
         insertion, nodes = self._pushed(), self._stack.nodes
         gaps, push = sliding_loops.gaps(insertion), self._axial.copy()
         push[np.arange(len(gaps)), gaps.argmin(axis=1)] += readings.push_force
@@ -285,12 +276,12 @@ class SlidingDevices(SingleDevice):
         ]
 
 
-def made(entity: DeviceStack, fields: ChainFields) -> tuple:
+def made(entity: DeviceStack, places: tuple) -> tuple:
     """What `sliding_loops.settle` takes: of devices, of their drives (SI), places."""
     stack = entity.stack
     devices = stack.tables, entity.rods, stack.arms, stack.of_links
     drives = entity.lumen_friction, CONTROL_TIMESTEP, MAX_TORQUE
-    return devices, drives, fields.places
+    return devices, drives, places
 
 
 def devices_of(chain: Chain) -> SingleDevice:

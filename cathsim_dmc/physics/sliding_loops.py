@@ -117,12 +117,8 @@ def gaps(insertion):
 def advance(before, step, least, most):
     """Where (N, K) the devices are told to go, and the chain's insertion (N,) then, m.
 
-    It cannot be drawn back behind its start.
-
-    Args:
-        before: (N, K), insertions, m.
-        step: (N, K), by how much they are told to move, m.
-        least, most: insertion of a device at least and at most, m.
+    They move from `before` (N, K) by `step` (N, K), m, within two limits; the chain
+    cannot be drawn back behind its start.
     """
     count, devices = before.shape
     target, lead = np.empty((count, devices)), np.empty(count)
@@ -141,11 +137,8 @@ def advance(before, step, least, most):
 def rubbing(force, lead, depth, nodes):
     """Size (N, L) of contact forces (N, L, 6) on the links outside the sheath, N.
 
-    Args:
-        force: torque and force, MuJoCo's `cfrc_ext`.
-        lead: (N,), insertion of the chain, m.
-        depth: of the chain's end past the mouth of the sheath at zero insertion, m.
-        nodes: (L + 1,), ends of the links from the end of the chain, m.
+    The chain's end is past the sheath's mouth by its insertion (N,) and a depth, m;
+    nodes (L + 1,) are the ends of the links from there, m.
     """
     count, links = force.shape[:2]
     size = np.zeros((count, links))
@@ -159,12 +152,9 @@ def rubbing(force, lead, depth, nodes):
 
 @compiled
 def points(line, places, nodes):
-    """Points (N, K, P, 3) of a chain (N, L + 1, 3) at places (N, K, P) from its end.
+    """Points (N, K, P, 3) of a line (N, L + 1, 3) at places (N, K, P) from its end, m.
 
-    Args:
-        line: joints and head, from proximal to distal, m.
-        places: m; behind its base the device is straight.
-        nodes: (L + 1,), distance of the line's points from the end, m.
+    Nodes (L + 1,) are the distances of its points; behind its base it is straight.
     """
     found = np.empty((*places.shape, 3))
     last = len(nodes) - 1
@@ -188,11 +178,8 @@ def points(line, places, nodes):
 def leading_load(force, line, ways, nodes):
     """Axial force (N,) in the leading device where it leaves the others, N.
 
-    Args:
-        force: (N, L, 6), on each link from the one before it, torque and force.
-        line: (N, L + 1, 3), m.
-        ways: (N, K), from the end of each device to that of the chain, m; K at least 2.
-        nodes: (L + 1,), distance of the line's points from the end, m.
+    The force (N, L, 6) is that on each link from the one before it, torque first; the
+    ways (N, K) lead from the ends of K > 1 devices to that of the line (N, L + 1, 3).
     """
     count, links = force.shape[:2]
     load = np.empty(count)

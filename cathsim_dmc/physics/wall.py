@@ -104,7 +104,7 @@ class Wall(Effect):
     def _write(self, index: int) -> None:
         fields = [self.world.field(index, name) for name in self.model_fields]
         vessel = self._radius[index], self._material[index]
-        contacts(*vessel, *self._links, _LAWS, RELAXATION, *fields)
+        _contacts(*vessel, *self._links, _LAWS, RELAXATION, *fields)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Takes the radius of the vessel around each link."""
@@ -141,19 +141,8 @@ def reference(stiffness, weight, first, last, relaxation):
 
 
 @compiled
-def contacts(radius, material, geoms, weight, rigid, laws, relaxation, solref, solimp):
-    """Writes the contacts of the links of one simulation.
-
-    Args:
-        radius: (n,) of the lumen around them, m, 0 for none.
-        material: (3,) modulus, thickness and support.
-        geoms, weight, rigid: (n,) numbers of the links' geoms, inverse weights, 1/kg,
-            and stiffness of the rigid wall's contact, N/m.
-        laws: (2, 7) of the rigid wall and of one that gives: `solimp`, then `solref`,
-            that of the latter not used.
-        relaxation: of a wall that gives, s.
-        solref, solimp: (ngeom, 2 and 5), written.
-    """
+def _contacts(radius, material, geoms, weight, rigid, laws, relaxation, solref, solimp):
+    """Writes `solref` and `solimp` of the links of one simulation."""
     first, last = laws[1, 0], laws[1, 1]
     for n in range(len(geoms)):
         geom, found = geoms[n], rigid[n]

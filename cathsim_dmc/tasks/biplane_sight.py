@@ -26,11 +26,7 @@ class BiplaneSight:
     """Reconstructs what the planes show; remembers each simulation's episode."""
 
     def __init__(self, num_simulations: int):
-        """Begins with nothing seen.
-
-        Args:
-            num_simulations: N.
-        """
+        """Begins with nothing seen of N simulations."""
         self._routes: list[Route | None] = [None] * num_simulations
         self._lines = [np.zeros((0, 3))] * num_simulations
         self._machines: dict[int, Biplane] = {}

@@ -4,6 +4,7 @@ All anatomies are compiled once. What differs between their models is kept and w
 into the model of the first, and everything that was bound to that stays bound.
 """
 
+import dataclasses
 import functools
 from collections.abc import Iterable
 
@@ -67,8 +68,6 @@ def compile_together(
 ) -> tuple[Case, ...]:
     """Compiles scenes so that any of them can be written into a model of the first.
 
-    One scene is held at a time: a case has the entities of the first one.
-
     Args:
         rooms: Scenes of one device, not compiled yet, with success and reward in each;
             the first one alone is drawn.
@@ -91,7 +90,9 @@ def compile_together(
             fields = _differences(host, model, scene, first)
             sizes |= {name: len(value) for name, value in fields.items()}
         case = Case(scene, objective, model, config, fields)
-        case.scene = first.in_anatomy(scene)
+        # The entities of the first, in this anatomy.
+        own = {"anatomy": scene.anatomy, "goal": scene.goal}
+        case.scene = dataclasses.replace(first, placement=scene.placement, **own)
         scene.anatomy.lumen.release()
         found.append(case)
     for case in found:

@@ -29,11 +29,7 @@ class CommonChain:
     """
 
     def __init__(self, chain: Chain, shaft_link: float):
-        """Finds the places of the simulated joints and links.
-
-        Args:
-            shaft_link: longest link of the shaft, m.
-        """
+        """Finds the simulated joints and links; `shaft_link` is the longest, m."""
         tip = max(device.tip_length for device in chain.devices)
         whole = Discretisation(max(COMMON_LENGTH, 2 * tip), shaft_link)
         self.num_links = len(whole.link_lengths(*chain.devices))

@@ -158,8 +158,8 @@ class NavigationConfig:
             bounds.interval("start_along_route", shares, 0.0, bounds.MOST_START_SHARE)
         timestep = bounds.number("physics_timestep", self.physics_timestep)
         substeps, (least, most) = CONTROL_TIMESTEP / (timestep or np.inf), _SUBSTEPS
-        whole = round(substeps)
-        if not least <= whole <= most or abs(substeps - whole) >= 1e-6:
+        within = least - 1e-6 <= substeps <= most + 1e-6
+        if not within or abs(substeps - round(substeps)) >= 1e-6:
             bounds.refuse(
                 "physics_timestep",
                 self.physics_timestep,

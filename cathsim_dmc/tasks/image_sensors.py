@@ -24,14 +24,7 @@ class ImageSensors:
     def __init__(
         self, names: Sequence[str], case: Case, num_simulations: int, chain: CommonChain
     ):
-        """Prepares the sensors.
-
-        Args:
-            names: Of the observations.
-            case: With the angiography machine before the first episode.
-            num_simulations: N.
-            chain: The device as observations show it.
-        """
+        """Prepares the sensors for observations of these names, before any episode."""
         self._names, self._chain, self._count = names, chain, num_simulations
         self.planes: list[angiographs.Planes] = []
         self._sight, self._noise = BiplaneSight(num_simulations), False

@@ -1,11 +1,8 @@
 """Physics errors: detection and names."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from cathsim_dmc.anatomy import Anatomy
-from cathsim_dmc.tasks.scene import Scene
 
 DIVERGED = "diverged"
 ESCAPED = "escaped through the wall"
@@ -42,32 +39,3 @@ def escaped(anatomy: Anatomy, centreline: np.ndarray, along: np.ndarray) -> np.n
     outside = aside & ~in_sheath
     outside[outside] = anatomy.lumen(centreline[outside]) < -_ESCAPE_DEPTH
     return outside.any(-1)
-
-
-def find(
-    scene_of: Callable[[int], Scene],
-    diverged: np.ndarray,
-    steps: np.ndarray,
-    centreline: np.ndarray,
-    peak_force: np.ndarray,
-) -> tuple[str | None, ...]:
-    """Physics errors of N simulations in the last control step.
-
-    Args:
-        scene_of: gives the scene of a simulation by its number.
-        diverged: (N,) bool, MuJoCo warned.
-        steps: (N,), control steps of the episodes.
-        centreline: (N, n, 3), nodes of the devices, m.
-        peak_force: (N,), largest single contact force within the step, N.
-
-    Returns:
-        A reason for each simulation, None where nothing went wrong.
-    """
-    reasons: list[str | None] = [None] * len(steps)
-    for index in np.flatnonzero(steps % ESCAPE_INTERVAL == 0).tolist():
-        scene = scene_of(index)
-        if escaped(scene.anatomy, centreline[index], scene.placement.direction):
-            reasons[index] = ESCAPED
-    for index in np.flatnonzero(diverged | ~(peak_force <= MAX_FORCE)).tolist():
-        reasons[index] = DIVERGED if diverged[index] else EXPLODED
-    return tuple(reasons)

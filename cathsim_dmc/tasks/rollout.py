@@ -85,17 +85,11 @@ class Rollout:
         self._read = self.index.reader(state)
         self._listed = listed = config.effects_on(scene.catheter)
         stepper.deepest = config.vessel.deepest
-        moving = [effect for effect in listed if isinstance(effect, Moving)]
-        self.moving: Moving | None = moving[0] if moving else None
+        self.moving = next((one for one in listed if isinstance(one, Moving)), None)
         self._devices = cast(SingleDevice, listed[-1])
-        depth, field = scene.placement.start_depth, stepper.field
-        self._effects = Effects(
-            listed,
-            World(
-                *(model, scene.catheter, self.index, depth, state, field),
-                parameters=state.userdata,
-            ),
-        )
+        depth = scene.placement.start_depth
+        places = model, scene.catheter, self.index, depth, state, stepper.field
+        self._effects = Effects(listed, World(*places, parameters=state.userdata))
         for index in range(count):
             self._effects.enter(index, scene.anatomy)
         self._routes: list[Route] = []
@@ -210,15 +204,28 @@ class Rollout:
         self._measure(force)
         # A new array: that handed out before stays what it was.
         self._way = self._way + straight(before, self.resting.head)
-        old, nodes = self._errors, self.resting.centreline
-        self._errors = physics_errors.find(
-            lambda index: self.case(index).scene,
-            *(warned, self.steps, nodes, force.peak_max),
-        )
+        old, self._errors = self._errors, self._find_errors(warned, force.peak_max)
         for error, last, steps in zip(self._errors, old, self.steps, strict=True):
             if error is not None and last is None:
                 _LOG.error("%s after %d steps", error, steps)
         return self._step(np.arange(len(self.steps)))
+
+    def _find_errors(
+        self, warned: np.ndarray, force: np.ndarray
+    ) -> tuple[str | None, ...]:
+        """What went wrong where MuJoCo has warned or a contact was so hard, N."""
+        errors: list[str | None] = [None] * len(self.steps)
+        due = self.steps % physics_errors.ESCAPE_INTERVAL == 0
+        for index in np.flatnonzero(due).tolist():
+            scene, nodes = self.case(index).scene, self.resting.centreline[index]
+            along = scene.placement.direction
+            if physics_errors.escaped(scene.anatomy, nodes, along):
+                errors[index] = physics_errors.ESCAPED
+        wrong = warned | ~(force <= physics_errors.MAX_FORCE)
+        for index in np.flatnonzero(wrong).tolist():
+            kind = physics_errors.DIVERGED if warned[index] else physics_errors.EXPLODED
+            errors[index] = kind
+        return tuple(errors)
 
     def _measure(self, force: forces.WallForce) -> None:
         self.readings, self.wall_force = self._read(), force

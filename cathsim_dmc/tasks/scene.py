@@ -108,12 +108,6 @@ class Scene:
         scene.arena.add_camera("side", centre, distance, (0, 1, 0, 0, 0, 1))
         return scene
 
-    def in_anatomy(self, other: "Scene") -> "Scene":
-        """These entities, in the anatomy and at the places of another scene."""
-        return dataclasses.replace(
-            self, anatomy=other.anatomy, goal=other.goal, placement=other.placement
-        )
-
     def _attach(self, user_data: int, moving: bool):
         if user_data:
             self.arena.mjcf_model.size.nuserdata = user_data

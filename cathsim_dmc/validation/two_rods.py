@@ -147,8 +147,9 @@ def simulate(
     rig.compile()
     entity: Any = rig.catheter
     stack = entity.stack
-    places = chain_fields.ChainFields(rig.model, entity)
-    hinges = rig.data.qpos[places.qpos]
+    places = chain_fields.places_of(rig.model, entity)
+    first = places[0][2]
+    hinges = rig.data.qpos[first : first + 2 * len(stack.spans)]
     fields = tuple(getattr(rig.model, name) for name in chain_fields.FIELDS)
     if beyond is not None:
         # Straight, half a circle, and straight.
