@@ -3,14 +3,12 @@
 import mujoco
 import numpy as np
 import pytest
-from dm_control import mjcf
 
 from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.arena import AngiographyArena
-from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.posture import joints_along
 from cathsim_dmc.entities.sheath import CLEARANCE, Sheath, straight
+from cathsim_dmc.validation import rig
 
 BEND = 0.04  # m
 LENGTH, STROKE = 0.3, 0.15  # m
@@ -23,52 +21,29 @@ def bend(straight_length, radius=BEND, angle=np.pi / 2, points=60):
     return np.concatenate([[[0, 0, 0]], arc + [0, 0, straight_length]])
 
 
-class Rig:
+class Rig(rig.Rig):
     """A device whose base slides along +z from the origin, in a sheath."""
 
     def __init__(self, line):
-        arena = AngiographyArena()
-        arena.mjcf_model.option.timestep = 4e-3
-        self.catheter = Catheter(
-            "steerable_5f", devices.Discretisation(working_length=LENGTH), stroke=STROKE
-        )
-        self.lengths = self.catheter.link_lengths
-        self.sheath = Sheath(
-            line, self.catheter.device.outer_radius, self.lengths.max()
-        )
-        arena.attach(self.sheath)
-        site = arena.mjcf_model.worldbody.add("site", name="start", pos=(0, 0, LENGTH))
-        arena.attach(self.catheter, site)
-        self.physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
-        self.model, self.data = self.physics.model.ptr, self.physics.data.ptr
-
-    def pose(self, angles):
-        hinges = [self.model.joint(j.full_identifier) for j in self.catheter.bends]
-        for hinge, angle in zip(hinges, angles.ravel(), strict=True):
-            self.data.qpos[hinge.qposadr[0]] = angle
-        mujoco.mj_forward(self.model, self.data)
+        division = devices.Discretisation(working_length=LENGTH)
+        super().__init__("steerable_5f", division, stroke=STROKE, friction=0.0)
+        line = line - [0, 0, LENGTH]  # the end of the device lies at the origin
+        self.sheath = Sheath(line, self.device.outer_radius, self.lengths.max())
+        self.arena.attach(self.sheath)
+        self.compile()
 
     @property
     def nodes(self):
-        links = [self.model.body(b.full_identifier).id for b in self.catheter.links]
-        head = self.model.site(self.catheter.head.full_identifier).id
-        return np.vstack([self.data.xpos[links], self.data.site_xpos[head]])
-
-    @property
-    def push_force(self):
-        return self.data.sensor("catheter/push_force").data[2]
-
-    @property
-    def penetration(self):
-        return max((-one.dist for one in self.data.contact), default=0.0)
+        return np.vstack([self.joints, self.head_position]) + [0, 0, LENGTH]
 
     def drive(self, command, seconds):
         """Push force (T,) and penetration (T,) of every step."""
         self.data.actuator("catheter/insertion").ctrl[0] = command
         rows = []
         for _ in range(round(seconds / self.model.opt.timestep)):
-            mujoco.mj_step(self.model, self.data)
-            rows.append((self.push_force, self.penetration))
+            self.step()
+            depth = max((-one.dist for one in self.data.contact), default=0.0)
+            rows.append((self.data.sensor("catheter/push_force").data[2], depth))
         return np.array(rows).T
 
 
@@ -90,9 +65,8 @@ def test_a_straight_sheath_is_one_round_bore(straight_rig):
     for angle in np.linspace(0, 2 * np.pi, 73):
         for distance in (CLEARANCE - 1e-6, CLEARANCE + 1e-6):
             # The bore moves, as the base of the device does not.
-            rig.model.body_pos[sheath, :2] = distance * np.array(
-                [np.cos(angle), np.sin(angle)]
-            )
+            way = distance * np.array([np.cos(angle), np.sin(angle)])
+            rig.model.body_pos[sheath, :2] = way
             mujoco.mj_forward(rig.model, rig.data)
             assert (rig.data.ncon > 0) == (distance > CLEARANCE)
     rig.model.body_pos[sheath] = 0.0
@@ -144,16 +118,16 @@ def beyond(line, length=0.15):
 
 def test_a_device_laid_along_a_bent_sheath_touches_nothing(bent_rig):
     mujoco.mj_resetData(bent_rig.model, bent_rig.data)
-    bent_rig.pose(joints_along(bent_rig.lengths, beyond(bend(0.2))))
+    bent_rig.bend(joints_along(bent_rig.lengths, beyond(bend(0.2))))
     assert bent_rig.data.ncon == 0
-    bent_rig.pose(np.zeros((len(bent_rig.lengths) - 1, 2)))
+    bent_rig.bend(np.zeros((len(bent_rig.lengths) - 1, 2)))
     assert bent_rig.data.ncon > 0
 
 
 def test_a_device_goes_round_a_bend_without_jam(bent_rig):
     rig = bent_rig
     mujoco.mj_resetData(rig.model, rig.data)
-    rig.pose(joints_along(rig.lengths, beyond(bend(0.2))))
+    rig.bend(joints_along(rig.lengths, beyond(bend(0.2))))
     rig.drive(0.0, 1.0)
     push, depth = rig.drive(1.0, 3.5)
     insertion = rig.data.joint("catheter/insertion").qpos[0]
@@ -200,7 +174,7 @@ def test_nodes_of_the_chain_lie_on_an_arc(bent_rig, turn):
     line = bend(0.06, angle=4.5, points=200) @ spin.T
     line = beyond(line)
     mujoco.mj_resetData(bent_rig.model, bent_rig.data)
-    bent_rig.pose(joints_along(bent_rig.lengths, line))
+    bent_rig.bend(joints_along(bent_rig.lengths, line))
     nodes = bent_rig.nodes
     assert polyline(line).project(nodes).distance.max() < 0.3e-3
     on_arc = nodes[1:][np.cumsum(bent_rig.lengths) > 0.08][:8]

@@ -1,5 +1,6 @@
 """Navigation of a catheter through an anatomy, as a composer task."""
 
+import functools
 import itertools
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -94,7 +95,6 @@ class Navigation(composer.Task):
             rooms = itertools.chain([(scene, objective)], others)
             self._cases = cases.compile_together(rooms, config)
         self._compiled = False
-        self._observables = None
         self._step: Step | None = None
 
     def make_rollout(self, model: mujoco.MjModel, stepper: Stepper) -> Rollout:
@@ -136,15 +136,13 @@ class Navigation(composer.Task):
         """The arena."""
         return self._scene.arena
 
-    @property
+    @functools.cached_property
     def task_observables(self):
         """One observable per entry of the chosen observations."""
-        if self._observables is None:
-            self._observables = {
-                key: FrameObservable(lambda _, key=key: self.observation[key][0], spec)
-                for key, spec in self.observation_specs.items()
-            }
-        return self._observables
+        return {
+            key: FrameObservable(lambda _, key=key: self.observation[key][0], spec)
+            for key, spec in self.observation_specs.items()
+        }
 
     @property
     def observation(self) -> Mapping[str, np.ndarray]:
