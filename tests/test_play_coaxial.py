@@ -12,8 +12,8 @@ import pytest
 
 from cathsim_dmc.play import controls, play, window
 from cathsim_dmc.play.controls import Controls
-from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.records import CoaxialRecord
 
 TASK = "simple1_lcca_pair"
 STEP = 0.04

@@ -6,8 +6,8 @@ import pytest
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording import rerun_log
-from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.recording.records import CoaxialRecord
 
 STEPS = 12
 

@@ -62,9 +62,8 @@ def test_contacts_lie_on_the_wall_and_press_outwards(env, episode):
 def test_poses_are_those_of_the_task(env, episode):
     np.testing.assert_array_equal(episode.catheter[-1], env.task.readings.centreline)
     assert episode.insertion[-1] == env.task.readings.insertion
-    np.testing.assert_allclose(
-        episode.meta["distance"][-1], env.task.info()["distance"]
-    )
+    distance = env.task.info()["distance"]
+    np.testing.assert_allclose(episode.meta["distance"][-1], distance)
     np.testing.assert_allclose(np.diff(episode.time), 0.04)
     # Published reward: minus the distance in metres.
     np.testing.assert_allclose(episode.reward, -np.array(episode.meta["distance"])[1:])

@@ -11,62 +11,38 @@ from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY
 from cathsim_dmc.validation import bench, bench_data
 from cathsim_dmc.validation.bench_data import MESH, WIRES, Wire
 from cathsim_dmc.validation.checks import Report
+from cathsim_dmc.validation.rig import tube
 
-ENTRY = np.array([3.0, 0.0, 0.0])  # mm, off the middle of the tube
-
-
-def tube():
-    """A tube of 7 mm, straight along +y for 25 mm, then bent; mm."""
-    angle = np.linspace(0.0, 0.9, 18)
-    arc = 50.0 * np.stack([1 - np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    line = np.vstack([[[0, -5.0, 0], [0, 5, 0], [0, 15, 0]], arc + (0, 25, 0)])
-    tangent = np.gradient(line, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1)[:, None]
-    up = np.array([0.0, 0.0, 1.0])
-    round_ = np.linspace(0, 2 * np.pi, 20, endpoint=False)[:, None, None]
-    side = np.cross(tangent, up)
-    rings = line + 7.0 * (np.cos(round_) * side + np.sin(round_) * up)
-    points = rings.transpose(1, 0, 2).reshape(-1, 3)
-    hull = []
-    for k in range(len(line) - 1):
-        for i in range(20):
-            a, b = 20 * k + i, 20 * k + (i + 1) % 20
-            hull += [(a, b, a + 20), (b, b + 20, a + 20)]
-    last = len(points)
-    for i in range(20):
-        j = (i + 1) % 20
-        hull += [(i, last, j), (last - 20 + i, last - 20 + j, last + 1)]
-    mesh = trimesh.Trimesh(np.vstack([points, line[[0, -1]]]), hull)
-    mesh.fix_normals()
-    return mesh, line[-1]
+ENTRY = [3.0, 0.0, 5.0]  # mm, off the middle of the tube
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Data in the bench's format, of a wire that was simulated."""
     path = tmp_path_factory.mktemp("bench")
-    mesh, far = tube()
-    mesh.export(path / MESH)
+    # Straight along +z, then bent towards +x.
+    surface = tube(0.03, 7e-3, 0.05).surface
+    trimesh.Trimesh(1e3 * surface.vertices, surface.faces).export(path / MESH)
     marks = {
-        "entry": {"point_mm": [0, 0, 0], "outward_normal": [0, -1, 0], "radius_mm": 7},
-        "ascending_aorta_root_mm": far.tolist(),
+        "entry": {"point_mm": [0, 0, 5], "outward_normal": [0, 0, -1], "radius_mm": 7},
+        "ascending_aorta_root_mm": [50.0, 0.0, 80.0],
         "patient_axes": {
-            "superior": [0, -1, 0], "left_about": [0, 0, 1],
+            "superior": [0, 0, -1], "left_about": [0, 1, 0],
             "posterior_about": [1, 0, 0],
         },
     }  # fmt: skip
     row = {
         "run": "made", "frame": 1, "wire": "straight", "tip_region": "arch",
         "recommended": True, "inserted_length_mm": 60.0,
-        "entry_point_mm": ENTRY.tolist(), "entry_direction": [0.0, 1.0, 0.0],
-        "centreline_mm": [[3.0, 60.0 - y, 0.0] for y in range(0, 70, 2)],
+        "entry_point_mm": ENTRY, "entry_direction": [0.0, 0.0, 1.0],
+        "centreline_mm": [[3.0, 0.0, 65.0 - z] for z in range(0, 70, 2)],
     }  # fmt: skip
     write(path, marks, row)
     made = bench_data.read(path)
     experiment = bench.Experiment(made)
     (wire,) = made.wires
     shape = 1e3 * experiment.held(wire, experiment.field()).push()
-    beyond = [[3.0, -1.0, 0.0], [3.0, -3.0, 0.0]]
+    beyond = [[3.0, 0.0, 4.0], [3.0, 0.0, 2.0]]
     measured = row | {"centreline_mm": [*shape[::-1].tolist(), *beyond]}
     write(path, marks, measured, row | {"frame": 2, "inserted_length_mm": 50.0})
     return path, marks, row, experiment.field()

@@ -35,11 +35,8 @@ def test_drag_is_that_of_the_correlation_against_the_velocity_of_the_blood():
     mujoco.mj_forward(model, data)
     found = data.qfrc_passive - data.qfrc_spring - data.qfrc_damper
     expected = np.zeros(model.nv)
-    for body, length in zip(
-        range(rig.tip_body + 1 - len(rig.lengths), rig.tip_body + 1),
-        rig.lengths,
-        strict=True,
-    ):
+    first = rig.tip_body + 1 - len(rig.lengths)
+    for body, length in enumerate(rig.lengths, first):
         jacobian = np.zeros((3, model.nv))
         mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
         axis = data.xmat[body].reshape(3, 3)[:, 2]

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.devices import Discretisation, get
-from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import pair, pressed, rod, two_rods
 from cathsim_dmc.validation.rig import Rig
 
@@ -38,29 +36,6 @@ def test_what_is_pressed_on_the_wall_lies_still():
         rattles = pressed.pressed(load, *edge)[1] > 1e-4
         assert rattles == (load >= 1.0)
     assert 0.1e-3 < depth < 0.2e-3
-
-
-def test_depth_and_law_agree_with_the_iteration_in_which_they_settle():
-    """α (1 + m) < 2 at every depth, as `entities.contact` says; see docs/physics.md."""
-
-    def growth(solref, solimp):
-        least, most, width, middle, power = solimp
-        depth = np.linspace(0.01, 0.99, 400) * width
-        x = depth / width
-        low = x**power / middle ** (power - 1)
-        high = 1 - (1 - x) ** power / (1 - middle) ** (power - 1)
-        d = least + (most - least) * np.where(x <= middle, low, high)
-        slope = np.gradient(np.log(d * d / (1 - d)), np.log(depth))
-        stiffness, damping = (-value for value in solref)
-        # MuJoCo scales what it is given by the largest impedance.
-        stiffness, damping = stiffness / most**2, damping / most
-        step = stiffness * d * PHYSICS_TIMESTEP
-        return depth, step / (step + damping) * (1 + slope)
-
-    _, law = growth(contact.CONTACT_SOLREF, contact.CONTACT_SOLIMP)
-    assert law.max() < 1.7
-    depth, edge = growth((-1 / 0.003**2, -2 / 0.003), (0.7, 0.999, 0.0003, 0.5, 1))
-    assert depth[np.argmax(edge > 2)] == pytest.approx(0.23e-3, abs=0.01e-3)
 
 
 def test_a_turned_shape_is_the_shape_turned():

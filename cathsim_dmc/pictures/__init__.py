@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.imaging import FluoroscopyOptions
-from cathsim_dmc.pictures.moment import Moment
+from cathsim_dmc.pictures.moment import Moment, xray
 from cathsim_dmc.pictures.readout import ForceReadout, forces
 from cathsim_dmc.pictures.recorded import record, write
 from cathsim_dmc.recording.episode import Episode
@@ -30,11 +30,7 @@ __all__ = [
 
 
 def show(
-    env: Any,
-    episode: Episode | None = None,
-    *,
-    step: int = -1,
-    **options: Any,
+    env: Any, episode: Episode | None = None, *, step: int = -1, **options: Any
 ) -> Any:
     """Draw anatomy, device, goal and contact forces.
 
@@ -76,7 +72,5 @@ def fluoroscopy(env: Any, seed: int = 0, **options: Any) -> np.ndarray:
         TypeError: it is no environment of this package, or there is no such option.
         ValueError: an option's value is not possible.
     """
-    from cathsim_dmc.pictures.moment import xray
-
     base: FluoroscopyOptions = navigation_of(env).config.fluoroscopy
     return xray(Moment.of(env), dataclasses.replace(base, **options), seed)

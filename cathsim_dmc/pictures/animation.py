@@ -4,15 +4,14 @@ import dataclasses
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from matplotlib.patches import Circle
 from PIL import Image
 
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.pictures import figure as drawing
-from cathsim_dmc.pictures.moment import Moment, xray
+from cathsim_dmc.pictures.moment import Moment
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 
@@ -44,7 +43,7 @@ def animate(
     the X-ray image over the force on the wall.
 
     Args:
-        surface: Lumen surface with `vertices` and `faces`.
+        surface: Lumen surface, `anatomy.surface`.
         path: File to write, `.gif` or `.webp`.
         frames: Number of pictures at most; an episode has one state every 40 ms.
         width: Width of the film, pixels.
@@ -58,7 +57,8 @@ def animate(
         FileNotFoundError: if the folder does not exist.
     """
     path = Path(path)
-    check_film(path)
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"a film is a {' or '.join(SUFFIXES)} file, not {path.name}")
     seconds = np.clip(episode.time[-1] - episode.time[0], *_LENGTH)
     count = min(frames, episode.steps + 1)
     chosen = np.unique(np.linspace(0, episode.steps, count).round().astype(int))
@@ -74,12 +74,6 @@ def animate(
         kind = path.suffix[1:].upper()
         pictures[0].save(temporary, format=kind, save_all=True, **options)
     return path
-
-
-def check_film(path: Path) -> None:
-    """Raise ValueError unless a film of this name can be written."""
-    if path.suffix not in SUFFIXES:
-        raise ValueError(f"a film is a {' or '.join(SUFFIXES)} file, not {path.name}")
 
 
 def _one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
@@ -101,22 +95,20 @@ def _frames(
     # One pixel of the glass for each of the film.
     pixels = rough.pixels * round(height) / rough.shape[0]
     projection = dataclasses.replace(rough, pixels=pixels)
-    rest = glass(surface.vertices, surface.faces, projection)
+    rest = glass(surface, projection)
     size, share = (width / _DPI, height / _DPI), left / (left + 0.66)
     figure = drawing.Picture(figsize=size, dpi=_DPI, facecolor="white")
     scene = figure.add_axes((0, 0, share, 1))
     beside = figure.add_axes((share + 0.01, 0.34, 0.98 - share, 0.64))
-    cursor = _draw_force(
-        figure.add_axes((share + 0.09, 0.1, 0.89 - share, 0.19)), episode
-    )
-    image = None
+    below = figure.add_axes((share + 0.09, 0.1, 0.89 - share, 0.19))
+    cursor, window = _draw_force(below, episode), None
     for step in steps.tolist():
         moment = Moment.of_episode(episode, surface, step)
         scene.clear()
         scene.axis("off")
         pane, now = rest, moment.surface
         if now is not surface:
-            pane = glass(now.vertices, now.faces, projection)
+            pane = glass(now, projection)
         drawing.draw_scene(scene, moment, projection, pane)
         time = float(episode.time[step] - episode.time[0])
         text = f"{episode.task}   {time:4.1f} s"
@@ -127,12 +119,9 @@ def _frames(
             # In a small film the label must not run under the X-ray image.
             fontsize=np.clip(width / 65, 6.5, 10), fontweight="bold", zorder=10,
         )  # fmt: skip
-        if image is None:
-            image = drawing.draw_fluoroscopy(beside, moment, FLUOROSCOPY, step)
-            beside.set_title("")
-        image.set_data(xray(moment, FLUOROSCOPY, step))
-        ring = cast(Circle, beside.patches[0])
-        ring.center = drawing.goal_ring(moment, FLUOROSCOPY)[0]
+        beside.clear()
+        window = drawing.draw_fluoroscopy(beside, moment, FLUOROSCOPY, step, window)
+        beside.set_title("")
         cursor.set_xdata([time, time])
         figure.agg.draw()
         yield np.asarray(figure.agg.buffer_rgba())[..., :3].copy()

@@ -58,10 +58,7 @@ _WIDEST_IN, _LETTERING_IN = 16.0, 1.2
 
 
 class Picture(Figure):
-    """A figure that notebooks show without pyplot.
-
-    Its axes have the colours and scales of `cathsim_dmc.style`.
-    """
+    """A figure in the style of `cathsim_dmc.style`, which notebooks show."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         """As `matplotlib.figure.Figure`, on the canvas that needs no screen."""
@@ -92,14 +89,11 @@ def force_map() -> LinearSegmentedColormap:
 def background(
     surface: Any, view: str, size: int, rest: Any = None
 ) -> tuple[ParallelProjection, Glass]:
-    """A vessel as glass in one of `VIEWS`, with `size` pixels along the longer side.
-
-    `rest` is the surface on which the view is centred, where that is another.
-    """
+    """A vessel as glass, `size` pixels long, in a view that `rest` (or it) centres."""
     _, right, up, *_ = VIEWS[view]
     middle = (rest or surface).vertices
     projection = ParallelProjection.of(middle, right, up, size=size)
-    return projection, glass(surface.vertices, surface.faces, projection)
+    return projection, glass(surface, projection)
 
 
 def anatomy_figure(anatomy: Anatomy) -> Picture:
@@ -123,10 +117,10 @@ def draw_anatomy(axes: Any, anatomy: Anatomy, view: str = "front") -> None:
         axes.plot(*line.T, color=COLOURS[number % len(COLOURS)], lw=1.4, label=name)
         axes.annotate(name, line[-1], (2, 2), textcoords="offset points", fontsize=6)
     for goal in anatomy.goals.values():
-        x, y = projection.flat_mm(goal.position).tolist()
-        ring = Circle((x, y), GOAL_RADIUS_MM, fill=False, ec=GOAL_COLOUR, lw=0.8)
+        place = projection.flat_mm(goal.position).tolist()
+        ring = Circle(place, GOAL_RADIUS_MM, fill=False, ec=GOAL_COLOUR, lw=0.8)
         axes.add_patch(ring)
-        axes.plot(x, y, ".", color=GOAL_COLOUR, ms=4)
+        axes.plot(*place, ".", color=GOAL_COLOUR, ms=4)
     inlet = anatomy.inlet
     ends = inlet.position + np.outer((0.015, -0.015), inlet.direction)
     arrow = {"arrowstyle": "->", "color": "k"}
@@ -186,14 +180,12 @@ def scene_figure(
         )  # fmt: skip
     if fluoroscopy:
         draw_fluoroscopy(panels[-1], moment)
-    caption, magnitude = f"{moment.title}; no contact with the wall", moment.magnitude
+    caption, magnitude = "no contact with the wall", moment.magnitude
     if count := len(magnitude):
-        caption = (
-            f"{moment.title}; {count} contact{'s' * (count > 1)}, "
-            f"{force_text(magnitude.sum())} in all, {force_text(magnitude.max())} the "
-            "largest"
-        )
-    figure.suptitle(caption, fontsize=11)
+        total, largest = force_text(magnitude.sum()), force_text(magnitude.max())
+        caption = f"{count} contact{'s' * (count > 1)}, {total} in all, "
+        caption += f"{largest} the largest"
+    figure.suptitle(f"{moment.title}; {caption}", fontsize=11)
     return figure
 
 
@@ -204,10 +196,10 @@ def draw_scene(
     extent = projection.extent_mm
     axes.imshow(picture.behind, extent=extent, zorder=1, interpolation="bilinear")
     _prepare(axes, projection, None)
-    x, z = projection.flat_mm(moment.goal).tolist()
+    goal, radius = projection.flat_mm(moment.goal).tolist(), 1e3 * moment.goal_radius
     inside = {"fc": GOAL_COLOUR, "alpha": 0.22, "zorder": 2}
     for look in (inside, {"fill": False, "lw": 1.6, "zorder": 7}):
-        axes.add_patch(Circle((x, z), 1e3 * moment.goal_radius, ec=GOAL_COLOUR, **look))
+        axes.add_patch(Circle(goal, radius, ec=GOAL_COLOUR, **look))
     way = projection.flat_mm(moment.path)
     axes.plot(*way.T, color=PATH_COLOUR, lw=0.9, zorder=3)
     _draw_device(axes, moment, projection)
@@ -232,15 +224,11 @@ def _draw_device(axes: Any, moment: Moment, projection: ParallelProjection) -> N
     for colour, share in (("white", 1.5), (dark, 1.0), (light, 0.35)):
         look = {"linewidths": share * width, "colors": colour, "capstyle": "round"}
         axes.add_collection(LineCollection(list(pieces), zorder=4, **look))
-    dots = [
-        (end, 1.3 * width.max(), DEVICES[number % len(DEVICES)][1], "0.1")
-        for number, end in enumerate(projection.flat_mm(moment.ends))
-    ]
-    for place, size, colour, edge in (
-        *dots,
-        (line[-1], 1.6 * width[-1], HEAD_COLOUR, "white"),
-    ):
-        axes.plot(*place, "o", ms=size, mfc=colour, mec=edge, mew=0.8, zorder=5)
+    for number, end in enumerate(projection.flat_mm(moment.ends)):
+        look = {"ms": 1.3 * width.max(), "mfc": DEVICES[number % len(DEVICES)][1]}
+        axes.plot(*end, "o", **look, mec="0.1", mew=0.8, zorder=5)
+    look = {"ms": 1.6 * width[-1], "mfc": HEAD_COLOUR}
+    axes.plot(*line[-1], "o", **look, mec="white", mew=0.8, zorder=5)
 
 
 def _draw_forces(axes: Any, moment: Moment, projection: ParallelProjection) -> None:
@@ -262,44 +250,39 @@ def _draw_forces(axes: Any, moment: Moment, projection: ParallelProjection) -> N
     )  # fmt: skip
     top = int(magnitude.argmax())
     end = place[top] + (along[top] if strong[top] else 0)
-    beyond = bool(end[0] > np.mean(axes.get_xlim()))  # what stands beside hides it
+    # What stands beside the axes hides text on their right.
+    side, shift = ("right", -5) if end[0] > np.mean(axes.get_xlim()) else ("left", 5)
     box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75}
     axes.annotate(
-        force_text(magnitude[top]), end, xytext=(-5 if beyond else 5, 4),
-        ha="right" if beyond else "left", textcoords="offset points", fontsize=9,
-        fontweight="bold", color="0.1", bbox=box, zorder=9,
+        force_text(magnitude[top]), end, xytext=(shift, 4), ha=side, bbox=box, zorder=9,
+        textcoords="offset points", fontsize=9, fontweight="bold", color="0.1",
     )  # fmt: skip
 
 
 def draw_fluoroscopy(
     axes: Any,
     moment: Moment,
-    options: FluoroscopyOptions | None = None,
+    options: FluoroscopyOptions = FLUOROSCOPY,
     seed: int = 0,
+    window: Any = None,
 ) -> Any:
     """Draw the X-ray image of a moment, with the goal as a ring.
 
+    Args:
+        window: Grey levels that are black and white; percentiles of the image if None.
+
     Returns:
-        matplotlib's image, whose data another moment may replace.
+        The window.
     """
-    options = options or FLUOROSCOPY
-    frame = xray(moment, options, seed)
-    black, white = np.percentile(frame, WINDOW)
-    image = axes.imshow(
-        frame, cmap="gray", vmin=black, vmax=white, interpolation="bilinear"
-    )
-    (column, row), radius = goal_ring(moment, options)
+    frame, carm = xray(moment, options, seed), fluoroscope_of(moment.rest, options).carm
+    black, white = np.percentile(frame, WINDOW) if window is None else window
+    axes.imshow(frame, cmap="gray", vmin=black, vmax=white, interpolation="bilinear")
+    (column, row), depth = carm.project(moment.goal)
+    radius = moment.goal_radius * carm.focal_length / float(depth)
     ring = Circle((column, row), radius, fill=False, ec=GOAL_LIGHT, lw=1.4)
     axes.add_patch(ring)
     axes.set_title("fluoroscopy", fontsize=10)
     axes.set_xticks([])
     axes.set_yticks([])
     axes.spines[:].set_visible(True)
-    return image
-
-
-def goal_ring(moment: Moment, options: FluoroscopyOptions) -> tuple[np.ndarray, float]:
-    """Middle (column, row) and radius of the goal in the X-ray image, pixels."""
-    carm = fluoroscope_of(moment.rest, options).carm
-    middle, depth = carm.project(moment.goal)
-    return middle, moment.goal_radius * carm.focal_length / float(depth)
+    return black, white

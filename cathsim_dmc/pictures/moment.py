@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions, Shadow
-from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale
-from cathsim_dmc.recording.living import VesselRecord
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
+from cathsim_dmc.recording.records import CoaxialRecord, VesselRecord
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,8 +70,7 @@ class Moment:
         """A state of a recorded episode.
 
         Args:
-            step: Number of the state, 0 at the start; negative ones count from the
-                end.
+            step: Number of the state; negative ones count from the end.
 
         Raises:
             IndexError: if the episode has no such state.
@@ -87,21 +85,19 @@ class Moment:
             raise ValueError("the episode was recorded without a goal")
         # Contacts of state t + 1 belong to step t.
         there = episode.contact_step == step - 1
-        record, coaxial = VesselRecord.of(episode), CoaxialRecord.of(episode)
-        now = surface if record is None else record.surface(surface, episode.time[step])
-        own: dict[str, np.ndarray] = {"radius": episode.radii}
-        if coaxial is not None:
-            outermost = coaxial.outermost(episode.catheter)[step]
-            own = {
-                "outermost": outermost,
-                "radius": coaxial.radii[outermost],
-                "ends": coaxial.ends(episode.catheter)[step],
-            }
+        now, own = surface, {"radius": episode.radii}
+        if (record := VesselRecord.of(episode)) is not None:
+            now = record.surface(surface, episode.time[step])
+            goal = record.series["goal"][step]
+        if (coaxial := CoaxialRecord.of(episode)) is not None:
+            own = {"outermost": coaxial.outermost(episode.catheter)[step]}
+            own["ends"] = coaxial.ends(episode.catheter)[step]
+            own["radius"] = coaxial.radii[own["outermost"]]
         return cls(
             surface=now,
             rest=surface,
             device=episode.catheter[step],
-            goal=np.asarray(goal if record is None else record.goal[step], np.float64),
+            goal=np.asarray(goal, np.float64),
             goal_radius=float(episode.meta["goal_radius"]),
             position=episode.contact_position[there],
             force=episode.contact_force[there],
@@ -120,11 +116,7 @@ def fluoroscope_of(surface: Any, options: FluoroscopyOptions) -> Any:
 
 
 def xray(moment: Moment, options: FluoroscopyOptions, seed: int = 0) -> np.ndarray:
-    """The X-ray image (rows, columns) uint8 of a moment.
-
-    Args:
-        seed: Seed of the quantum noise, if the options ask for noise.
-    """
+    """The X-ray image (rows, columns) uint8 of a moment; `seed` of its noise."""
     state = np.random.RandomState(seed) if options.noise else None
     fluoroscope = fluoroscope_of(moment.rest, options)
     if moment.surface is not moment.rest:

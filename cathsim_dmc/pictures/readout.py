@@ -47,12 +47,8 @@ class ForceReadout:
 
     def __repr__(self) -> str:
         """A table of the contacts and a line of the other forces."""
-        total, largest, peak, push = (
-            f"{1e3 * force:.2f} mN"
-            for force in (
-                self.wall_sum, self.wall_max, self.wall_peak_max, self.push_force
-            )
-        )  # fmt: skip
+        shown = self.wall_sum, self.wall_max, self.wall_peak_max, self.push_force
+        total, largest, peak, push = (f"{1e3 * force:.2f} mN" for force in shown)
         cell = ", ".join(f"{1e3 * force:.1f}" for force in self.load_cell)
         lines = [
             f"{len(self)} contact{'s' * (len(self) != 1)} with the wall: sum {total}, "

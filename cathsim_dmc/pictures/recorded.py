@@ -11,8 +11,8 @@ import numpy as np
 from cathsim_dmc import policies
 from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions, Shadow
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.living import MESH_EVERY, VesselRecord
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
+from cathsim_dmc.recording.records import MESH_EVERY, VesselRecord
 
 # A name of `policies.POLICIES`, a policy, or a function from the observation (a
 # dictionary of arrays) to the action (A,).
@@ -138,7 +138,7 @@ def xray_film(
     """X-ray images of all states of an episode, with the contrast of a screen.
 
     Args:
-        surface: Lumen surface with `vertices` and `faces`.
+        surface: Lumen surface, `anatomy.surface`.
 
     Returns:
         (T + 1, rows, columns, planes) uint8, the frontal plane first. The darkest and

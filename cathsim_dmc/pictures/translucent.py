@@ -1,13 +1,12 @@
 """A vessel as translucent glass, drawn by numpy: no OpenGL, no window.
 
-A device in a vessel is seen through the wall in front of it. Painting triangles one
-over the other with transparency shows every seam between them, so the hits of all
-pixels with all triangles are found first, sorted by depth and laid over each other
-pixel by pixel. Glass is denser where one looks along it, which draws the outline.
+Painted one over the other, translucent triangles show their seams: all hits of pixels
+are sorted by depth first. Glass is denser along the line of sight, at the outline.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,19 +25,13 @@ _LAYERS = 16  # walls behind each other; further ones are hidden by these
 
 @dataclass(frozen=True)
 class ParallelProjection:
-    """A parallel projection of the world onto a picture.
+    """A parallel projection of the world onto a picture."""
 
-    Attributes:
-        right, up: Unit vectors (3,) of the picture's axes, world frame.
-        low, high: Corners (2,) of the picture along `right` and `up`, metres.
-        pixels: Number of pixels along a metre.
-    """
-
-    right: np.ndarray
-    up: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    pixels: float
+    right: np.ndarray  # unit vector (3,) of the picture's axis, world frame
+    up: np.ndarray  # likewise
+    low: np.ndarray  # corner (2,) of the picture along `right` and `up`, metres
+    high: np.ndarray  # likewise
+    pixels: float  # number of pixels along a metre
 
     @classmethod
     def of(
@@ -50,12 +43,10 @@ class ParallelProjection:
         margin: float = 6e-3,
         size: int = 900,
     ) -> "ParallelProjection":
-        """A view that shows all vertices.
+        """A view that shows all vertices, from the front (AP) by default.
 
         Args:
             vertices: (V, 3), world frame, metres.
-            right, up: Unit vectors (3,) of the picture's axes; from the front (AP) of
-                the patient frame (LPS) by default.
             margin: Space around the vertices, metres.
             size: Number of pixels along the longer side.
         """
@@ -91,31 +82,18 @@ class ParallelProjection:
         return (flat - corner) * [self.pixels, -self.pixels]
 
 
-@dataclass(frozen=True, eq=False)
-class Glass:
-    """Pictures (rows, columns, 4) of a vessel, float64 in [0, 1], not premultiplied.
+class Glass(NamedTuple):
+    """Pictures (rows, columns, 4) of a vessel, float64 in [0, 1], not premultiplied."""
 
-    Attributes:
-        behind: All walls, to be drawn first.
-        glaze: The nearest wall, to be drawn over the device.
-    """
-
-    behind: np.ndarray
-    glaze: np.ndarray
+    behind: np.ndarray  # all walls, to be drawn first
+    glaze: np.ndarray  # the nearest wall, to be drawn over the device
 
 
-def glass(
-    vertices: np.ndarray, faces: np.ndarray, projection: ParallelProjection
-) -> Glass:
-    """Draw a closed surface as translucent glass.
-
-    Args:
-        vertices: (V, 3), metres, world frame.
-        faces: (F, 3), counter-clockwise seen from outside.
-    """
+def glass(surface: Surface, projection: ParallelProjection) -> Glass:
+    """Draw a closed surface as translucent glass."""
     fine = replace(projection, pixels=projection.pixels * _SAMPLES)
     rows, columns = (_SAMPLES * n for n in projection.shape)
-    pixel, depth, normal = _hits(vertices, faces, fine, (rows, columns))
+    pixel, depth, normal = _hits(surface, fine, (rows, columns))
     order = np.lexsort((depth, pixel))  # within a pixel, the farthest first
     pixel, normal = pixel[order], normal[order]
     slant = 1.0 - np.abs(normal[:, 2:])
@@ -133,10 +111,11 @@ def glass(
     return Glass(*(_smaller(each, projection.shape) for each in (behind, glaze)))
 
 
-def _hits(vertices, faces, projection, shape):
+def _hits(surface: Surface, projection: ParallelProjection, shape: tuple[int, int]):
     """Pixels (H,), depths (H,) towards the viewer and unit normals (H, 3) of hits."""
+    vertices, faces = surface.vertices, surface.faces
     frame = np.stack([projection.right, projection.up, projection.towards], axis=1)
-    normals = Surface(vertices, faces).normals @ frame
+    normals = surface.normals @ frame
     flat = projection.pixel(vertices)[faces]  # (F, 3, 2)
     depth = (vertices @ projection.towards)[faces]
     # Pixels of the boxes around the triangles.

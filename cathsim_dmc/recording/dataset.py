@@ -48,26 +48,19 @@ def write(
     import minari
     from minari.dataset.minari_storage import MinariStorage
 
-    name = path.name
+    name, spaces = path.name, (observation_space, action_space)
+    about = {
+        # The last part of an id is a name with a version.
+        "dataset_id": name if re.search(r"-v\d+$", name) else f"{name}-v0",
+        "algorithm_name": algorithm,
+        "description": description,
+        "minari_version": minari.__version__,
+    }
     with atomic_directory(path) as temporary:
-        storage = MinariStorage.new(
-            # Minari looks for the files of a relative path beneath that path again.
-            temporary.absolute() / "data",
-            observation_space,
-            action_space,
-            env_spec,
-            "hdf5",
-            jpeg_encoding=False,
-        )
-        storage.update_metadata(
-            {
-                # The last part of an id is a name with a version.
-                "dataset_id": name if re.search(r"-v\d+$", name) else f"{name}-v0",
-                "algorithm_name": algorithm,
-                "description": description,
-                "minari_version": minari.__version__,
-            }
-        )
+        # Minari looks for the files of a relative path beneath that path again.
+        data = temporary.absolute() / "data"
+        storage = MinariStorage.new(data, *spaces, env_spec, jpeg_encoding=False)
+        storage.update_metadata(about)
         storage.update_episodes(buffers)
     return path
 
@@ -95,9 +88,8 @@ def read_episodes(path: str | os.PathLike[str]) -> Iterator[Any]:
         )
     try:
         # Without its spaces Minari would make the environment that the file names.
-        if not {"observation_space", "action_space"} <= set(
-            json.loads(data.read_text())
-        ):
+        named = json.loads(data.read_text())
+        if not {"observation_space", "action_space"} <= set(named):
             raise ValueError("metadata.json lacks the spaces")
         for number, episode in enumerate(minari.MinariDataset(data.parent)):
             _check_episode(episode, number)
@@ -111,10 +103,8 @@ def read_episodes(path: str | os.PathLike[str]) -> Iterator[Any]:
 
 def _check_episode(episode: Any, number: int) -> None:
     """Raises ValueError unless all columns are as long as they must be, and finite."""
-    steps = len(episode.actions)
-    columns = {
-        name: (episode.observations[name], steps + 1) for name in episode.observations
-    }
+    steps, seen = len(episode.actions), episode.observations
+    columns = {name: (seen[name], steps + 1) for name in seen}
     for name in ("actions", "rewards", "terminations", "truncations"):
         columns[name] = getattr(episode, name), steps
     for name, (values, length) in columns.items():

@@ -1,8 +1,6 @@
 """One recorded episode: states, actions, rewards and contact forces.
 
-The record is independent of any scene: it holds world-frame arrays and a JSON
-dictionary, so statistics, heatmaps and Rerun files can be made from it long after
-the environment is gone, on a machine that has neither MuJoCo nor Rerun.
+It holds world-frame arrays and a JSON dictionary, and needs neither scene nor MuJoCo.
 """
 
 import json
@@ -99,9 +97,8 @@ class Episode:
             object.__setattr__(self, "seed", bounds.whole("seed", self.seed))
         object.__setattr__(self, "meta", _checked_meta(self.meta))
         states = np.size(self.time)
-        sizes = {
-            "state": states, "step": states - 1, "contact": np.size(self.contact_step),
-        }  # fmt: skip
+        sizes = {"state": states, "step": states - 1}
+        sizes["contact"] = np.size(self.contact_step)
         for name, (axis, tail) in _AXES.items():
             kinds, dtype = "biuf", np.float64
             if name == "contact_step":
@@ -152,13 +149,8 @@ class Episode:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the episode to a ``.npz``, whole or not at all."""
-        header = {
-            "format": FORMAT,
-            "version": FORMAT_VERSION,
-            "task": self.task,
-            "seed": self.seed,
-            "meta": self.meta,
-        }
+        header = {"format": FORMAT, "version": FORMAT_VERSION, "task": self.task}
+        header |= {"seed": self.seed, "meta": self.meta}
         arrays = {name: getattr(self, name) for name in _AXES}
         arrays["header"] = np.array(json.dumps(header))
         with atomic_path(path, SUFFIX) as temporary, open(temporary, "wb") as stream:

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from cathsim_dmc.anatomy.centreline import arc_lengths
+
 # Top of the colour scale, newtons. Published in-contact forces lie mostly within
 # 0-0.2 N with outliers above 0.4 N, so ordinary contacts use half the scale.
 FORCE_COLOUR_MAX = 0.4
@@ -19,28 +21,21 @@ _FORCE_COLOURS = np.array(
 def force_colours(
     magnitude: np.ndarray, largest: float = FORCE_COLOUR_MAX
 ) -> np.ndarray:
-    """Return RGB colours (..., 3) uint8 of force magnitudes (...,) in newtons.
-
-    The scale is linear from 0 to ``largest`` and saturates above.
-    """
+    """Return RGB colours (..., 3) uint8 of forces (...,), N; up to ``largest``."""
     stops = np.linspace(0.0, largest, len(_FORCE_COLOURS))
     mixed = [np.interp(magnitude, stops, one) for one in _FORCE_COLOURS.T]
     return np.round(np.stack(mixed, axis=-1)).astype(np.uint8)
 
 
 def force_scale(magnitude: np.ndarray) -> float:
-    """Return the top of a colour scale for forces (...,), newtons.
-
-    It is at most ``FORCE_COLOUR_MAX``, and no less than the largest force below that.
-    """
+    """Return the top of a scale for forces (...,), N, at most ``FORCE_COLOUR_MAX``."""
     largest = float(np.max(magnitude, initial=0.0))
     return next((top for top in _FORCE_SCALES if largest <= top), FORCE_COLOUR_MAX)
 
 
 def along(points: np.ndarray, way: np.ndarray) -> np.ndarray:
     """Return places (m, 3) on a line (n, 3) at ways (m,) from its first point."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    arc = np.append(0.0, np.cumsum(steps))
+    arc = arc_lengths(points)
     return np.stack([np.interp(way, arc, axis) for axis in points.T], axis=-1)
 
 

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc import __version__, bounds, files
-from cathsim_dmc.recording import sequences
+from cathsim_dmc.recording import coco, sequences
 from cathsim_dmc.recording.sequences import KEYPOINTS, KITS, ImageSetOptions
 
 SPLITS = {"train": "train", "val": "train", "test": "test"}  # and their sets of arches
@@ -139,11 +139,8 @@ def _shards(out: Path, options: ImageSetOptions) -> list[_Shard]:
 
 def _write_shard(shard: _Shard) -> tuple[int, str, Labels]:
     """Writes one anatomy unless it is there: new frames, a line about it, labels."""
-    from cathsim_dmc.recording import coco
-
     rows, line = (0, "") if shard.path.exists() else _simulate_shard(shard)
-    labels = coco.labels(shard.path, shard.number, shard.options.pictures)
-    return rows, line, labels
+    return rows, line, coco.labels(shard.path, shard.number, shard.options.pictures)
 
 
 def _simulate_shard(shard: _Shard) -> tuple[int, str]:
@@ -185,8 +182,6 @@ def _over(work: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterab
 
 def _label(out: Path, shards: list[_Shard], labels: list[Labels]) -> dict[str, int]:
     """Writes the labels of each split; the number of its images."""
-    from cathsim_dmc.recording import coco
-
     frames = {}
     for split in SPLITS:
         joined: dict[str, Any] = {

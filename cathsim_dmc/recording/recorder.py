@@ -13,12 +13,12 @@ import numpy as np
 from dm_control.rl import control
 
 from cathsim_dmc import __version__, bounds
-from cathsim_dmc.recording.coaxial import SERIES, device_meta
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.living import vessel_state
+from cathsim_dmc.recording.records import DEVICE_SERIES, device_meta, vessel_state
 from cathsim_dmc.simulation.episodes import ComposerSimulation, play
 
 Policy = Callable[[Any], np.ndarray]
+_TERM = "reward_"  # before the names of reward terms
 
 
 def navigation_of(env: Any) -> Any:
@@ -36,12 +36,9 @@ def navigation_of(env: Any) -> Any:
 class _Rows(collections.defaultdict[str, list]):
     """Growing lists, one per array of an episode."""
 
-    def add(self, values: dict[str, Any]) -> None:
+    def add(self, **values: Any) -> None:
         for name, value in values.items():
             self[name].append(value)
-
-    def array(self, name: str, row_shape: tuple[int, ...] = ()) -> np.ndarray:
-        return np.array(self[name]) if self[name] else np.zeros((0, *row_shape))
 
 
 class EpisodeRecorder:
@@ -96,7 +93,7 @@ class EpisodeRecorder:
         turns = play(ComposerSimulation(self._env), choose)
         next(turns)
         rows = _Rows(list)
-        rows.add(self._state())
+        rows.add(**self._state())
         steps, end = 0, {"termination": None, "discount": 1.0}
         try:
             for action, timestep, _ in itertools.islice(turns, max_steps):
@@ -108,9 +105,7 @@ class EpisodeRecorder:
                 lost = alone and not timestep.discount
                 if lost or termination == "physics_error":
                     raise control.PhysicsError("the environment ended the episode")
-                rows.add(self._state())
-                rows.add({"action": action, "reward": float(timestep.reward)})
-                self._add_forces(rows, steps)
+                self._add_step(rows, steps, action, float(timestep.reward))
                 steps += 1
         except control.PhysicsError as error:
             end |= {"termination": "physics_error", "error": str(error)}
@@ -122,10 +117,8 @@ class EpisodeRecorder:
     def present(self) -> Episode:
         """The present state as an episode of one step, whose contacts are present."""
         rows = _Rows(list)
-        rows.add(self._state())
-        rows.add(self._state())
-        rows.add({"action": np.zeros(self._env.action_spec().shape), "reward": 0.0})
-        self._add_forces(rows, 0)
+        rows.add(**self._state())
+        self._add_step(rows, 0, np.zeros(self._env.action_spec().shape), 0.0)
         return self._episode(rows, None, {"termination": None, "discount": 1.0})
 
     def _action(self, policy: Policy, timestep: Any) -> np.ndarray:
@@ -134,30 +127,27 @@ class EpisodeRecorder:
         return np.array(action, dtype=np.float64)
 
     def _state(self) -> dict[str, Any]:
-        data, readings, devices = (
-            self._env.physics.data, self._task.readings, self._task.devices
-        )  # fmt: skip
-        coaxial = {} if devices is None else {n: getattr(devices, n) for n in SERIES}
-        vessel = vessel_state(self._task)
+        data, task = self._env.physics.data, self._task
+        vessel = vessel_state(task)
+        series = () if task.devices is None else DEVICE_SERIES
         return {
-            **coaxial,
+            **{name: getattr(task.devices, name) for name in series},
             "time": float(data.time),
             "qpos": np.array(data.qpos),
-            "catheter": np.array(readings.centreline),
+            "catheter": np.array(task.readings.centreline),
             "body_pos": np.array(data.xpos),
             "body_quat": np.array(data.xquat),
-            "base_insertion": float(readings.insertion),
+            "base_insertion": float(task.readings.insertion),
             **({"vessel": vessel} if vessel else {}),
         }
 
-    def _add_forces(self, rows: _Rows, step: int) -> None:
-        """Adds forces, contacts and reward terms of the step that has just ended."""
-        task, prefix = self._task, "reward_"
-        rows.add({name: float(one) for name, one in task.wall_force.named().items()})
-        rows.add({"push_force": float(task.readings.push_force)})
-        for name, value in task.info().items():
-            if name.startswith(prefix):
-                rows[name].append(value)
+    def _add_step(self, rows: _Rows, step: int, action: Any, reward: float) -> None:
+        """Adds what the step that has just ended has led to."""
+        task, terms = self._task, self._task.info().items()
+        rows.add(**self._state(), action=action, reward=reward)
+        rows.add(**{name: float(one) for name, one in task.wall_force.named().items()})
+        rows.add(push_force=float(task.readings.push_force))
+        rows.add(**{name: one for name, one in terms if name.startswith(_TERM)})
         contacts = task.contacts(self._env.physics)
         there = contacts.present
         rows["contact_position"] += list(contacts.position[there])
@@ -165,22 +155,21 @@ class EpisodeRecorder:
         rows["contact_step"] += [step] * int(there.sum())
 
     def _episode(self, rows: _Rows, seed: int | None, end: dict[str, Any]) -> Episode:
+        meta = self._meta(rows, end)
+        names = set(Episode.__annotations__) - {"task", "seed", "meta"}
+        arrays = {name: np.array(rows[name]) for name in names}
+        arrays["insertion"] = np.array(rows["base_insertion"])
         shapes = {"action": self._env.action_spec().shape}
-        shapes |= dict.fromkeys(("contact_position", "contact_force"), (3,))
-        names = set(Episode.__annotations__) - {"task", "seed", "meta", "insertion"}
-        return Episode(
-            task=self._task_name,
-            seed=seed,
-            meta=self._meta(rows, end),
-            insertion=rows.array("base_insertion"),
-            **{name: rows.array(name, shapes.get(name, ())) for name in names},
-        )
+        shapes |= {"contact_position": (3,), "contact_force": (3,)}
+        for name, shape in shapes.items():
+            arrays[name] = arrays[name].reshape(-1, *shape)  # of no rows, too
+        return Episode(self._task_name, seed, meta, **arrays)
 
     def _meta(self, rows: _Rows, end: dict[str, Any]) -> dict[str, Any]:
         model, task = self._env.physics.model, self._task
         termination = end["termination"] or "truncated"
         goal = task.objective.goal.reshape(3)
-        peaks, prefix = ("wall_force_peak_sum", "wall_force_peak_max"), "reward_"
+        peaks = ("wall_force_peak_sum", "wall_force_peak_max")
         meta = {
             "success": termination == "success",
             **end,
@@ -198,15 +187,16 @@ class EpisodeRecorder:
             * len(task.scene.catheter.links),
             **{name: rows[name] for name in peaks},
             "reward_terms": {
-                name.removeprefix(prefix): values
+                name.removeprefix(_TERM): values
                 for name, values in rows.items()
-                if name.startswith(prefix)
+                if name.startswith(_TERM)
             },
             "goal_position": goal.tolist(),
             "goal_radius": float(task.objective.goal_radius),
         }
         if task.devices is not None:
-            meta["devices"] = device_meta(task, {n: rows.array(n) for n in SERIES})
+            series = {name: np.array(rows[name]) for name in DEVICE_SERIES}
+            meta["devices"] = device_meta(task.scene.catheter, series)
         if states := rows["vessel"]:
             moving = task.rollout.moving
             meta["vessel"] = {
@@ -214,6 +204,6 @@ class EpisodeRecorder:
                 **(moving.record() if moving else {"lattice": [], "parameters": []}),
             }
             goal = np.array(meta["vessel"]["goal"])
-        head = rows.array("catheter")[:, -1]
+        head = np.array(rows["catheter"])[:, -1]
         meta["distance"] = np.linalg.norm(head - goal, axis=-1).tolist()
         return meta

@@ -1,13 +1,13 @@
-"""Episodes as Rerun recordings.
+"""Episodes as Rerun recordings: scene, fluoroscopy, series, and their layout.
 
-One file holds one episode: the scene in 3D, the fluoroscopy if there is any, every
-series over simulated time, and the layout that opens them.
 Whole series are sent as columns, so the cost does not grow with calls per step.
 """
 
+import io
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -18,17 +18,14 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.recording import rerun_scene
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.rerun_scene import BodyGeom
-from cathsim_dmc.recording.rerun_stream import (
-    FLUOROSCOPY,
-    TIMELINE_STEP,
-    TIMELINE_TIME,
-    Log,
-    log_frames,
-    log_series,
-)
+from cathsim_dmc.recording.records import VESSEL_SERIES
+from cathsim_dmc.recording.rerun_scene import TIMELINES, BodyGeom, Log
 
 APPLICATION_ID = "cathsim"
+# Entities of the X-ray planes, frontal first.
+FLUOROSCOPY = ("fluoroscopy", "fluoroscopy_lateral")
+# At this quality noisy frames take about half the size of a PNG.
+JPEG_QUALITY = 90
 _PLANE_NAMES = ("Fluoroscopy, frontal", "Fluoroscopy, second plane")
 # Distance of the eye in extents of the scene: the viewer's vertical field of view
 # is near 45 degrees, which shows 0.83 of the distance.
@@ -87,11 +84,11 @@ def write_rrd(
             stream.send_recording_name(title)
             rerun_scene.log_vessel(log, surface)
             if fluoroscopy is not None:
-                log_frames(log, fluoroscopy)
+                _log_frames(log, fluoroscopy)
             rerun_scene.log_catheter(log)
             rerun_scene.log_bodies(log, robot_geoms)
             rerun_scene.log_contacts(log)
-            log_series(log)
+            _log_series(log)
             data = encoded.read()
             stream.disconnect()
         temporary.write_bytes(data or b"")
@@ -125,30 +122,26 @@ def _layout(
         "rotation_deg": log.coaxial is not None,
         "vessel": log.vessel is not None,
     }
-    plots = [
-        rrb.TimeSeriesView(
-            origin=f"series/{entity}",
-            name=name,
-            plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
-        )
-        for name, entity, legend in _PLOTS
-        if there.get(entity, True)
-    ]
+    plots = []
+    for name, entity, several in _PLOTS:
+        if there.get(entity, True):
+            legend = rrb.PlotLegend(corner="LeftTop", visible=several)
+            look: Any = {"name": name, "plot_legend": legend}
+            plots.append(rrb.TimeSeriesView(origin=f"series/{entity}", **look))
     left = rrb.Vertical(scene, rrb.Horizontal(*insets), row_shares=[3, 2])
     columns = [(left, 5), (rrb.Vertical(*images), 3.4), (rrb.Vertical(*plots), 3)]
     columns, shares = zip(*(columns if planes else columns[::2]), strict=True)
     return rrb.Blueprint(
         rrb.Horizontal(*columns, column_shares=shares),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(
             state="collapsed",
             play_state="playing",
-            timeline=TIMELINE_TIME,
+            timeline=TIMELINES[0],
             loop_mode="all",
         ),
         auto_views=False,
         auto_layout=False,
+        collapse_panels=True,
     )
 
 
@@ -161,14 +154,9 @@ def _world(
     so_far: Sequence[str] = ("world/heat",),
 ) -> rrb.Spatial3DView:
     """A view of the world; of the entities `so_far`, where they have been is shown."""
-    ranges = [
-        rrb.VisibleTimeRange(
-            timeline,
-            start=rrb.TimeRangeBoundary.infinite(),
-            end=rrb.TimeRangeBoundary.cursor_relative(),
-        )
-        for timeline in (TIMELINE_TIME, TIMELINE_STEP)
-    ]
+    start = rrb.TimeRangeBoundary.infinite()
+    end = rrb.TimeRangeBoundary.cursor_relative()
+    ranges = [rrb.VisibleTimeRange(each, start=start, end=end) for each in TIMELINES]
     return rrb.Spatial3DView(
         origin="world",
         name=name,
@@ -184,3 +172,54 @@ def _world(
         line_grid=False,
         overrides={entity: rrb.VisibleTimeRanges(ranges) for entity in so_far},
     )
+
+
+def _log_series(log: Log) -> None:
+    """Log reward with its terms, forces, distance, insertion, vessel and actions."""
+    episode, meta = log.episode, log.episode.meta
+    mm, mn = 1e3, 1e3
+    wall_sum, wall_max = mn * episode.wall_force_sum, mn * episode.wall_force_max
+    for entity, values, label, colour in (
+        ("reward", episode.reward, "reward", [90, 160, 90]),
+        ("force/wall_sum", wall_sum, "wall, sum", [230, 110, 40]),
+        ("force/wall_max", wall_max, "wall, largest contact", [180, 20, 50]),
+        ("force/push", mn * episode.push_force, "push", [80, 120, 210]),
+        ("insertion_mm", mm * episode.insertion, "insertion, mm", [150, 90, 200]),
+    ):
+        log.series(entity, values, label, colour)
+    if "distance" in meta:
+        away = mm * np.array(meta["distance"])
+        log.series("distance_mm", away, "distance to goal, mm", [60, 190, 90])
+    for name, values in meta.get("reward_terms", {}).items():
+        log.series(f"reward/{name}", values, name)
+    if (coaxial := log.coaxial) is not None:
+        for k, name in enumerate(coaxial.names):
+            colour = np.resize(rerun_scene.DEVICE_COLOURS, (k + 1, 3))[k].tolist()
+            for entity, values, label in (
+                (f"insertion_mm/{name}", mm * coaxial.insertion, "mm"),
+                (f"rotation_deg/{name}", np.degrees(coaxial.rotation), "base"),
+                (f"rotation_deg/{name}_end", np.degrees(coaxial.tip_rotation), "end"),
+            ):
+                log.series(entity, values[:, k], f"{name}, {label}", colour)
+    if log.vessel is not None:
+        for name, (factor, label) in VESSEL_SERIES.items():
+            log.series(f"vessel/{name}", factor * log.vessel.series[name], label)
+    # Of several devices, whose names come first; otherwise of joints of the device.
+    names = [str(name) for name in meta.get("action_names", ())]
+    short = [name.rsplit("/", 1)[-1] for name in names]
+    names = short if len(set(short)) == len(names) else names
+    log.series("action", episode.action, names or None, rows=slice(0, -1))
+
+
+def _log_frames(log: Log, frames: np.ndarray) -> None:
+    """Log X-ray images (T+1, H, W, P) as JPEG, one entity for each of P planes."""
+    from PIL import Image
+
+    for plane, entity in enumerate(FLUOROSCOPY[: frames.shape[-1]]):
+        blobs = []
+        for frame in frames[..., plane]:
+            buffer = io.BytesIO()
+            Image.fromarray(frame).save(buffer, "JPEG", quality=JPEG_QUALITY)
+            blobs.append(buffer.getvalue())
+        log.static(entity, rr.EncodedImage.from_fields(media_type="image/jpeg"))
+        log.columns(entity, rr.EncodedImage.columns(blob=blobs))

@@ -2,8 +2,7 @@
 
 import itertools
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -12,14 +11,15 @@ from scipy.spatial.transform import Rotation
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_colours, force_scale
-from cathsim_dmc.recording.living import MESH_EVERY
-from cathsim_dmc.recording.rerun_stream import (
-    MEASURED,
-    SHAFT_COLOUR,
-    Log,
-    device_colours,
-)
+from cathsim_dmc.recording.records import MESH_EVERY, CoaxialRecord, VesselRecord
 
+TIMELINES = ("sim_time", "step")
+SHAFT_COLOUR = (215, 228, 255)
+# Of coaxial devices from the innermost outwards, over and over: a wire is teal, the
+# catheter around it looks as a single device does.
+DEVICE_COLOURS = np.array([(90, 220, 190), SHAFT_COLOUR, (200, 170, 255)], np.uint8)
+# Rows of a series: one for each state, and of what is measured.
+EVERY, MEASURED = slice(None), slice(1, None)
 VESSEL_COLOUR = (225, 140, 130, 60)
 GOAL_COLOUR = (60, 190, 90, 110)
 BLOOD_COLOUR, BLOOD_SCALE = (200, 30, 40), 0.02  # s; an arrow of 20 mm is 1 m/s
@@ -35,6 +35,42 @@ _VISIBLE_GROUPS = 3
 # MuJoCo geom types that a recording can draw, and how many sizes each one uses:
 # capsule and cylinder (radius, half length), box (half extents).
 SIZES = {"capsule": 2, "cylinder": 2, "box": 3}
+
+
+class Log:
+    """Logs entities of an episode, static or as whole series."""
+
+    def __init__(self, stream: rr.RecordingStream, episode: Episode) -> None:
+        """Takes the stream, and the times of the episode."""
+        self._stream, self.episode = stream, episode
+        self.coaxial, self.vessel = CoaxialRecord.of(episode), VesselRecord.of(episode)
+        # Rounded here, since Rerun truncates 0.12 s to 119,999,999 ns.
+        self._times = np.round(episode.time * 1e9).astype("timedelta64[ns]")
+
+    def static(self, entity: str, archetype: Any) -> None:
+        """Logs what never changes."""
+        self._stream.log(entity, archetype, static=True, strict=True)
+
+    def columns(self, entity: str, columns: Any, rows: Any = EVERY) -> None:
+        """Sends one row per state in ``rows``; nothing at all for no rows."""
+        times, steps = self._times[rows], np.arange(len(self._times))[rows]
+        if len(steps):
+            time, step = TIMELINES
+            seconds = rr.TimeColumn(time, duration=times)
+            indexes = [seconds, rr.TimeColumn(step, sequence=steps)]
+            self._stream.send_columns(entity, indexes, columns, strict=True)
+
+    def series(
+        self, entity: str, values: Any, names: Any, colour: Any = None, rows: Any = None
+    ) -> None:
+        """Plots (n,) or (n, C) values as C lines; T of them are of `MEASURED` rows."""
+        values = np.asarray(values)
+        rows = rows or (EVERY if len(values) > self.episode.steps else MEASURED)
+        self.static(f"series/{entity}", rr.SeriesLines(names=names, colors=colour))
+        columns = rr.Scalars.columns(scalars=values.ravel())
+        if values.ndim == 2:
+            columns = columns.partition(np.full(len(values), values.shape[1]))
+        self.columns(f"series/{entity}", columns, rows)
 
 
 def log_vessel(log: Log, surface: Surface) -> None:
@@ -62,11 +98,11 @@ def log_vessel(log: Log, surface: Surface) -> None:
     if record is None:
         return
     log.static("world/blood", rr.Arrows3D.from_fields(colors=[BLOOD_COLOUR]))
-    vectors = BLOOD_SCALE * record.blood_velocity
+    vectors = BLOOD_SCALE * record.series["blood_velocity"]
     arrows = rr.Arrows3D.columns(origins=log.episode.head, vectors=vectors)
     log.columns("world/blood", arrows)
     if "goal_position" in meta:
-        way = record.goal - meta["goal_position"]
+        way = record.series["goal"] - meta["goal_position"]
         log.columns("world/goal", rr.Transform3D.columns(translation=way))
     if moves:
         rows = np.arange(0, log.episode.steps + 1, MESH_EVERY)
@@ -87,7 +123,7 @@ def log_catheter(log: Log) -> None:
     thickness = np.broadcast_to(radii, (states, links))
     if coaxial is not None:
         outermost = coaxial.outermost(joints)
-        own = device_colours(len(coaxial.names))
+        own = np.resize(DEVICE_COLOURS, (len(coaxial.names), 3))
         colours, thickness = own[outermost], coaxial.radii[outermost]
         ends = np.moveaxis(coaxial.ends(joints), 1, 0)
         for name, colour, radius, end in zip(
@@ -95,11 +131,15 @@ def log_catheter(log: Log) -> None:
         ):
             _log_point(log, f"{entity}/{name}", end, colour, radius)
     log.static(entity, rr.Capsules3D.from_fields(fill_mode="solid"))
+    # Azimuth and inclination of what lies along +z.
+    x, y, z = along.reshape(-1, 3).T
+    angles = np.stack([np.arctan2(y, x), np.arctan2(np.hypot(x, y), z)], axis=-1)
+    turns = Rotation.from_euler("ZY", angles)
     capsules = rr.Capsules3D.columns(
         lengths=np.linalg.norm(along, axis=-1).ravel(),
         radii=thickness.ravel(),
         translations=joints[:, :-1].reshape(-1, 3),
-        quaternions=z_to(along).reshape(-1, 4),
+        quaternions=turns.as_quat(),
         colors=link_colours(log.episode, colours).reshape(-1, 3),
     )
     log.columns(entity, capsules.partition(np.full(states, links)))
@@ -118,11 +158,7 @@ def _log_point(log: Log, entity: str, places, colour, radius: float) -> None:
 
 
 def link_colours(episode: Episode, colours: np.ndarray) -> np.ndarray:
-    """Colours (T+1, L, 3) uint8 of the links: that of the largest force, or their own.
-
-    Args:
-        colours: (T+1, L, 3) uint8, of links that press nothing.
-    """
+    """Colours (T+1, L, 3) uint8 of links: of the largest force, or their own."""
     pressed = np.zeros(colours.shape[:2])
     magnitude = np.linalg.norm(episode.contact_force, axis=-1)
     row = episode.contact_step + 1
@@ -155,36 +191,20 @@ def log_contacts(log: Log) -> None:
         log.columns("world/heat", heat.partition(counts), MEASURED)
 
 
-@dataclass(frozen=True, eq=False)
-class BodyGeom:
-    """One primitive fixed to a body.
+class BodyGeom(NamedTuple):
+    """One primitive fixed to a body, in the frame of the body; lengths in metres."""
 
-    Attributes:
-        body: Row of the body in ``Episode.body_pos`` (the MuJoCo body id).
-        body_name: Full name of the body, such as ``robot/carriage``.
-        kind: One of `SIZES`.
-        size: MuJoCo half sizes in metres: (radius, half length) or (half x, half y,
-            half z).
-        position: (3,) centre in the frame of the body, metres.
-        quaternion: (4,) wxyz, orientation in the frame of the body.
-        rgba: (4,) colour in [0, 1].
-    """
-
-    body: int
-    body_name: str
-    kind: str
-    size: np.ndarray
-    position: np.ndarray
-    quaternion: np.ndarray
-    rgba: np.ndarray
+    body: int  # row in `Episode.body_pos`: the MuJoCo id
+    body_name: str  # in full, such as "robot/carriage"
+    kind: str  # one of `SIZES`
+    size: np.ndarray  # MuJoCo's: (radius, half length) or half extents
+    position: np.ndarray  # (3,) of the centre
+    quaternion: np.ndarray  # (4,) wxyz
+    rgba: np.ndarray  # (4,) in [0, 1]
 
 
 def body_geoms(physics: Any) -> Iterator[BodyGeom]:
-    """The visible primitives of robot and sheath, in the order of the model.
-
-    Args:
-        physics: A dm_control ``Physics``.
-    """
+    """The visible primitives of robot and sheath of a dm_control ``Physics``."""
     import mujoco
 
     model = physics.model
@@ -209,7 +229,7 @@ def log_bodies(log: Log, geoms: Iterable[BodyGeom]) -> None:
         for kind, same in itertools.groupby(parts, lambda geom: geom.kind):
             log.static(f"{entity}/{kind}", _shape(kind, list(same)))
         place = log.episode.body_pos[:, body]
-        turn = xyzw(log.episode.body_quat[:, body])
+        turn = np.roll(log.episode.body_quat[:, body], -1, axis=-1)  # xyzw
         if np.ptp(place, axis=0).any() or np.ptp(turn, axis=0).any():
             moved = rr.Transform3D.columns(translation=place, quaternion=turn)
             log.columns(entity, moved)
@@ -219,13 +239,12 @@ def log_bodies(log: Log, geoms: Iterable[BodyGeom]) -> None:
 
 
 def _shape(kind: str, parts: list[BodyGeom]) -> Any:
-    size, centre, turn, rgba = (
-        np.array([getattr(geom, name) for geom in parts], np.float64)
-        for name in ("size", "position", "quaternion", "rgba")
-    )
+    _, _, _, *rows = zip(*parts, strict=True)
+    size, centre, turn, rgba = (np.array(row, np.float64) for row in rows)
     rgba[:, 3] *= SEE_THROUGH.get(parts[0].body_name.split("/", 1)[0], 1.0)
     colours = np.round(255 * rgba).astype(np.uint8)
-    look = {"quaternions": xyzw(turn), "colors": colours, "fill_mode": "solid"}
+    look: dict[str, Any] = {"quaternions": np.roll(turn, -1, axis=-1)}
+    look |= {"colors": colours, "fill_mode": "solid"}
     if kind == "box":
         return rr.Boxes3D(half_sizes=size, centers=centre, **look)
     look |= {"radii": size[:, 0], "lengths": 2 * size[:, 1]}
@@ -234,28 +253,3 @@ def _shape(kind: str, parts: list[BodyGeom]) -> Any:
     # MuJoCo centres a capsule, Rerun starts it at its lower end.
     along = Rotation.from_quat(turn, scalar_first=True).apply([0.0, 0.0, 1.0])
     return rr.Capsules3D(translations=centre - size[:, 1:] * along, **look)
-
-
-def z_to(direction: np.ndarray) -> np.ndarray:
-    """Return the shortest rotations taking +z to ``direction``, as quaternions xyzw.
-
-    Half-angle construction: q = (z x d, 1 + z.d), normalised; for d = -z, where that
-    vanishes, half a turn about x.
-
-    Args:
-        direction: (..., 3) vectors of any length; a zero vector gives the identity.
-
-    Returns:
-        (..., 4) unit quaternions.
-    """
-    length = np.linalg.norm(direction, axis=-1, keepdims=True)
-    x, y, z = np.moveaxis(direction / np.where(length > 0, length, 1), -1, 0)
-    quaternion = np.stack([-y, x, 0 * z, 1 + z], axis=-1)
-    norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    flipped = np.array([1.0, 0.0, 0.0, 0.0])
-    return np.where(norm > 1e-9, quaternion / np.where(norm > 1e-9, norm, 1), flipped)
-
-
-def xyzw(quaternion_wxyz: np.ndarray) -> np.ndarray:
-    """Reorder quaternions (..., 4) from MuJoCo's wxyz to Rerun's xyzw."""
-    return np.roll(quaternion_wxyz, -1, axis=-1)

@@ -1,9 +1,7 @@
 """Sequences of fluoroscopy in one anatomy, with all that is known of each frame.
 
-A device drawn from `KITS` starts anywhere along the way to a branch and is pushed and
-turned at random. C-arms drawn for each sequence see every state. One HDF5 file holds
-the frames of an anatomy: a row of every array belongs to one frame, and the frames of a
-sequence follow each other.
+One HDF5 file holds the frames of an anatomy, those of a sequence after each other; a
+row of every array belongs to one frame.
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ import dataclasses
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,7 +35,7 @@ KEYPOINTS = DEVICE_KEYPOINTS + OSTIA
 # Of a keypoint, as in COCO.
 ABSENT, UNSEEN, SEEN = 0, 1, 2
 
-# Options of the task, by name: what is pushed and turned.
+# Devices that are pushed and turned: options of the task, by name.
 KITS: dict[str, dict[str, Any]] = {
     "steerable_5f": {"device": "steerable_5f", "rotation": True},
     "steerable_4f": {"device": "steerable_4f", "rotation": True},
@@ -100,21 +98,13 @@ class ImageSetOptions:
         bounds.seed("seed", self.seed)
 
 
-@dataclasses.dataclass(frozen=True)
-class States:
-    """The motions in one anatomy, arrays with leading axes (T frames, N motions).
+class States(NamedTuple):
+    """The motions in one anatomy, arrays with leading axes (T frames, N motions)."""
 
-    Attributes:
-        shadows: devices as X-rays meet them, points (T, N, n, 3).
-        columns: what is written of each state, by name.
-        warps: T times N motions of the vessel (`Motion.to_space`); None at rest.
-        kept: numbers of the motions that are sound.
-    """
-
-    shadows: Sequence[Shadow]
-    columns: dict[str, np.ndarray]
-    warps: list[list[Warp]] | None
-    kept: np.ndarray
+    shadows: Sequence[Shadow]  # devices as X-rays meet them, points (T, N, n, 3)
+    columns: dict[str, np.ndarray]  # what is written of each state, by name
+    warps: list[list[Warp]]  # T times N motions of the vessel; empty at rest
+    kept: np.ndarray  # numbers of the motions that are sound
 
 
 def simulate(
@@ -124,10 +114,9 @@ def simulate(
     from cathsim_dmc import suite
     from cathsim_dmc.simulation.batch import BatchSimulation
 
-    task = suite.make_task(
-        "navigate", anatomy=anatomy, goal=goal, vessel=options.vessel, **KITS[kit],
-        observation="goal", start_along_route=_STARTS, randomisation=_RANDOMISED,
-    )  # fmt: skip
+    drawn = {"start_along_route": _STARTS, "randomisation": _RANDOMISED, **KITS[kit]}
+    drawn |= {"anatomy": anatomy, "goal": goal, "vessel": options.vessel}
+    task = suite.make_task("navigate", observation="goal", **drawn)
     random, count = np.random.RandomState(seed), options.sequences
     seeds = random.randint(2**31, size=count).tolist()
     simulation = BatchSimulation(task, count, num_threads=1, seeds=seeds)
@@ -141,21 +130,20 @@ def simulate(
     shadows, turns, warps = [], [], []
     for _ in range(options.frames):
         for _ in range(options.stride):
-            drawn = random.normal(0.0, _JITTER, mean.shape)
-            added = _MEMORY * added + np.sqrt(1.0 - _MEMORY**2) * drawn
+            noise = random.normal(0.0, _JITTER, mean.shape)
+            added = _MEMORY * added + np.sqrt(1.0 - _MEMORY**2) * noise
             step = simulation.step(np.clip(mean + added, -1.0, 1.0))
             failed |= step.physics_error
         shadows.append(rollout.shadows)
         state = step.readings
-        turns.append({
-            "centreline": state.centreline,
-            "wall_force": np.stack(step.wall_force, axis=-1),
-            "push_force": np.stack([state.push_force, state.push_torque], axis=-1),
-            "load_cell": state.load_cell,
-        })  # fmt: skip
+        turn = {"centreline": state.centreline}
+        turn["wall_force"] = np.stack(step.wall_force, axis=-1)
+        turn["push_force"] = np.stack([state.push_force, state.push_torque], axis=-1)
+        turn["load_cell"] = state.load_cell
         if step.vessel is not None:
             for name in ("heart_phase", "breath_phase"):
-                turns[-1][name] = getattr(step.vessel, name)
+                turn[name] = getattr(step.vessel, name)
+        turns.append(turn)
         if (moving := rollout.moving) is not None:
             every = map(moving.warp, range(count))
             warps.append([(course.copy(), time) for _, course, time in every])
@@ -164,7 +152,7 @@ def simulate(
         dataclasses.replace(same[0], points=np.stack([each.points for each in same]))
         for same in zip(*shadows, strict=True)
     ]
-    return States(joined, columns, warps or None, np.flatnonzero(~failed))
+    return States(joined, columns, warps, np.flatnonzero(~failed))
 
 
 def ostia(anatomy: Anatomy) -> np.ndarray:
@@ -204,11 +192,7 @@ class Camera:
         self.gain = random.uniform(*GAIN)
 
     def seen(self, places: np.ndarray) -> np.ndarray:
-        """Keypoints (T, K, 3) from places (T, K, 3) m, NaN for none.
-
-        Returns:
-            Column, row, and `ABSENT`, `UNSEEN` or `SEEN`.
-        """
+        """Column, row and state (T, K, 3) of places (T, K, 3) m, NaN for none."""
         pixels, _ = self.arm.project(np.nan_to_num(places, nan=1e3))
         size = self.arm.resolution[0]
         inside = ((pixels >= -0.5) & (pixels < size - 0.5)).all(axis=-1)
@@ -238,9 +222,7 @@ def frames_of(
     rest, found = ostia(anatomy), 0
     here = np.isfinite(rest[:, 0])
     # Frames before one state of the vessel, and how it has moved.
-    parts: list[tuple[slice, list[Warp] | None]] = [(slice(None), None)]
-    if states.warps is not None:
-        parts = [(slice(row, row + 1), w) for row, w in enumerate(states.warps)]
+    parts = [(slice(row, row + 1), each) for row, each in enumerate(states.warps)]
     device = np.concatenate([ends(shadow) for shadow in states.shadows], axis=-2)
     count = options.frames
     for motion in states.kept:
@@ -251,7 +233,7 @@ def frames_of(
             places[:, : device.shape[-2]] = device[:, motion]
             places[:, -len(OSTIA) :] = rest
             image, mask = np.empty((2, count, options.size, options.size), np.uint8)
-            for rows, every in parts:
+            for rows, every in parts or [(slice(None), None)]:
                 warp = None if every is None else every[motion]
                 view = camera.before(anatomy, warp)
                 own = [
@@ -296,15 +278,15 @@ def write(
     import h5py
 
     rows, count = len(states.kept) * options.views * options.frames, options.frames
+    about |= {
+        "keypoints": list(KEYPOINTS),
+        "mask_bits": json.dumps({"device": DEVICE, "vessel": VESSEL}),
+        "units": "m, N, N m, s, kg/m3, degrees, pixels; frame LPS",
+    }
+    columns: dict[str, h5py.Dataset] = {}
     with files.atomic_path(path, ".h5") as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update(
-            **about,
-            keypoints=list(KEYPOINTS),
-            mask_bits=json.dumps({"device": DEVICE, "vessel": VESSEL}),
-            units="m, N, N m, s, kg/m3, degrees, pixels; frame LPS",
-        )
+        file.attrs.update(about)
         every = frames_of(anatomy, states, options, seed)
-        columns: dict[str, h5py.Dataset] = {}
         for start, clip in zip(range(0, rows, count), every, strict=True):
             for name, values in clip.items():
                 if name not in columns:

@@ -33,23 +33,14 @@ _SIDES = {"superior": "inferior", "left_about": "right", "posterior_about": "fro
 
 @dataclass(frozen=True, eq=False)
 class Wire:
-    """A measured guidewire.
+    """A measured guidewire."""
 
-    Attributes:
-        name: run and frame.
-        kind: one of `KINDS`.
-        vessel: that of the tip.
-        recommended: whether it is to be compared.
-        points: (n, 3) m, from the entry to the tip.
-        direction: (3,) unit vector towards the tip, at the entry.
-    """
-
-    name: str
-    kind: str
-    vessel: str
-    recommended: bool
-    points: np.ndarray
-    direction: np.ndarray
+    name: str  # run and frame
+    kind: str  # one of `KINDS`
+    vessel: str  # that of the tip
+    recommended: bool  # whether it is to be compared
+    points: np.ndarray  # (n, 3) m, from the entry to the tip
+    direction: np.ndarray  # (3,) unit vector towards the tip, at the entry
 
     @property
     def length(self) -> float:
@@ -68,21 +59,13 @@ class Wire:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A phantom and the wires that were measured in it.
+    """A phantom and the wires that were measured in it."""
 
-    Attributes:
-        surface: of the lumen, m, cut off and flat at the entry.
-        entry: where the wires enter; its direction points out.
-        ends: (3,) m, far end of each vessel by the name that a wire's tip region has.
-        down: directions (3,) by name, among them gravity's.
-        wires: as measured.
-    """
-
-    surface: Surface
-    entry: End
-    ends: Mapping[str, np.ndarray]
-    down: Mapping[str, np.ndarray]
-    wires: tuple[Wire, ...]
+    surface: Surface  # of the lumen, m, cut off and flat at the entry
+    entry: End  # where the wires enter; its direction points out
+    ends: Mapping[str, np.ndarray]  # (3,) m, of each vessel by a tip's region
+    down: Mapping[str, np.ndarray]  # (3,) by name, among them gravity's
+    wires: tuple[Wire, ...]  # as measured
 
     def field(self, scale: float = 1.0) -> Field:
         """Depth in the lumen, larger by a factor about the entry."""

@@ -33,20 +33,12 @@ FIGURES = ("path_mean_mm", "path_max_mm", "track_max_mm", "force_mean")
 
 @dataclasses.dataclass(frozen=True)
 class Script:
-    """An insertion that depends on nothing but the time.
+    """An insertion that depends on nothing but the time."""
 
-    Attributes:
-        name: where it leads in the type-I arch.
-        speed: of the base, share of its full speed.
-        curl: commands in [-1, 1] of all tip motors about x and about y, reached in
-            `CURL_TIME`.
-        duration: s.
-    """
-
-    name: str
-    speed: float
-    curl: tuple[float, float]
-    duration: float
+    name: str  # where it leads in the type-I arch
+    speed: float  # of the base, share of its full speed
+    curl: tuple[float, float]  # commands of tip motors about x and y, after `CURL_TIME`
+    duration: float  # s
 
     def action(self, step: int, task: Any) -> np.ndarray:
         """Action (A,) of a control step of a task."""

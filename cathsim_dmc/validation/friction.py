@@ -93,23 +93,14 @@ def creep(device: Any) -> float:
 
 
 class Capstan(NamedTuple):
-    """A rod pulled round a drum.
+    """A rod pulled round a drum."""
 
-    Attributes:
-        friction: Coulomb coefficient.
-        angle: by which the drum turns the force in the rod, rad.
-        mean: ratio of the tensions at the base and at the end, in steady sliding.
-        free: the same without friction: bending and straightening dissipate a little.
-        travel: (n,), way of the base, m.
-        ratio: (n,), of the tensions.
-    """
-
-    friction: float
-    angle: float
-    mean: float = np.nan
-    free: float = 1.0
-    travel: np.ndarray = np.zeros(1)
-    ratio: np.ndarray = np.zeros(1)
+    friction: float  # Coulomb coefficient
+    angle: float  # by which the drum turns the force in the rod, rad
+    mean: float = np.nan  # ratio of the tensions at base and end, in steady sliding
+    free: float = 1.0  # the same without friction: bending dissipates a little
+    travel: np.ndarray = np.zeros(1)  # (n,), way of the base, m
+    ratio: np.ndarray = np.zeros(1)  # (n,), of the tensions
 
     @property
     def expected(self) -> float:

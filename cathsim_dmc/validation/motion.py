@@ -102,10 +102,7 @@ def diameters(anatomy: Anatomy) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def wall_place(anatomy: Anatomy, number: int = 40) -> float:
-    """Largest distance of the wall from where all motions put it, m.
-
-    Points of the wall at rest are moved, and looked for by the collisions of probes.
-    """
+    """Largest distance, m, of the wall that probes find from where motions put it."""
     course, lumen = parameters(_HEART, _BREATHING, _SOFT), anatomy.lumen
     random = np.random.RandomState(0)
     vertices, normals = anatomy.surface.vertices, anatomy.surface.normals
@@ -172,12 +169,10 @@ def ride(
     friction: float,
     inertial: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ways (T, 3) m of a link in a tube whose wall moves rigidly, and of the wall.
+    """Ways (T, 3) m of a link in a tube along z whose wall moves rigidly, and of that.
 
     Args:
-        anatomy: A straight tube along z.
         way: Direction of the motion, of `_HEART` in a beat.
-        friction: Coulomb coefficient.
         inertial: Whether the wall rests instead, and all feel its acceleration.
     """
     course = parameters(_HEART, 0.0, 0.0)

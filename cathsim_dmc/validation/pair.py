@@ -64,12 +64,10 @@ WHIP = 3.0  # least rate of turning of the end in a bend, in that of the base
 
 
 def free_curve(chosen: Sequence[Device], gaps: ArrayLike, length: float) -> np.ndarray:
-    """End (3,), m, of the curve of the EI-weighted curvature of devices at rest.
+    """End (3,), m, of the curve of a length (m) of the EI-weighted curvature at rest.
 
-    Args:
-        chosen: K coaxial devices, not turned: the curve lies in the plane of x and z.
-        gaps: (K,) from the end of each device to that of the curve, m.
-        length: m.
+    The gaps (K,), m, are those from the end of each of K devices, which are not turned,
+    to that of the curve. It lies in the plane of x and z.
     """
     arc = np.arange(0.0, length, _FINE)
     steps = np.diff(np.append(arc, length))
@@ -83,11 +81,7 @@ def free_curve(chosen: Sequence[Device], gaps: ArrayLike, length: float) -> np.n
 
 
 def turned(names: Sequence[str], gaps: Sequence[float]) -> tuple[float, float, float]:
-    """Largest deviations of the unloaded end, turned by `TURNS`.
-
-    Args:
-        names: K coaxial devices.
-        gaps: (K,) from the end of each to that of the chain, m.
+    """Largest deviations of the unloaded end of K devices with gaps (K,), m, turned.
 
     Returns:
         Deviation from the turned shape of 0° and from the continuous curve of the
@@ -115,12 +109,9 @@ def turned(names: Sequence[str], gaps: Sequence[float]) -> tuple[float, float, f
 
 
 def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float, float]:
-    """Twist of the last frame of a chain laid along half a circle of 40 mm.
+    """Twist of the last frame of a chain of links (L,), m, in half a circle of 40 mm.
 
-    Args:
-        link_lengths: (L,), m.
-        start: length of the straight piece before the half circle, m.
-        plane: of the half circle about the axis, rad.
+    It begins after `start`, m, and lies in a plane about the axis, rad.
 
     Returns:
         Twist of the last link, and of the link before it less the twist that coaxial

@@ -12,15 +12,10 @@ from cathsim_dmc.entities.device import Device
 
 
 class Elastica(NamedTuple):
-    """Shape of a clamped rod under a dead transverse force at its free end.
+    """Shape of a clamped rod under a dead transverse force at its free end."""
 
-    Attributes:
-        force: N.
-        position: (n, 2), axial and transverse place from the clamp to the end, m.
-    """
-
-    force: float
-    position: np.ndarray
+    force: float  # N
+    position: np.ndarray  # (n, 2), axial and transverse, from the clamp on, m
 
 
 def elastica(lengths: ArrayLike, stiffnesses: ArrayLike, end_angle: float) -> Elastica:

@@ -52,19 +52,12 @@ _WIDE = 0.275, 0.07  # m, length and radius of a tube that nothing touches
 
 
 class Rods(NamedTuple):
-    """Devices in equilibrium.
+    """Devices in equilibrium."""
 
-    Attributes:
-        rotation: (K,), of the ends of the devices, rad.
-        end: (3,), of the chain from its base, m.
-        energy: of the reference, N·m.
-        force: (K,), axial forces on the bases of simulated devices, N, or (0,).
-    """
-
-    rotation: np.ndarray
-    end: np.ndarray
-    energy: float = np.nan
-    force: np.ndarray = np.zeros(0)
+    rotation: np.ndarray  # (K,), of the ends of the devices, rad
+    end: np.ndarray  # (3,), of the chain from its base, m
+    energy: float = np.nan  # of the reference, N·m
+    force: np.ndarray = np.zeros(0)  # (K,), axial, on simulated bases, N
 
 
 def reference(
@@ -139,8 +132,6 @@ def simulate(
     """Lets a chain come to rest, free or held along half a circle; see `reference`.
 
     Args:
-        gaps: (K,), m.
-        rotation: (K,), of their bases, rad.
         beyond: free length of the chain after the half circle, m; None where all is.
     """
     rig = Rig(names, lumen_friction=0.0)

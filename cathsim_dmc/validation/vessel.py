@@ -68,17 +68,13 @@ def terminal_velocity(force: float) -> tuple[float, float]:
     blood_loops.install()
     radius = devices.get("steerable_5f").outer_radius
     size = blood_loops.HEADER + blood_loops.OF_LINK
-    model = mujoco.MjModel.from_xml_string(f"""
-        <mujoco>
-          <option timestep="0.004" gravity="0 0 0" integrator="implicitfast"/>
-          <size nuserdata="{2 + size + 1}"/>
-          <worldbody>
-            <body>
-              <freejoint/>
-              <geom type="capsule" size="{radius} {LINK / 2}" density="1060"/>
-            </body>
-          </worldbody>
-        </mujoco>""")
+    spec = bare()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.nuserdata = 2 + size + 1
+    body, capsule = spec.worldbody.add_body(), mujoco.mjtGeom.mjGEOM_CAPSULE
+    body.add_freejoint()
+    body.add_geom(type=capsule, size=(radius, LINK / 2, 0), density=BLOOD_DENSITY)
+    model = spec.compile()
     data = mujoco.MjData(model)
     data.userdata[1:6] = size, blood_loops.MARK, BLOOD_DENSITY, BLOOD_VISCOSITY, 1
     data.xfrc_applied[1, 0] = force
@@ -126,13 +122,9 @@ def profile() -> tuple[float, float]:
 def indentation(
     kind: str, radius: float, modulus: float, loads: Sequence[float] | np.ndarray
 ) -> np.ndarray:
-    """Depths (n,) m to which a sphere or a capsule is pressed into the wall of a tube.
+    """Depths (n,), m, to which loads (n,), N, press a "sphere" or a "capsule".
 
-    Args:
-        kind: "sphere", or "capsule", which lies along the tube.
-        radius: of the tube, m.
-        modulus: Pa; the wall is 1.5 mm thick.
-        loads: (n,), N.
+    It lies along a tube with a radius, m, and a wall of 1.5 mm with a modulus, Pa.
     """
     from cathsim_dmc.collision import carrying
 

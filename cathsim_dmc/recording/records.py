@@ -1,0 +1,115 @@
+"""What `meta` of a recorded episode tells of coaxial devices and of a living vessel."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.anatomy.motion import Motion
+from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.geometry import along
+
+# Of one device in ``meta['devices']``: series over the states.
+DEVICE_SERIES = ("insertion", "rotation", "tip_rotation")
+# Figures over the states in ``meta['vessel']``: name, factor and label of a plot.
+VESSEL_SERIES = {
+    "heart_phase": (1.0, "phase of the heart"),
+    "breath_phase": (1.0, "phase of breathing"),
+    "blood_speed": (1.0, "blood at the head, m/s"),
+    "indentation": (1e3, "indentation, mm"),
+    "wall_work": (1e6, "work on the wall, µJ"),
+}
+MESH_EVERY = 4  # states, of which a recording keeps the moved surface
+
+
+@dataclass(frozen=True, eq=False)
+class CoaxialRecord:
+    """K devices from the innermost outwards, over T+1 states."""
+
+    names: tuple[str, ...]  # what each device is to an operator
+    radii: np.ndarray  # (K,), outer radius, metres
+    insertion: np.ndarray  # (T+1, K), of the devices' ends, metres
+    rotation: np.ndarray  # (T+1, K), of the rotary units, radians
+    tip_rotation: np.ndarray  # (T+1, K), of the devices' ends, radians
+
+    @classmethod
+    def of(cls, episode: Episode) -> "CoaxialRecord | None":
+        """Reads the devices of an episode; None if it has a single device."""
+        if not (devices := episode.meta.get("devices")):
+            return None
+        columns = (
+            np.array([one[name] for one in devices], np.float64).T
+            for name in ("radius", *DEVICE_SERIES)
+        )
+        return cls(tuple(one["name"] for one in devices), *columns)
+
+    @property
+    def gaps(self) -> np.ndarray:
+        """Way (T+1, K) from the end of each device to that of the chain, metres."""
+        return self.insertion.max(axis=1, keepdims=True) - self.insertion
+
+    def ends(self, line: np.ndarray) -> np.ndarray:
+        """Ends (T+1, K, 3) of the devices on a chain (T+1, L+1, 3), ``catheter``."""
+        pairs = zip(line, self.gaps, strict=True)
+        return np.array([along(points[::-1], gaps) for points, gaps in pairs])
+
+    def outermost(self, line: np.ndarray) -> np.ndarray:
+        """Number (T+1, L) of the outermost device in each link's middle; see `ends`."""
+        lengths = np.linalg.norm(np.diff(line, axis=1), axis=-1)
+        middle = np.cumsum(lengths[:, ::-1], axis=1)[:, ::-1] - lengths / 2
+        number = np.broadcast_to(self.gaps.argmin(axis=1)[:, None], middle.shape).copy()
+        for k in range(len(self.names)):
+            number[middle >= self.gaps[:, k, None]] = k
+        return number
+
+
+def device_meta(chain: Any, rows: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """What ``meta['devices']`` holds, from ``DEVICE_SERIES`` (T+1, K) by name."""
+    return [
+        {
+            "name": name,
+            "device": device.name,
+            "radius": device.outer_radius,
+            **{series: rows[series][:, k].tolist() for series in DEVICE_SERIES},
+        }
+        for k, (name, device) in enumerate(
+            zip(chain.device_names, chain.devices, strict=True)
+        )
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class VesselRecord:
+    """A vessel over T+1 states."""
+
+    # (T+1,) by names of `VESSEL_SERIES`; (T+1, 3), world frame, "goal" (m) and
+    # "blood_velocity" at the head (m/s); "parameters" of the motion.
+    series: dict[str, np.ndarray]
+    motion: Motion | None  # how it moves; None where it rests
+
+    @classmethod
+    def of(cls, episode: Episode) -> "VesselRecord | None":
+        """Reads the vessel of an episode; None if it is rigid and its blood rests."""
+        if not (meta := episode.meta.get("vessel")):
+            return None
+        given = {name: np.array(values, np.float64) for name, values in meta.items()}
+        return cls(given, Motion(given["lattice"]) if meta["lattice"] else None)
+
+    def surface(self, rest: Surface, time: float) -> Surface:
+        """The surface of the lumen at a time, s."""
+        if self.motion is None:
+            return rest
+        return self.motion.surface(self.series["parameters"], float(time), rest)
+
+
+def vessel_state(task: Any) -> dict[str, Any]:
+    """What a record keeps of the vessel in a state; nothing of one that rests."""
+    vessel = task.rollout.vessel
+    if vessel is None:
+        return {}
+    return {
+        **{name: float(value[0]) for name, value in vessel.info().items()},
+        "blood_velocity": vessel.blood_velocity[0].tolist(),
+        "goal": task.rollout.goal.reshape(3).tolist(),
+    }
