@@ -112,24 +112,18 @@ def write(
         from cathsim_dmc.recording.rerun_log import write_rrd
         from cathsim_dmc.recording.rerun_scene import body_geoms
 
-        options, geoms = film_options(env.task), body_geoms(env.physics)
-        film = xray_film(episode, surface, options) if fluoroscopy else None
+        own, film = env.task.config.fluoroscopy, None
+        if fluoroscopy:
+            # The task's own view and a second plane, in the size of a screen.
+            view = {"size": _FILM_SIZE, "noise": False}
+            view["magnification"] = max(own.magnification, _FILM_MAGNIFICATION)
+            view["biplane"] = own.biplane or "LATERAL"
+            film = xray_film(episode, surface, dataclasses.replace(own, **view))
+        geoms = body_geoms(env.physics)
         return write_rrd(episode, surface, target, robot_geoms=geoms, fluoroscopy=film)
     from cathsim_dmc.pictures.animation import animate
 
     return animate(episode, surface, target)
-
-
-def film_options(task: Any) -> FluoroscopyOptions:
-    """The task's own X-ray view and a second plane, in the size of a screen."""
-    options = task.config.fluoroscopy
-    return dataclasses.replace(
-        options,
-        size=_FILM_SIZE,
-        noise=False,
-        magnification=max(options.magnification, _FILM_MAGNIFICATION),
-        biplane=options.biplane or "LATERAL",
-    )
 
 
 def xray_film(

@@ -24,10 +24,8 @@ VESSEL_COLOUR = (225, 140, 130, 60)
 GOAL_COLOUR = (60, 190, 90, 110)
 BLOOD_COLOUR, BLOOD_SCALE = (200, 30, 40), 0.02  # s; an arrow of 20 mm is 1 m/s
 HEAD_COLOUR, TRAIL_COLOUR = (255, 200, 0), (255, 200, 0, 160)
-# Entities that would hide the device inside them, and how opaque they are drawn.
-SEE_THROUGH = {"sheath": 0.3}
-# Drawing only: the longest arrow of an episode is about this long.
-LONGEST_ARROW = 25e-3
+SHEATH_OPACITY = 0.3  # of what would hide the device inside it
+LONGEST_ARROW = 25e-3  # m, about, in an episode
 ARROW_RADIUS, HEAT_RADIUS, TRAIL_RADIUS = 0.7e-3, 0.9e-3, 0.25e-3
 HEAD_SCALE = 1.8
 # Geoms that bodies collide with are not drawn, as in MuJoCo's own viewers.
@@ -241,7 +239,7 @@ def log_bodies(log: Log, geoms: Iterable[BodyGeom]) -> None:
 def _shape(kind: str, parts: list[BodyGeom]) -> Any:
     _, _, _, *rows = zip(*parts, strict=True)
     size, centre, turn, rgba = (np.array(row, np.float64) for row in rows)
-    rgba[:, 3] *= SEE_THROUGH.get(parts[0].body_name.split("/", 1)[0], 1.0)
+    rgba[:, 3] *= SHEATH_OPACITY if parts[0].body_name.startswith("sheath/") else 1.0
     colours = np.round(255 * rgba).astype(np.uint8)
     look: dict[str, Any] = {"quaternions": np.roll(turn, -1, axis=-1)}
     look |= {"colors": colours, "fill_mode": "solid"}
