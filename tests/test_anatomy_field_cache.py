@@ -40,14 +40,6 @@ def built(monkeypatch, folder):
     return done
 
 
-def test_a_field_is_built_once_and_read_as_it_was(folder):
-    ends = [End("root", np.zeros(3), -UP, 4e-3, True)]
-    first, again = (field_cache.field_of(tube(), ends) for _ in range(2))
-    assert first is not again and first.digest == again.digest
-    for one, other in zip(first.arrays, again.arrays, strict=True):
-        assert one.dtype == other.dtype and one.shape == other.shape
-
-
 def test_a_cached_field_lies_in_its_file(folder):
     ends = [End("root", np.zeros(3), -UP, 4e-3, True)]
     fields = [field_cache.field_of(tube(), ends) for _ in range(2)]

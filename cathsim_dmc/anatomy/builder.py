@@ -9,10 +9,8 @@ import numpy as np
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet
 
-# Goals lie this far (m) past the ostium of their branch where it is long enough,
-# at most so near (m) to its free end, and not beyond the ostium of a fork.
-GOAL_DEPTH = 27e-3
-_GOAL_END = 5e-3
+GOAL_DEPTH = 27e-3  # m, of a goal past its ostium
+_GOAL_END = 5e-3  # m, at least, before the free end
 ACCESSES = ("ascending", "descending")
 
 
@@ -80,10 +78,9 @@ def placed(
 
 
 def default_goals(tree: VesselTree) -> dict[str, VesselPlace]:
-    """A goal in each branch: 27 mm past its ostium where there is room for it.
+    """A goal in each branch of 10 mm or more: 27 mm past its ostium if there is room.
 
-    It lies at least 5 mm before the branch's free end, and not beyond the place
-    where a branch of its own parts from it. Branches shorter than 10 mm have none.
+    It lies 5 mm or more before the free end, and before any branch parts from it.
     """
     goals = {}
     for name, vessel in tree.vessels.items():

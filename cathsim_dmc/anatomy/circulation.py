@@ -1,10 +1,4 @@
-"""Distribution of the aortic inflow among the branches.
-
-The heart is at the wider end of the root; every other free end of a vessel is an
-outlet. Arteries with a measured share have it together with all that branches off them;
-within an artery, and in an imported scan, outlets share by Murray's law, as their radii
-cubed. A vessel loses at each ostium what the branch takes, so volume is conserved.
-"""
+"""Distribution of the aortic inflow among the branches; see docs/vessel_model.md."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,19 +20,12 @@ _AT_END = 1e-6  # m
 
 
 class Course(NamedTuple):
-    """Blood flow through a vessel.
+    """Blood flow through a vessel."""
 
-    Attributes:
-        begin: way from the heart to where blood enters the vessel, m.
-        reverse: whether blood goes towards the first point of the centreline.
-        outlet: share of the inflow that leaves through the vessel's own free end.
-        branches: (B, 2), way in the vessel to each ostium, m, and the share it takes.
-    """
-
-    begin: float
-    reverse: bool
-    outlet: float
-    branches: Array
+    begin: float  # way from the heart to where blood enters the vessel, m
+    reverse: bool  # whether blood goes towards the first point of the centreline
+    outlet: float  # share of the inflow that leaves through the vessel's own free end
+    branches: Array  # (B, 2), way in the vessel to each ostium, m, and its share
 
     def share(self, way: Array) -> Array:
         """Share (n,) of the inflow at ways (n,) m in the vessel."""
@@ -48,25 +35,15 @@ class Course(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Circulation:
-    """The inflow along the vessels, in S straight segments.
+    """The inflow along the vessels, in S straight segments."""
 
-    Attributes:
-        courses: of blood, by vessel.
-        radius: of the lumen at the heart, m.
-        ends: (S, 2, 3), m.
-        radii: (S, 2), of the lumen, m.
-        shares: (S, 2), of the inflow, negative against the segment.
-        ways: (S, 2), from the heart, m.
-        vessel: (S,) int64, number of the vessel.
-    """
-
-    courses: dict[str, Course]
-    radius: float
-    ends: Array
-    radii: Array
-    shares: Array
-    ways: Array
-    vessel: np.ndarray
+    courses: dict[str, Course]  # of blood, by vessel
+    radius: float  # of the lumen at the heart, m
+    ends: Array  # (S, 2, 3), m
+    radii: Array  # (S, 2), of the lumen, m
+    shares: Array  # (S, 2), of the inflow, negative against the segment
+    ways: Array  # (S, 2), from the heart, m
+    vessel: np.ndarray  # (S,) int64, number of the vessel
 
     @classmethod
     def of(cls, tree: VesselTree, murray: bool = False) -> "Circulation":

@@ -1,14 +1,10 @@
-"""Vessel trees from measured centrelines: splines, ostia, flares.
-
-Lengths are metres, points are in one frame (LPS unless said otherwise).
-"""
+"""Vessel trees from measured centrelines: splines, ostia, flares; m."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import interpolate
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.centreline import (
@@ -21,7 +17,7 @@ from cathsim_dmc.anatomy.centreline import (
 
 # Standard deviations of measured positions and radii, m: how far the spline may
 # depart from them, root mean square: less than what a lattice of 0.5 mm leaves open.
-SMOOTHING = 0.35e-3
+_SMOOTHING = 0.35e-3
 _RADIUS_SMOOTHING = 0.15e-3
 # By how much a branch's radius grows at its ostium, m, if its parent has the room.
 _FLARE = 1e-3
@@ -55,56 +51,46 @@ class Curve(Centreline):
     parent: str | None = None
 
 
-def smooth_tree(
-    curves: Mapping[str, Curve], *, smoothing: float = SMOOTHING
-) -> VesselTree:
-    """Vessel tree through measured centrelines.
+def smooth_tree(curves: Mapping[str, Curve]) -> VesselTree:
+    """Vessel tree through measured centrelines by name, parents before their children.
 
     Each vessel is a cubic smoothing spline. A branch starts on its parent's
     centreline; its ostium is where its centreline leaves the parent's lumen, and its
     radius grows towards the ostium.
-
-    Args:
-        curves: centrelines by name, parents before their children, the root first.
-        smoothing: root mean square (m) by which the spline may miss the points; 0
-            runs through all of them.
 
     Raises:
         ValueError: if a branch does not begin in its parent or never leaves it, if a
             vessel bends more sharply than its lumen allows, or if two vessels run
             into each other; names the vessel and the place.
     """
-    bounds.number("smoothing", smoothing, 0.0, 5e-3, "m")
     vessels: dict[str, Vessel] = {}
     for name, curve in curves.items():
         if curve.parent is None:
-            vessels[name] = Vessel(name, _spline(curve, smoothing))
+            dense = _smooth(curve.points, _STEP)
+            line = Centreline(dense, np.ones(len(dense)))
+            places, fresh = _places(line, curve.points)
+            radii = _radii(places[fresh], curve.radii[fresh], line.arc_length)
+            vessels[name] = Vessel(name, Centreline(dense, radii))
         else:
             before = bounds.choice(f"the parent before {name!r}", curve.parent, vessels)
-            vessels[name] = _branch(name, curve, vessels[before], smoothing)
+            vessels[name] = _branch(name, curve, vessels[before])
         _check_bends(vessels[name])
     tree = VesselTree(vessels)
     check_septa(tree)
     return tree
 
 
-def _smooth(
-    points: Array, smoothing: float, step: float, first_weight: float = 1.0
-) -> Array:
-    """Points (n, 3) of a cubic spline at equal arcs of about `step` (m), ends included.
+def _smooth(points: Array, step: float, first_weight: float = 1.0) -> Array:
+    """Points (n, 3) of a cubic spline at equal arcs of about `step` (m), with ends."""
+    from scipy import interpolate  # slow to import
 
-    Its parameter is the chord length.
-    """
     chord = arc_lengths(points)
     weights = np.ones(len(points))
     weights[0] = first_weight
     # In millimetres, which fitpack's tolerances suit.
-    (knots, coefficients, degree), _ = interpolate.splprep(
-        1e3 * points.T,
-        u=chord,
-        w=weights,
-        k=min(3, len(points) - 1),
-        s=len(points) * (1e3 * smoothing) ** 2,
+    degree, miss = min(3, len(points) - 1), len(points) * (1e3 * _SMOOTHING) ** 2
+    (knots, coefficients, _), _ = interpolate.splprep(
+        1e3 * points.T, u=chord, w=weights, k=degree, s=miss
     )
     spline = interpolate.BSpline(knots, 1e-3 * np.array(coefficients).T, degree)
     end = float(chord[-1])
@@ -117,22 +103,15 @@ def _smooth(
 
 def _radii(places: Array, values: Array, at: Array) -> Array:
     """Smooth radii at arc lengths `at` from measured ones, constant outside them."""
+    from scipy import interpolate
+
     if len(places) < 4:
         return np.interp(at, places, values)
-    spline = interpolate.splrep(
-        places, 1e3 * values, s=len(values) * (1e3 * _RADIUS_SMOOTHING) ** 2
-    )
+    miss = len(values) * (1e3 * _RADIUS_SMOOTHING) ** 2
+    spline = interpolate.splrep(places, 1e3 * values, s=miss)
     smooth = 1e-3 * interpolate.splev(np.clip(at, places[0], places[-1]), spline)
     # A spline may overshoot where the calibre changes at once.
     return np.clip(smooth, 0.9 * values.min(), 1.1 * values.max())
-
-
-def _spline(curve: Curve, smoothing: float) -> Centreline:
-    dense = _smooth(curve.points, smoothing, _STEP)
-    line = Centreline(dense, np.ones(len(dense)))
-    places, fresh = _places(line, curve.points)
-    smooth = _radii(places[fresh], curve.radii[fresh], line.arc_length)
-    return Centreline(dense, smooth)
 
 
 def _places(line: Centreline, points: Array) -> tuple[Array, np.ndarray]:
@@ -141,10 +120,10 @@ def _places(line: Centreline, points: Array) -> tuple[Array, np.ndarray]:
     return places, np.append(True, np.diff(places) > 1e-6)
 
 
-def _branch(name: str, curve: Curve, parent: Vessel, smoothing: float) -> Vessel:
+def _branch(name: str, curve: Curve, parent: Vessel) -> Vessel:
     start = _onto_parent(name, curve.points, parent)
     # The start is no measurement: it lies on the parent.
-    dense = _smooth(start, smoothing, _FINE, first_weight=100.0)
+    dense = _smooth(start, _FINE, first_weight=100.0)
     dense[0] = start[0]
     fine = Centreline(dense, np.ones(len(dense)))
     ostium = _ostium(name, fine, parent)
@@ -183,10 +162,9 @@ def _branch(name: str, curve: Curve, parent: Vessel, smoothing: float) -> Vessel
 
 
 def flare_begin(wide: float, parent_radius: float, tilt: float, ostium: float) -> float:
-    """Arc length (m) at which the flare of a branch begins, inside the parent.
+    """Arc length (m) at which a branch's flare begins, up to `wide` (m) at its ostium.
 
-    The branch has the radius `wide` (m) at its ostium, an arc length (m), and stands
-    `tilt` (rad) off the normal of the parent's wall.
+    The branch stands `tilt` (rad) off the normal of the parent's wall.
     """
     sag = parent_radius - math.sqrt(parent_radius**2 - min(wide, parent_radius) ** 2)
     inwards = _FLARE_MARGIN * (sag + wide * math.tan(tilt)) + 1e-3
@@ -245,10 +223,7 @@ def _check_bends(vessel: Vessel) -> None:
 
 
 def _junction_end(vessel: Vessel, parent: Vessel) -> float:
-    """Arc length (m) from which a branch's lumen is free of its parent's.
-
-    It is the first place past the ostium where the two tubes are `_LEAST_WALL` apart.
-    """
+    """Arc length (m) past the ostium from which two tubes are `_LEAST_WALL` apart."""
     line = vessel.centreline
     s = np.arange(vessel.ostium, line.length, 0.5e-3)
     place = line.at(s)

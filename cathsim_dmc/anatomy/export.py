@@ -18,7 +18,7 @@ from cathsim_dmc import files
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS, Inlet
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS
-from cathsim_dmc.anatomy.scan.inlet import cut_open
+from cathsim_dmc.anatomy.scan.places import cut_open
 from cathsim_dmc.anatomy.scan.topology import decimated
 from cathsim_dmc.anatomy.surface import sampled
 
@@ -82,17 +82,14 @@ def _inlet_cap(border: np.ndarray, inlet: Inlet) -> list[np.ndarray]:
 
 
 def _outward_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3) that lean outwards from all triangles around a vertex.
-
-    The angle-weighted mean can point into one of the triangles where the surface
-    folds sharply; while it does, the worst triangle is added.
-    """
+    """Unit normals (V, 3) that lean outwards from all triangles around a vertex."""
     import igl
 
     flat = igl.per_face_normals(vertices, faces, np.zeros(3))
     weighting = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
     normals = igl.per_vertex_normals(vertices, faces, weighting)
     normals[~np.isfinite(normals)] = 0.0  # of vertices without triangles
+    # Where the surface folds sharply the mean may point into one of the triangles.
     for _ in range(20):
         lean = np.einsum("fkd,fd->fk", normals[faces], flat)
         push = np.zeros_like(vertices)

@@ -1,8 +1,6 @@
 """Cache of fields, by the content that they are built from.
 
-The fields of the measured phantoms come with the package, in `data`: building the first
-field on a machine takes longer than all else that a task needs. `tools/ship_fields.py`
-writes them.
+Those of the measured phantoms ship in `data`, written by `tools/ship_fields.py`.
 """
 
 import contextlib
@@ -43,11 +41,9 @@ def cache_folder() -> Path:
 
 
 def field_of(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Field:
-    """As `Field.of`, read from the cache if it was built before.
+    """As `Field.of`, mapped from its file in the cache if it was built before.
 
-    It lies in the file, which is mapped into memory. A file appears whole or not at
-    all, and holds its checksum: a damaged one is built again. Where the folder cannot
-    be written to, nothing is kept.
+    A damaged file is built again; nothing is kept in a folder that is read-only.
     """
     shipped = shipped_path(lumen, ends)
     digest = hashlib.sha256(_name(lumen, ends).encode() + _code()).hexdigest()

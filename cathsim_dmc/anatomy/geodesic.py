@@ -25,15 +25,8 @@ def inside(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lattice points deeper than a depth; only blocks near the lumen are evaluated.
 
-    Args:
-        depth: signed depth (n,) m of points (n, 3) m in the lumen, > 0 inside.
-        low: (3,) m, the first point.
-        shape: (3,) numbers of points.
-        spacing: m.
-        above: m, smallest depth.
-
-    Returns:
-        (ijk (n, 3) int64, depth (n,) m).
+    The lattice begins at `low` (3,) m and has a shape (3,). Returns ijk (n, 3) int64
+    and depths (n,) m, > 0 inside.
     """
     size = _BLOCKS[0][0]
     ijk = size * np.argwhere(np.ones(-(-np.asarray(shape) // size), bool))
@@ -55,10 +48,8 @@ def nearest_cell(cells: np.ndarray, place: np.ndarray) -> tuple[int, ...]:
 class LumenDistance:
     """Length of the shortest way inside the lumen to a target, as a lattice.
 
-    The way of a head in another branch leads back through the parent vessel, however
-    near the target lies behind the wall. Ways run along the edges and diagonals of the
-    lattice (26 neighbours), which makes them up to a tenth too long, never too short by
-    more than a cell.
+    Ways run along the edges and diagonals of the lattice (26 neighbours), which makes
+    them up to a tenth too long, never too short by more than a cell.
     """
 
     def __init__(
@@ -70,10 +61,7 @@ class LumenDistance:
             depth: Signed depth (n,) of points (n, 3) in the lumen, m, > 0 inside.
             bounds: (2, 3), m, corners of a box that holds the lumen.
             target: (3,), m, point in the lumen.
-            origin: (3,), m, another point in it, which must be connected to the target.
-
-        Raises:
-            ValueError: if no way inside the lumen joins origin and target.
+            origin: (3,), m, another one; ValueError if no way joins it to the target.
         """
         # Slow to import, and only a reward along the path needs it.
         from skimage import graph
@@ -108,11 +96,9 @@ class LumenDistance:
         self._own = np.where(self._inside, self._ways, 0.0)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Length (...) of the ways from points (..., 3), m.
-
-        Linear between the lattice points inside the lumen; those outside, which may
-        be nearer to another vessel, count only where there is no other.
-        """
+        """Length (...) of the ways from points (..., 3), m."""
+        # Lattice points outside the lumen, which may be nearer to another vessel, count
+        # only where there is no other.
         points = np.asarray(points, float)
         cell = ((points.reshape(-1, 3) - self._low) / self._spacing).T
         total, weight = (

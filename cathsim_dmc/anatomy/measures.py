@@ -1,8 +1,4 @@
-"""Measures of an arch: type, sizes, take-offs, curvature, places of the ostia.
-
-Computed from centrelines and radii, so alike for generated, measured and imported
-anatomies. Millimetres and degrees in the names, rounded; the vertical is +z (superior).
-"""
+"""Measures of an arch: type, sizes, take-offs, curvature, places of the ostia."""
 
 import math
 from typing import Any

@@ -2,19 +2,14 @@
 
 A place x in space holds what lies at X = x - u(x, t) in the anatomy at rest, with
 u = a(t) H(x) + b(t) B(x): H of the heart and B of breathing at amplitude 1. The radius
-grows by g(X) p(t - s/c), s the way from the heart. Rest is the end of diastole and of
-expiration. H, B, g and s lie on one lattice, between whose points they are linear.
-
-The heart moves the root of the aorta caudal, anterior and to the left, by amounts that
-fade along the aorta. Breathing moves all by what Sailer 2015 measured, in inspiration
-anterior, medial and caudal; a branch moves like its ostium. The sheath rests: near an
-open end all displacements pass into none.
+grows by g(X) p(t - s/c), s the way from the heart. See docs/vessel_model.md.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import softmax
 
 from cathsim_dmc.anatomy import motion_loops
 from cathsim_dmc.anatomy.centreline import Array, VesselTree, as_rows
@@ -39,11 +34,10 @@ STEEPEST = 0.6
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Displacements of space around an anatomy.
+    """Displacements of space around an anatomy, on a lattice.
 
-    Attributes:
-        lattice: (7 + 8 a b c,) origin (3) and step, m, shape (a, b, c), and at each
-            point what `motion_loops.VALUES` says.
+    It is (7 + 8 a b c,): origin (3) and step, m, shape (a, b, c), and at each point
+    what `motion_loops.VALUES` says.
     """
 
     lattice: Array
@@ -56,11 +50,7 @@ class Motion:
         ends: Sequence[End],
         blood: Circulation,
     ) -> "Motion":
-        """The motion of an anatomy, with its open ends at rest.
-
-        Args:
-            box: Corners (3,), (3,) m, of its lumen's field.
-        """
+        """The motion of an anatomy whose field has corners (3,), (3,) m."""
         low, high = box
         aorta = _along_aorta(blood, tree)
         shape = np.ceil((high - low) / _STEP).astype(int) + 1
@@ -95,11 +85,7 @@ class Motion:
     def to_space(
         self, parameters: Array, time: float, points: Array
     ) -> tuple[Array, Array]:
-        """Places in space (..., 3) of places at rest (..., 3), within 1e-6 m.
-
-        Returns:
-            And by how much the radius has grown there (...), m.
-        """
+        """Places in space (..., 3) m of those at rest, and growth of radii (...) m."""
         flat = as_rows(points)
         out, growth = np.empty_like(flat), np.empty(len(flat))
         motion_loops.moved(self.lattice, parameters, time, flat, out, growth)
@@ -126,8 +112,8 @@ def _values(
     middles, radii = blood.ends.mean(axis=1), blood.radii.mean(axis=1)
     ways = blood.ways.mean(axis=1)
     distance = np.linalg.norm(points[:, None] - middles, axis=-1)
-    weight = _shares(-0.5 * (distance / _SMOOTH) ** 2)
-    across = _shares((radii - distance) / _ACROSS)
+    weight = softmax(-0.5 * (distance / _SMOOTH) ** 2, axis=1)
+    across = softmax((radii - distance) / _ACROSS, axis=1)
     radius = across @ radii
     growth = 0.5 * PULSE_PRESSURE * distensibility(radius) * radius
     begun = np.ones(len(points))
@@ -139,12 +125,6 @@ def _values(
     columns = [weight @ heart, weight @ breath, growth[:, None]]
     moving = [begun[:, None] * each for each in columns]
     return np.hstack([*moving, across @ ways[:, None]])
-
-
-def _shares(exponent: Array) -> Array:
-    """Weights (n, S) that sum to 1."""
-    weight = np.exp(exponent - exponent.max(axis=1, keepdims=True))
-    return weight / weight.sum(axis=1, keepdims=True)
 
 
 def _along_aorta(blood: Circulation, tree: VesselTree) -> tuple[Array, Array]:

@@ -1,10 +1,4 @@
-"""How a moving vessel displaces space, compiled; see `anatomy.motion`.
-
-Parameters of a motion are numbers, one simulation's: `MARK`, the amplitudes of heart
-and breathing and the distensibility; rate (1/s) and phase of the heart, pulse wave
-velocity (m/s), rate (1/s) and phase of breathing; and the numbers of the geoms that
-carry the wall and the bore of the sheath, -1 for none.
-"""
+"""How a moving vessel displaces space, compiled; see `anatomy.motion`."""
 
 import math
 
@@ -13,6 +7,9 @@ import numpy as np
 from cathsim_dmc.anatomy.circulation import BEAT
 from cathsim_dmc.compiled import compiled
 
+# One simulation's numbers: `MARK`, amplitudes of heart and breathing, distensibility;
+# rate (1/s) and phase of the heart, pulse wave velocity (m/s), rate (1/s) and phase of
+# breathing; the geoms that carry the wall and the bore of the sheath, -1 for none.
 PARAMETERS, MARK = 11, 2947.0
 # Of the head of a lattice: origin (3) m, step m, shape (3); then its values.
 HEAD = 7
@@ -122,10 +119,7 @@ def interpolate(lattice, x, y, z, out):
 
 @compiled
 def warp(lattice, course, x, y, z, scratch, out):
-    """Writes what the motion does to a place (m) in space, see `WARP`.
-
-    The course is what `courses` says of a time; scratch is (8, 4).
-    """
+    """Writes what the motion of `courses` does to a place (m) in space, see `WARP`."""
     interpolate(lattice, x, y, z, scratch)
     a, b, r, da, db, dr, beats, lag, often = course
     out[0], out[1], out[2] = x, y, z
@@ -144,10 +138,7 @@ def warp(lattice, course, x, y, z, scratch, out):
 
 @compiled
 def first_past(inlet, points):
-    """Number of the first of places (n, 3), m, past an inlet, n for none.
-
-    The inlet is (2, 3), its position, m, and the direction into the vessel.
-    """
+    """Number of the first of places (n, 3) m past an inlet (position, way in), or n."""
     for n in range(len(points)):
         level = 0.0
         for k in range(3):
@@ -170,10 +161,7 @@ def rest(lattice, parameters, time, points, out):
 
 @compiled
 def moved(lattice, parameters, time, points, out, growth):
-    """Writes the places in space (n, 3) of places at rest (n, 3), m.
-
-    And how much the radius has grown there (n,), m.
-    """
+    """Writes places in space (n, 3) m of those at rest, and growth of radii (n,) m."""
     values, there = np.empty((VALUES, 4)), np.empty(WARP)
     course = courses(parameters, time)
     for n in range(len(points)):
@@ -207,10 +195,8 @@ def carried(there, p, q, r):
 
 @compiled
 def wall_velocity(there, normal):
-    """Velocity (3) m/s of the wall's material where `warp` has looked.
-
-    Space goes with A⁻¹ ∂u/∂t, and a wall that widens away from its normal (3).
-    """
+    """Velocity (3) m/s of the wall's material where `warp` has looked."""
+    # Space goes with A⁻¹ ∂u/∂t, and a wall that widens away from its normal.
     u, v, w, scale = carried(there, there[16], there[17], there[18])
     u, v, w, grow = u / scale, v / scale, w / scale, there[19]
     return u - grow * normal[0], v - grow * normal[1], w - grow * normal[2]

@@ -15,7 +15,7 @@ _LEAST_SPACING = 1e-3
 
 
 def _depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
-    """Depths (nx, ny, nz) m, those far outside -2 spacing, and the first point (3,)."""
+    """Depths (nx, ny, nz) m, far outside -2 spacing, and the first point (3,)."""
     lines = [(one.centreline, one.parent is None) for one in tree.vessels.values()]
     margin = 3.0 * spacing
     low = np.min([(x.points - x.radii[:, None]).min(0) for x, _ in lines], axis=0)

@@ -30,25 +30,19 @@ class TreeDepth:
     """Distance to the wall of a union of tubes.
 
     A tube is the union of its cross-sections: rings around the centreline, across it,
-    whose centres, directions and radii change linearly between its points. Next to a
-    tapered wall and within an ostium, `VesselTree.depths` (radius less distance from
-    the centreline) is not the distance to the wall; this is. Where a ring lies in
-    another vessel there is no wall, and where two walls meet there is an edge, a
-    crease, which is kept as points. Closed ends are flat walls; an open end goes on as
-    a straight tube.
+    whose centres, directions and radii change linearly between its points. Where a ring
+    lies in another vessel there is no wall, and where two walls meet there is an edge,
+    a crease, which is kept as points. Closed ends are flat walls; an open end goes on
+    as a straight tube.
     """
 
     def __init__(self, tree: VesselTree, ends: Sequence[End] = ()):
-        """Finds the creases.
-
-        Args:
-            ends: flat ends of the tree; those that are not named are closed.
-        """
+        """Finds the creases; flat ends that are not named are closed."""
         lines = [vessel.centreline for vessel in tree.vessels.values()]
         stops = np.cumsum([0, *(len(line.points) for line in lines)])
+        free = [end.position for end in ends if end.open]
 
         def closed(point: Array) -> bool:
-            free = [end.position for end in ends if end.open]
             return all(np.linalg.norm(point - place) >= 1e-6 for place in free)
 
         # Centres (3), unit tangents (3) and radii of all rings; the first and the last
@@ -141,13 +135,11 @@ def _grouped(points: Array) -> tuple[np.ndarray, Array, Array]:
     size = max(float(np.ptp(points, axis=0).max()), 1e-9) / along
     cells = ((points - points.min(axis=0)) / size).astype(int).clip(0, along - 1)
     _, groups = np.unique(cells @ (1, along, along**2), return_inverse=True)
-    parts = [points[groups == group] for group in range(groups.max() + 1)]
-    middles = [own.mean(axis=0) for own in parts]
-    reaches = [
-        np.linalg.norm(own - middle, axis=1).max()
-        for own, middle in zip(parts, middles, strict=True)
-    ]
-    return groups, np.array(middles), np.array(reaches)
+    numbers = range(groups.max() + 1)
+    middles = np.array([points[groups == group].mean(axis=0) for group in numbers])
+    reaches = np.zeros(len(middles))
+    np.maximum.at(reaches, groups, np.linalg.norm(points - middles[groups], axis=1))
+    return groups, middles, reaches
 
 
 @compiled
@@ -209,12 +201,7 @@ def _nearest(nodes, first, last, chosen, x, y, z):
 
 @compiled
 def _signed(tree, vessel, chosen, x, y, z, out):
-    """Signed depth (m) in one vessel, and the nearest place of its wall in `out`.
-
-    Args:
-        tree: arrays of `TreeDepth`.
-        chosen: numbers of the vessel's rings that matter.
-    """
+    """Signed depth (m) in one vessel, and the nearest place of its wall in `out`."""
     nodes, (first, last), flats = tree[0], tree[1][vessel], tree[2][vessel]
     k, u, value = _nearest(nodes, first, last, chosen, x, y, z)
     axial, radial, radius = _ring(nodes, k, u, x, y, z)
@@ -260,10 +247,7 @@ def _square(place, x, y, z):
 
 @compiled
 def _rings_near(nodes, among, x, y, z, margin, chosen):
-    """Depth of the rings of one vessel around a place.
-
-    Those that matter are written behind their number, chosen[0].
-    """
+    """Depth of one vessel's rings; those that matter, behind their number, `chosen`."""
     best, deepest, count = np.inf, -np.inf, 0
     for k in among:
         best = min(best, _from_node(nodes, k, x, y, z))
@@ -293,16 +277,7 @@ def _creases_near(creases, among, x, y, z, margin, near):
 
 @compiled
 def _tree_depths(tree, creases, blocks, points, reach, groups, out):
-    """Signed distance to the wall at every point of every block.
-
-    Args:
-        tree: arrays of `TreeDepth`.
-        creases: (c, 3) points where walls of two vessels meet, m.
-        blocks: (n, 3) middles of the blocks, m.
-        points: (q, 3) relative to the middle of a block, m, within `reach`.
-        groups: see `_grouped`; middles are relative to that of a block.
-        out: (n, q) m, > 0 inside.
-    """
+    """Signed distances (n, q) m at blocks (n, 3) + points (q, 3) within a reach, m."""
     nodes, spans, _ = tree
     group, middles, reaches = groups
     vessels = len(spans)
@@ -344,13 +319,9 @@ def _tree_depths(tree, creases, blocks, points, reach, groups, out):
 
 @compiled
 def _tree_depth(tree, here, x, y, z):
-    """Signed distance (m) of one point from the walls, without creases.
-
-    Args:
-        tree: arrays of `TreeDepth`.
-        here: which vessels matter to the point, and their rings; the same of those
-            that may hold the wall of another; scratch (2, 3).
-    """
+    """Signed distance (m) of one point from the walls, without creases."""
+    # Which vessels matter, and their rings; the same of those that may hold another's
+    # wall; scratch.
     matters, close, others, wide, places = here
     inside, distance = False, np.inf
     for v in range(len(matters)):

@@ -1,9 +1,4 @@
-"""Vessel trees in JSON: centrelines, inlets and goals in millimetres.
-
-The section "Your own centrelines" of docs/anatomies.md has the format. The first vessel
-is the root; parents stand before their children. `note`, `inlets` and `goals` may be
-left out.
-"""
+"""Vessel trees in JSON; docs/anatomies.md, "Your own centrelines", has the format."""
 
 import json
 import math
@@ -36,19 +31,12 @@ _WAYS = {
 
 @dataclass(frozen=True, eq=False)
 class TreeFile:
-    """Content of a tree file; lengths in metres, frame LPS.
-
-    Attributes:
-        name: of the anatomy.
-        curves: centrelines by name, the root first.
-        inlets: by name of the access; the first is the usual one.
-        goals: by name; None for one in each branch.
-    """
+    """Content of a tree file; lengths in metres, frame LPS."""
 
     name: str
-    curves: Mapping[str, Curve]
-    inlets: Mapping[str, VesselPlace]
-    goals: Mapping[str, VesselPlace] | None = None
+    curves: Mapping[str, Curve]  # the root first
+    inlets: Mapping[str, VesselPlace]  # by access; the first is the usual one
+    goals: Mapping[str, VesselPlace] | None = None  # None for one in each branch
 
     def build(self, access: str | None = None) -> Anatomy:
         """Anatomy that is entered by `access`, by default the first inlet's."""

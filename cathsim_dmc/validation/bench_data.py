@@ -14,8 +14,8 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End, Inlet, Surface
-from cathsim_dmc.anatomy.scan.inlet import cut_open
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
+from cathsim_dmc.anatomy.scan.places import cut_open
 from cathsim_dmc.anatomy.scan.topology import merged
 from cathsim_dmc.recording.geometry import along
 

@@ -1,12 +1,7 @@
 """Parametric aortic arches: presets, sets of random ones, and their anatomies.
 
-Built in the patient frame LPS with the inlet of the ascending aorta at the
-origin. The arch is half an ellipse in a plane, between an ascending and a
-descending limb; limbs may bend and the plane may tilt and sway. Three branches
-leave the outer curve: brachiocephalic (bca), left common carotid (lcca) and
-left subclavian artery (lsa). The presets of types I and II are idealised: straight
-limbs in a vertical plane. Type III and bovine curve in space, as what `arch.sampler`
-draws does.
+The inlet of the ascending aorta is at the origin. The presets of types I and II are
+idealised: straight limbs in a vertical plane. Type III and bovine curve in space.
 """
 
 import math

@@ -37,10 +37,7 @@ _UPRIGHT = np.array([0.0, 0.0, 1.0])
 
 
 class Plane:
-    """The plane of the arch: vertical, turned from the sagittal one, its top tilted.
-
-    Unit vectors `along` the arch, `up`, and `normal`, to the patient's right and back.
-    """
+    """The plane of the arch: `along` it, `up`, and `normal`, to the right and back."""
 
     def __init__(self, rotation: float, tilt: float):
         self.along = np.array([math.sin(rotation), math.cos(rotation), 0.0])
@@ -65,9 +62,7 @@ def _smooth_interpolation(s: Array, stations: Array, values: Array) -> Array:
 def _limb(length: float, bend: float, heading: float) -> Array:
     """Points (n, 2) m of a limb from 0 on that turns to the right by `bend`, rad."""
     step = _STRAIGHT_STEP if abs(bend) < 1e-9 else _CURVED_STEP
-    # Whole steps, of which the parametric arches have always had `length / step`.
-    count = max(1, round(length / step))
-    s = np.linspace(0.0, length, count + 1)
+    s = np.linspace(0.0, length, max(1, round(length / step)) + 1)
     if abs(bend) < 1e-9:
         return s[:, None] * np.array([math.sin(heading), math.cos(heading)])
     radius = length / bend
@@ -93,11 +88,7 @@ def _aorta_points(p: ArchParameters) -> Array:
 
 
 def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, list[float]]:
-    """Aorta in its plane: points (n, 2), radii (n,), outer curve, branch levels.
-
-    The levels are arc lengths on the centreline. They depend on the outer curve,
-    which depends on the radii, which depend on the levels: iterate.
-    """
+    """Aorta in its plane: points (n, 2), radii (n,), outer curve, branch levels (m)."""
     points = _aorta_points(p)
     s = arc_lengths(points)
     tangent = np.gradient(points, s, axis=0)
@@ -107,6 +98,7 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, list[float]]:
     levels = [top - 15e-3, top, top + 12e-3]
     arch_end = float(s[-1] - p.descending_length)
     radii_of = np.array([getattr(p, f"{level}_radius") for level in LEVELS])
+    # Levels depend on the outer curve, that on the radii, and these on the levels.
     for _ in range(8):
         stations = np.array([0.5 * p.ascending_length, *levels[:3], arch_end])
         if np.any(np.diff(stations) <= 1e-3):
@@ -125,37 +117,28 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, list[float]]:
         lsa = lcca + p.lcca_lsa_spacing
         if p.bovine:  # no LCCA ostium: its level of the aorta is half-way to the LSA
             lcca = 0.5 * (bca + lsa)
-        places = [bca, lcca, lsa, lsa + p.lsa_aberrant_spacing]
-        places = places[: len(p.branches)]
+        places = [bca, lcca, lsa, lsa + p.lsa_aberrant_spacing][: len(p.branches)]
         levels = [float(np.interp(place, arc, s)) for place in places]
     return points, radii, outer, levels
-
-
-def _in_space(p: ArchParameters, plane: Plane, flat: Array) -> Array:
-    """World points (n, 3) of the aorta's in-plane ones: with bow and sway."""
-    s = arc_lengths(flat)
-    phase = math.pi * s / s[-1]
-    aside = p.bow * np.sin(phase) + p.sway * np.sin(2.0 * phase)
-    return plane.to_world(flat) + aside[:, None] * plane.normal
-
-
-def _direction(branch: BranchParameters, plane: Plane) -> Array:
-    aside = np.cross(_UPRIGHT, plane.along)
-    upstream, lean = math.tan(branch.take_off), math.tan(branch.lean)
-    direction = _UPRIGHT - upstream * plane.along + lean * aside
-    return direction / np.linalg.norm(direction)
 
 
 def arch_tree(params: ArchParameters) -> VesselTree:
     """Vessels of an arch; ValueError if branches do not fit or meet each other."""
     plane = Plane(params.plane_rotation, params.plane_tilt)
     points, radii, outer, levels = _outer_curve(params)
-    aorta = Vessel("aorta", Centreline(_in_space(params, plane, points), radii))
+    s = arc_lengths(points)
+    phase = math.pi * s / s[-1]
+    aside = params.bow * np.sin(phase) + params.sway * np.sin(2.0 * phase)
+    line = plane.to_world(points) + aside[:, None] * plane.normal
+    aorta = Vessel("aorta", Centreline(line, radii))
     vessels = {"aorta": aorta}
     for (name, branch), level, septum in zip(
         params.branches.items(), levels, _septa(params), strict=True
     ):
-        direction = _direction(branch, plane)
+        upstream, lean = math.tan(branch.take_off), math.tan(branch.lean)
+        side = np.cross(_UPRIGHT, plane.along)
+        direction = _UPRIGHT - upstream * plane.along + lean * side
+        direction = direction / np.linalg.norm(direction)
         fillet = min(_FILLET, 0.4 * max(septum - MINIMUM_SEPTUM, 0.0))
         parent = aorta
         if name == "lcca" and params.bovine:
@@ -197,14 +180,11 @@ def _ostium(
 
 
 def _septa(params: ArchParameters) -> list[float]:
-    """Wall (m) between the ostium of each branch, without its flare, and the nearest.
-
-    That of a bovine LCCA is on the BCA.
-    """
+    """Wall (m) between the ostium of each branch, without flare, and the nearest."""
     radii = [branch.radius for branch in params.branches.values()]
     before, last = math.inf, math.inf
     after = params.lcca_lsa_spacing - radii[0 if params.bovine else 1] - radii[2]
-    if not params.bovine:
+    if not params.bovine:  # whose LCCA is on the BCA
         before = params.bca_lcca_spacing - radii[0] - radii[1]
     if params.aberrant is not None:
         last = params.lsa_aberrant_spacing - radii[2] - radii[3]
@@ -234,7 +214,19 @@ def _branch_vessel(
     outward = ostium - line.at(line.project(ostium).arc_length).position
     tilt = math.acos(np.clip(direction @ outward / np.linalg.norm(outward), -1.0, 1.0))
     wide, parent_radius = p.radius + fillet, float(place.radius)
-    _check_exit(name, wide, exit_length, tilt, parent_radius)
+    longest = _LONGEST_EXIT * parent_radius
+    if tilt > _MOST_OBLIQUE or exit_length > longest:
+        raise ValueError(
+            f"branch {name!r} leaves at {math.degrees(tilt):.0f} degrees, "
+            f"{exit_length * 1e3:.0f} mm from its parent's centreline; at most "
+            f"{math.degrees(_MOST_OBLIQUE):.0f} degrees and {longest * 1e3:.0f} mm are "
+            "allowed: mend take_off"
+        )
+    if wide > 0.95 * parent_radius:
+        raise ValueError(
+            f"branch {name!r} has a radius of {wide:g} m at its ostium, more than 0.95 "
+            f"of its parent's, {parent_radius:g} m; make it smaller"
+        )
     flare_start = flare_begin(wide, parent_radius, tilt, exit_length)
     flare_end = exit_length + 2.0 * fillet + p.radius * math.tan(tilt)
     length = exit_length + p.length
@@ -252,23 +244,6 @@ def _branch_vessel(
     u = np.clip((s - flare_start) / (flare_end - flare_start), 0.0, 1.0)
     radii = p.radius + (p.end_radius - p.radius) * progress + fillet * (1.0 - u) ** 2
     return Vessel(name, Centreline(points, radii), parent.name, exit_length)
-
-
-def _check_exit(
-    name: str, wide: float, exit_length: float, tilt: float, parent_radius: float
-) -> None:
-    if tilt > _MOST_OBLIQUE or exit_length > _LONGEST_EXIT * parent_radius:
-        raise ValueError(
-            f"branch {name!r} leaves at {math.degrees(tilt):.0f} degrees, "
-            f"{exit_length * 1e3:.0f} mm from its parent's centreline; at most "
-            f"{math.degrees(_MOST_OBLIQUE):.0f} degrees and "
-            f"{_LONGEST_EXIT * parent_radius * 1e3:.0f} mm are allowed: mend take_off"
-        )
-    if wide > 0.95 * parent_radius:
-        raise ValueError(
-            f"branch {name!r} has a radius of {wide:g} m at its ostium, more than 0.95 "
-            f"of its parent's, {parent_radius:g} m; make it smaller"
-        )
 
 
 def _path(

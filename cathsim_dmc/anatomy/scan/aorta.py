@@ -64,21 +64,13 @@ def find_aorta(
 
 @dataclass(frozen=True)
 class Bend:
-    """The bend of an aorta.
+    """The bend of an aorta; directions are unit vectors (3,)."""
 
-    Attributes:
-        line: (n, 3) m, smoothed, 1 mm apart.
-        apex: row of the line at which it bends most.
-        turn: rad, bend between 60 mm before and after the apex.
-        up: (3,), unit, mean direction of both limbs to the bend and of the branches.
-        along: (3,), unit, from the leg before the apex to the one after it.
-    """
-
-    line: np.ndarray
-    apex: int
-    turn: float
-    up: np.ndarray
-    along: np.ndarray
+    line: np.ndarray  # (n, 3) m, smoothed, 1 mm apart
+    apex: int  # row of the line at which it bends most
+    turn: float  # rad, bend between 60 mm before and after the apex
+    up: np.ndarray  # mean direction of both limbs to the bend and of the branches
+    along: np.ndarray  # from the leg before the apex to the one after it
 
     @classmethod
     def of(cls, way: np.ndarray, branches: Sequence[np.ndarray] = ()) -> Self:
@@ -155,10 +147,7 @@ def mirrored(azimuth: float | None) -> str | None:
 def heart_odds(bend: Bend, depth: np.ndarray, places: Sequence[float]) -> float:
     """Log odds that the heart is at the last point of the aorta, branches aside.
 
-    Args:
-        bend: of the aorta.
-        depth: (n,) m, of the points of its line.
-        places: m, arc lengths at which the branches of the arch leave.
+    Its line has depths (n,) m; the branches leave at `places`, arc lengths, m.
     """
     first, last = min(places), max(places)
     s = 1e-3 * np.arange(len(bend.line))

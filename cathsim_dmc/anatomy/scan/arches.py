@@ -7,15 +7,9 @@ from typing import Self
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from cathsim_dmc.anatomy.scan import aorta, naming
+from cathsim_dmc.anatomy.scan import aorta, extract, naming
 from cathsim_dmc.anatomy.scan.aorta import Bend
-from cathsim_dmc.anatomy.scan.extract import (
-    FreeEnd,
-    LumenEntry,
-    centrelines,
-    listed,
-    stump,
-)
+from cathsim_dmc.anatomy.scan.extract import FreeEnd, LumenEntry, listed
 from cathsim_dmc.anatomy.scan.naming import SURE, Naming
 from cathsim_dmc.anatomy.scan.offshoots import Offshoot, offshoots
 from cathsim_dmc.anatomy.scan.ways import Ways
@@ -23,40 +17,26 @@ from cathsim_dmc.anatomy.scan.ways import Ways
 
 @dataclass(frozen=True)
 class Arch:
-    """An aorta that turns back, seen from the end that is not at the heart.
-
-    Attributes:
-        ways: of the lumen.
-        ends: of the aorta, that at the heart last.
-        entry: at the first of them, towards the last; the other way if that is a stump.
-        found: the centrelines from there, as `centrelines` gives them.
-        bend: of the aorta, from there on.
-        heart: probability that the heart is at the last end.
-    """
+    """An aorta that turns back, seen from the end that is not at the heart."""
 
     ways: Ways
-    ends: tuple[FreeEnd, FreeEnd]
-    entry: LumenEntry
-    found: tuple[list[np.ndarray], int]
-    bend: Bend
-    heart: float
+    ends: tuple[FreeEnd, FreeEnd]  # that at the heart last
+    entry: LumenEntry  # at the first of them; at the last if the first is a stump
+    found: tuple[list[np.ndarray], int]  # `centrelines` from there on
+    bend: Bend  # of the aorta, from there on
+    heart: float  # probability that the heart is at the last end
 
     @classmethod
     def of(
         cls, ways: Ways, ends: Sequence[FreeEnd], heart: np.ndarray | None
     ) -> Self | None:
-        """The arch of a lumen, or None if it has none.
+        """The arch of a lumen with free ends, or None if it has none.
 
-        Args:
-            ways: of the lumen.
-            ends: its free ends.
-            heart: (3,) m near the end at the heart, or None to find it.
-
-        Raises:
-            ValueError: if ``heart`` is near no end of an aorta.
+        The `heart` (3,) m is near the end at the heart, or None to find it; ValueError
+        if it is near no end of an aorta.
         """
         pair, cut = aorta.find_aorta(ways, ends), None
-        if pair is None and (cut := stump(ways, ends)) is not None:
+        if pair is None and (cut := extract.stump(ways, ends)) is not None:
             ends = [*ends, cut]
             pair = aorta.find_aorta(ways, ends, aorta.TURN_OF_STUMP)
         if pair is None:
@@ -88,12 +68,12 @@ class Arch:
             return arch
         # Too short for a device that enters there.
         entry = LumenEntry(last.position, True, first.position)
-        return replace(arch, entry=entry, found=centrelines(ways, ends, entry))
+        return replace(arch, entry=entry, found=extract.centrelines(ways, ends, entry))
 
     @classmethod
     def _seen(cls, ways, ends, first, last, heart: float | None = None) -> Self:
         entry = LumenEntry(first.position, True, last.position)
-        found = centrelines(ways, ends, entry)
+        found = extract.centrelines(ways, ends, entry)
         bend, width, branches = _branches(ways, first.position, last.position, found[0])
         if heart is None:
             share = _shares(bend, width, branches)
@@ -101,12 +81,9 @@ class Arch:
         return cls(ways, (first, last), entry, found, bend, heart)
 
     def entered(self, inlet: np.ndarray | None, planned: LumenEntry) -> LumenEntry:
-        """Where the device enters, and where the aorta leads from there.
+        """Where the device enters: by default at the end that is not at the heart.
 
-        Args:
-            inlet: (3,) m as given by the user, or None: then the end that is not at
-                the heart.
-            planned: entry that the given inlet means.
+        A given inlet (3,) m means the `planned` entry; the aorta leads on from there.
         """
         if inlet is None:
             return self.entry
@@ -134,7 +111,7 @@ class Arch:
         far = self.ends[toward].position
         bend, width, found = _branches(self.ways, start, far, curves)
         if not found:
-            return Naming([f"branch_{k + 1}" for k in range(len(curves))], [])
+            return Naming([f"branch_{k + 1}" for k in range(len(curves))])
         if self.heart < SURE:
             names = naming.neutral_names(curves)
             share = {

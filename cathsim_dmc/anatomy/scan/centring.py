@@ -32,8 +32,7 @@ def centred(
 ) -> np.ndarray:
     """Move a curve (n, 3) sideways towards the middle of the lumen.
 
-    Every round steps up the depth across the curve and then smooths a little; the
-    step shrinks, so that the curve settles on the ridge of the depth.
+    Every round steps up the depth across the curve, by less and less, and smooths.
     """
     points = curve.copy()
     for turn in range(ROUNDS):
@@ -91,9 +90,7 @@ def section_radii(field: SurfaceDepth, points: np.ndarray) -> np.ndarray:
 def _smoothed(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Smooth a curve over about half the lumen's radius, its ends kept.
 
-    The middle of a wide vessel is flat, and a curve would wander about on it. What
-    smoothing takes off a bend is smoothed and put back, or an arch of 34 mm radius
-    would be cut by a millimetre.
+    The middle of a wide vessel is flat, and a curve would wander about on it.
     """
     width = np.clip(SMOOTH * (depth - NARROW) / STEP, 0.0, 12.0)
     pad = min(len(points) - 1, 40)

@@ -34,13 +34,7 @@ START_ROOM = 10e-3  # m between the head at the start and a goal's ostium
 
 
 class TreeCheck(NamedTuple):
-    """One finding about a tree.
-
-    Attributes:
-        name: what was looked at.
-        passed: whether it is as it should be.
-        detail: the figures, and where it is wrong.
-    """
+    """What was looked at, whether it is right, and figures, or where it is wrong."""
 
     name: str
     passed: bool
@@ -48,16 +42,7 @@ class TreeCheck(NamedTuple):
 
 
 def check_tree(anatomy: Anatomy) -> list[TreeCheck]:
-    """Proves the tree of an anatomy against its surface.
-
-    Args:
-        anatomy: of any origin; its surface must be closed.
-
-    Returns:
-        One finding for each of: centrelines inside the lumen, every vessel in a lumen
-        of its own, branches on their parents, branches of the arch on their sides,
-        free ends, goals, sizes, the inlet, and the start of the device.
-    """
+    """Proves the tree of an anatomy against its closed surface; see docs/scans.md."""
     measure = SurfaceDepth(anatomy.surface)
     out = []
     for name, look in _CHECKS.items():
@@ -130,10 +115,7 @@ def _parents(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
 
 
 def _sides(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
-    """Whether the arch leads from right and front to left and back, as named.
-
-    It tells a scan that is mirrored, or whose frame is not what it was said to be.
-    """
+    """Whether the arch leads from right and front to left and back, as named."""
     tree, wrong = anatomy.tree, []
     root = tree.root
     vessels = [tree.vessels[key] for key in ARCH_BRANCHES if key in tree.vessels]
@@ -193,10 +175,7 @@ def _lumen_beyond(
 ) -> np.ndarray:
     """Lattice points (n, 3) of the passable lumen ahead of an end, within 60 mm.
 
-    Args:
-        depth: of the lumen.
-        end: of a centreline.
-        radius: m, of the lumen up to there: what lies behind is cut off there.
+    The lumen has a `radius` (m) up to there: what lies behind is cut off there.
     """
     reach = (FREE_RADII + 1.5) * radius
     narrow = float(end.radius) / 3.0

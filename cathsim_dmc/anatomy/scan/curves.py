@@ -25,16 +25,8 @@ def read_curves(
 ) -> dict[str, np.ndarray]:
     """Points (n, 3) m, LPS, of drawn centrelines, by the names of their vessels.
 
-    Args:
-        paths: of markups or tables, one per branch.
-        units: of tables, as `frame`; see `read_curve`.
-        frame: "LPS" or "RAS".
-        axes: how the scan is turned; see `units.upright`.
-        root: name that no branch may have.
-
-    Raises:
-        FileNotFoundError: if a file is missing.
-        ValueError: if a file holds no centreline, or two give one name.
+    Files are read as by `read_curve`; see `units.upright` for `axes`. ValueError if a
+    file holds no centreline, or two give one name, or the `root`'s.
     """
     listed = isinstance(paths, Sequence) and not isinstance(paths, str | bytes)
     if not listed or not all(isinstance(path, str | Path) for path in paths):
@@ -59,11 +51,7 @@ def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> np.nd
     """Points (n, 3) m, LPS, of a 3D Slicer markup (.json) or a table (.csv, .txt).
 
     A table holds x, y, z per line, in ``units`` and ``frame``, and may hold the radius,
-    which is not used; a markup says both itself.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it holds no centreline.
+    which is not used. FileNotFoundError without a file, ValueError without a curve.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -98,11 +86,7 @@ def vessel_name(path: str | Path) -> str:
 
 
 def inside_part(name: str, curve: np.ndarray, measure: SurfaceDepth) -> np.ndarray:
-    """The points (k, 3) m of a curve (n, 3) m, LPS, in the lumen, wider end first.
-
-    Raises:
-        ValueError: if less than `INSIDE` of them do.
-    """
+    """The points (k, 3) m of a curve (n, 3) m, LPS, in the lumen, wider end first."""
     depth = measure(curve)
     inside = depth > 0.0
     if inside.mean() < INSIDE:

@@ -30,12 +30,9 @@ RING = 40e-3  # m, shortest ring
 
 
 class FreeEnd(NamedTuple):
-    """A blind end of the lumen.
+    """A blind end of the lumen: place (3,) and radius near it, m.
 
-    Attributes:
-        position: (3,) m.
-        radius: m, of the lumen near the end.
-        bottleneck: m, largest sphere that reaches the widest part from here.
+    Of the `bottleneck` (m) is the largest sphere that reaches the widest part from it.
     """
 
     position: np.ndarray
@@ -134,12 +131,9 @@ def stump(ways: Ways, ends: Sequence[FreeEnd]) -> FreeEnd | None:
 
 
 class LumenEntry(NamedTuple):
-    """Where the device enters and where the root vessel leads.
+    """Place (3,) m where the device enters, and `far` end (3,) m of the root, or None.
 
-    Attributes:
-        position: (3,) m.
-        at_end: whether that is a free end, or a place where the lumen is cut.
-        far: (3,) m, far end of the root, or None.
+    It is a free end (`at_end`), or a place where the lumen is cut.
     """
 
     position: np.ndarray
@@ -155,17 +149,10 @@ def plan_inlet(
 ) -> LumenEntry:
     """Choose where the device enters and where the root vessel leads.
 
-    Args:
-        ways: of the lumen.
-        ends: its free ends.
-        curves: (n_i, 3) m, given centrelines, first point proximal; may be empty.
-        inlet: (3,) m near the end to use or in the middle of a vessel that is to be
-            cut there, or None to choose: the end at which the curves start, else the
-            wide end farthest along the lumen from their starts. Without curves it is
-            the widest.
-
-    Raises:
-        ValueError: if no end can be chosen; lists them.
+    It enters by the free end near the `inlet` (3,) m, or where that lies in a vessel,
+    which is cut there. None chooses the end at which drawn curves (n_i, 3) m start,
+    else the wide end farthest from their starts, and without curves the widest.
+    ValueError lists the ends if none can be chosen.
     """
     nodes = [ways.node(end.position) for end in ends]
     width = np.array([end.bottleneck for end in ends])
@@ -239,11 +226,6 @@ def centrelines(
     Branches have a free end, or close a ring (such as the two vertebral arteries,
     which meet in the basilar).
 
-    Args:
-        ways: of the lumen.
-        ends: its free ends.
-        entry: where the device enters and where the root leads.
-
     Returns:
         (centrelines (n_i, 3) m, first point at the inlet, the bulkiest first, without
         the root; how many more branches are too thin or too short).
@@ -291,18 +273,10 @@ def continued(
     curves: dict[str, np.ndarray],
     entry: LumenEntry,
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Given centrelines, each drawn on to the end of its vessel.
+    """Given centrelines (n, 3) m by name, each drawn on to the end of its vessel.
 
-    A curve that stops half way says which vessel is meant, not where that ends.
-
-    Args:
-        ways: of the lumen.
-        ends: its free ends.
-        curves: (n, 3) m by name, first point proximal.
-        entry: where the device enters.
-
-    Returns:
-        (curves; metres by which each was continued, where it was).
+    A curve that stops half way says which vessel is meant, not where that ends. Also
+    returns the lengths (m) by which curves were continued.
     """
     before = ways.deepest_from(ways.node(entry.position))
     paths = [ways.trace(before, ways.node(end.position)) for end in ends]

@@ -16,10 +16,19 @@ from cathsim_dmc.anatomy.scan.arches import Arch
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.curves import inside_part, read_curves
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS, listed
-from cathsim_dmc.anatomy.scan.inlet import cut_open
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
-from cathsim_dmc.anatomy.scan.naming import VESSEL_NAME, neutral_names, renamed
-from cathsim_dmc.anatomy.scan.places import flat_ends, place_goals, place_inlet
+from cathsim_dmc.anatomy.scan.naming import (
+    VESSEL_NAME,
+    Naming,
+    neutral_names,
+    renamed,
+)
+from cathsim_dmc.anatomy.scan.places import (
+    cut_open,
+    flat_ends,
+    place_goals,
+    place_inlet,
+)
 from cathsim_dmc.anatomy.scan.tree import grow_tree, name_trunk
 from cathsim_dmc.anatomy.scan.units import in_mm, to_lps
 from cathsim_dmc.anatomy.scan.ways import Ways
@@ -81,12 +90,24 @@ def import_scan(
             does not agree with the surface; says how to mend it.
     """
     started = time.monotonic()
-    say, note = _reporters(progress, notes)
-    given, changes = _given(inlet=inlet, heart=heart), _changes(rename)
-    # Refused before the long steps, or read when the unit is known.
-    supposed = "mm" if units is None else units
-    to_lps(supposed, mesh_frame, axes)
-    read_curves(centreline_paths, supposed, mesh_frame, axes, root)
+    notes = [] if notes is None else notes
+    say = progress or (lambda text: None)
+
+    def note(*texts: str) -> None:
+        notes.extend(texts)
+        for text in texts:
+            say(f"note: {text}")
+
+    given = {
+        key: np.array(bounds.vector(key, place, 3))
+        for key, place in {"inlet": inlet, "heart": heart}.items()
+        if place is not None
+    }
+    changes = bounds.options("rename", rename)
+    if not all(VESSEL_NAME.fullmatch(str(wanted)) for wanted in changes.values()):
+        bounds.refuse("rename", rename, "names of small letters, digits and '_'")
+    # Refused before the long steps; read again when the unit is known.
+    read_curves(centreline_paths, units or "mm", mesh_frame, axes, root)
     lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, say)
     note(*lumen.notes)
     measure = SurfaceDepth(lumen.surface)
@@ -103,44 +124,8 @@ def import_scan(
     return anatomy
 
 
-def _reporters(
-    progress: Callable[[str], None] | None, notes: list[str] | None
-) -> tuple[Callable[[str], None], Callable[..., None]]:
-    """What tells of a step, and what tells and keeps notes."""
-
-    def say(text: str) -> None:
-        if progress is not None:
-            progress(text)
-
-    def note(*texts: str) -> None:
-        for text in texts:
-            if notes is not None:
-                notes.append(text)
-            say(f"note: {text}")
-
-    return say, note
-
-
-def _given(**places: Sequence[float] | None) -> dict[str, np.ndarray]:
-    """Those of the places (3,) that are given, checked."""
-    return {
-        key: np.array(bounds.vector(key, place, 3))
-        for key, place in places.items()
-        if place is not None
-    }
-
-
-def _changes(rename: Mapping[str, str] | None) -> dict[str, str]:
-    """New names by the computed ones, checked."""
-    changes = bounds.options("rename", rename)
-    for wanted in changes.values():
-        if not VESSEL_NAME.fullmatch(str(wanted)):
-            bounds.refuse("rename", rename, "names of small letters, digits and '_'")
-    return changes
-
-
 def _anatomy(name, tree, opening, surface, say, note) -> Anatomy:
-    """The anatomy of a tree, proved against its surface."""
+    """The anatomy of a tree, proved against its surface; notes what one may accept."""
     sizes = [
         f"{key} {vessel.centreline.length * 1e3:.0f} mm"
         + (f" from {vessel.parent}" if vessel.parent else "")
@@ -149,7 +134,15 @@ def _anatomy(name, tree, opening, surface, say, note) -> Anatomy:
     say(f"tree: {', '.join(sizes)}")
     ends = flat_ends(tree, opening)
     anatomy = Anatomy(name, tree, opening, place_goals(tree), ends, surface)
-    _prove(anatomy, note)
+    for check in check_tree(anatomy):
+        if not check.passed and check.name != "start of the device" and anatomy.goals:
+            raise ValueError(
+                f"the tree does not agree with the surface ({check.name}): "
+                f"{check.detail}. Mend the surface or the centrelines there, or give "
+                "its frame (mesh_frame, axes), the inlet, or other centrelines."
+            )
+        if not check.passed:
+            note(f"{check.name}: {check.detail}")
     return anatomy
 
 
@@ -183,20 +176,16 @@ def _computed(ways, ends, entry, places, root, changes, note):
         entry = arch.entered(places.get("inlet"), entry)
         if (wrong := arch.wrong_side()) is not None:
             raise ValueError(wrong)
-    if arch is not None and entry is arch.entry:
-        found, thin = arch.found
-    else:
-        found, thin = extract.centrelines(ways, ends, entry)
+    known = arch.found if arch is not None and entry is arch.entry else None
+    found, thin = known or extract.centrelines(ways, ends, entry)
     if not found:
         raise ValueError(
             "no branch of the lumen lets a 5 Fr catheter "
             f"({DEVICE_RADIUS * 2e3:.2f} mm) in for 15 mm, so there is no goal; its "
             f"ends are {listed(ends)}."
         )
-    names, right = neutral_names(found), ()
-    if arch is not None:
-        names, notes, right = arch.named(found)
-        note(*notes)
+    names, notes, right = arch.named(found) if arch else Naming(neutral_names(found))
+    note(*notes)
     names = renamed(names, changes, root)
     curves = dict(zip(names, found, strict=True))
     nameless = [
@@ -215,27 +204,11 @@ def _computed(ways, ends, entry, places, root, changes, note):
     return entry, curves, frozenset(names[row] for row in right)
 
 
-def _prove(anatomy: Anatomy, note: Callable[..., None]) -> None:
-    """Checks the tree against the surface; notes what a user may accept."""
-    for check in check_tree(anatomy):
-        if check.passed:
-            continue
-        if check.name != "start of the device" and anatomy.goals:
-            raise ValueError(
-                f"the tree does not agree with the surface ({check.name}): "
-                f"{check.detail}. Mend the surface or the centrelines there, or give "
-                "its frame (mesh_frame, axes), the inlet, or other centrelines."
-            )
-        note(f"{check.name}: {check.detail}")
-
-
 def _opened(
     tree: VesselTree, at_end: bool, surface: Surface
 ) -> tuple[VesselTree, Inlet, Surface]:
-    """The tree from its inlet on, the inlet, and the surface cut off there.
-
-    Less is cut off where the plane of the inlet would meet a branch.
-    """
+    """The tree from its inlet on, the inlet, and the surface cut off there."""
+    # Less is cut off where the plane of the inlet would meet a branch.
     for share in SHARES if at_end else SHARES[:1]:
         opened, inlet = place_inlet(tree, at_end, share)
         last = not at_end or share == SHARES[-1]

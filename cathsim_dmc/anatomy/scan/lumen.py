@@ -26,13 +26,7 @@ _SAMPLES = 1000
 
 
 class Lumen(NamedTuple):
-    """The closed surface of a lumen.
-
-    Attributes:
-        surface: closed, normals outwards, m, LPS.
-        units: of the file.
-        notes: what was guessed and what was mended, a line for each.
-    """
+    """A closed surface (m, LPS), its file's unit, and what was guessed and mended."""
 
     surface: Surface
     units: str
@@ -47,26 +41,14 @@ def read_lumen(
     labels: Sequence[int] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> Lumen:
-    """Read the surface of a lumen and mend it.
-
-    Args:
-        path: OBJ, STL, PLY or VTP; ends open or capped, any orientation, thin or
-            with the wall's thickness. Or a label map (NIfTI, NRRD), whose unit and
-            frame are its own.
-        units: of its coordinates, a key of ``units.UNITS``, or None to guess by the
-            lumen's width.
-        frame: "LPS" or "RAS".
-        axes: how the scan is turned if it does not stand upright; see
-            ``units.upright``.
-        labels: of a label map, those that are the lumen; see `labels.label_surface`.
-        say: called with a line of text for every step.
+    """Read the surface of a lumen and mend it; arguments as of `importer.import_scan`.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no such surface; says how to mend it.
     """
-    to_lps(units or "mm", frame, axes)  # refused before anything is read
-    if mesh.is_label_map(path):
+    to_lps("mm" if units is None else units, frame, axes)  # before anything is read
+    if str(path).lower().endswith(mesh.LABEL_MAPS):
         vertices, faces, why = mesh.label_surface(path, labels)
         units, vertices = "mm", vertices @ upright(axes).T
     else:
@@ -92,16 +74,9 @@ def read_lumen(
 def guess_units(
     name: str, vertices: np.ndarray, faces: np.ndarray, units: str | None
 ) -> tuple[str, str]:
-    """The unit in which a lumen has a plausible width, and a line that says why.
+    """The unit given, or in which a lumen has a plausible width, and why, as a line.
 
-    Args:
-        name: of the file, for messages.
-        vertices: (V, 3), in the file's unit.
-        faces: (F, 3).
-        units: as given by the user, or None to guess.
-
-    Raises:
-        ValueError: if none is given and the lumen has no plausible width in any.
+    ValueError if none is given and the lumen has no plausible width in any.
     """
     width = typical_radius(vertices, faces)
     fits = [u for u, s in UNITS.items() if WIDTH[0] <= width * s <= WIDTH[1]]

@@ -21,14 +21,7 @@ _PAD = 3  # voxels around the labels
 _NIFTI_UNITS = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6, "unknown": 1e-3}
 
 
-def parsed(path: Path, kind: str, read: Callable[[Path], Any], extra: str = "") -> Any:
-    """What ``read`` makes of a file.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged, or the ``extra`` that reads it is not installed;
-            the message is one line.
-    """
+def _parsed(path: Path, kind: str, read: Callable[[Path], Any], extra: str) -> Any:
     if not path.is_file():
         raise FileNotFoundError(
             f"no mesh file {path}; give a lumen's surface (STL, OBJ, PLY or VTP), or a "
@@ -50,13 +43,7 @@ def parsed(path: Path, kind: str, read: Callable[[Path], Any], extra: str = "") 
 
 
 def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of a file as they are.
-
-    Args:
-        path: OBJ, STL, PLY or VTP.
-
-    Returns:
-        (vertices (V, 3) float64 in the file's unit, faces (F, 3) int64).
+    """Vertices (V, 3) float64 in the file's unit and faces (F, 3) int64, as they are.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -70,7 +57,7 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
             f"{path} has the ending {path.suffix!r}; give a mesh in one of the formats "
             f"{', '.join(FORMATS)}."
         )
-    count = parsed(path, kind, announced)
+    count = _parsed(path, kind, _announced, "")
     if count > MOST:
         raise ValueError(
             f"{path} has some {count / 1e6:.1f} million triangles; at most "
@@ -78,7 +65,7 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
             "Surface Toolbox, Decimate)."
         )
     read = _read_vtp if kind == "vtp" else _read_mesh
-    vertices, faces = parsed(path, kind, read, "vtp")
+    vertices, faces = _parsed(path, kind, read, "vtp")
     if len(faces) < 4:
         raise ValueError(
             f"{path} has {len(faces)} triangles; give a triangle mesh of the lumen "
@@ -93,7 +80,7 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces
 
 
-def announced(path: Path) -> int:
+def _announced(path: Path) -> int:
     """Triangles that a file announces, or the most its size leaves room for."""
     with path.open("rb") as stream:
         head = stream.read(4096)
@@ -113,8 +100,6 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     options = {"skip_materials": True} if kind == "obj" else {}
     data = io.BytesIO(path.read_bytes())
     mesh = trimesh.load_mesh(data, file_type=kind, process=False, **options)
-    if isinstance(mesh, trimesh.Scene):
-        mesh = mesh.to_mesh()
     faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
     return np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3), faces
 
@@ -149,19 +134,10 @@ def _read_vtp(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return points, corners.astype(np.int64).reshape(-1, 3)
 
 
-def is_label_map(path: str | Path) -> bool:
-    """Whether a file's ending is that of a label map."""
-    return str(path).lower().endswith(LABEL_MAPS)
-
-
 def label_surface(
     path: str | Path, labels: Sequence[int] = ()
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Surface of some labels of a label map.
-
-    Args:
-        path: NIfTI (.nii, .nii.gz) or NRRD (.nrrd, .seg.nrrd) with whole numbers.
-        labels: values whose union is the lumen; none where the file holds one only.
+    """Surface of the labels of a label map that are the lumen, or of its only one.
 
     Returns:
         (vertices (V, 3) m in LPS, faces (F, 3), a line that says what was taken).
@@ -177,7 +153,7 @@ def label_surface(
     path = Path(path)
     nrrd = path.suffix.lower() == ".nrrd"
     read, kind = (_nrrd, "nrrd") if nrrd else (_nifti, "nii")
-    voxels, matrix, origin, names = parsed(path, kind, read, "segmentation")
+    voxels, matrix, origin, names = _parsed(path, kind, read, "segmentation")
     if voxels.ndim != 3:
         raise ValueError(
             f"{path} has the shape {voxels.shape}; give one label map in three "
@@ -212,12 +188,8 @@ def label_surface(
         faces = faces[:, ::-1]
     size = " x ".join(f"{x * 1e3:.2g}" for x in np.linalg.norm(matrix, axis=0))
     called = ", ".join(f"{k} {names.get(k, '')}".strip() for k in chosen)
-    return (
-        vertices,
-        faces.astype(np.int64),
-        f"label {called} of {path.name}: {int(mask.sum()):,} voxels of {size} mm; unit "
-        "and frame are the file's",
-    )
+    taken = f"label {called} of {path.name}: {int(mask.sum()):,} voxels of {size} mm"
+    return vertices, faces.astype(np.int64), f"{taken}; unit and frame are the file's"
 
 
 def _nifti(path: Path):

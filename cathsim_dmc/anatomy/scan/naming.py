@@ -1,9 +1,7 @@
 """Names of computed centrelines, by hypotheses about the arch that they leave.
 
-A hypothesis says which end of the aorta is at the heart and which branch each offshoot
-of the arch is. Its probability is that of the pattern of branches times those of the
-calibres, spacings and forks that are seen. A branch gets its name if the hypotheses
-that give it sum up to `SURE`; otherwise it gets a neutral one, and the notes ask.
+A branch gets its name if the hypotheses that give it sum up to `SURE`; otherwise it
+gets a neutral one, and the notes ask.
 """
 
 import re
@@ -15,14 +13,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.scan import offshoots
 from cathsim_dmc.anatomy.scan.aorta import Bend, chord
-from cathsim_dmc.anatomy.scan.offshoots import (
-    EXTRA,
-    SPREAD,
-    SURE,
-    Offshoot,
-    normal,
-    summed,
-)
+from cathsim_dmc.anatomy.scan.offshoots import EXTRA, SPREAD, SURE, Offshoot, normal
 from cathsim_dmc.anatomy.scan.units import in_mm
 from cathsim_dmc.anatomy.scan.ways import Ways, common
 
@@ -70,17 +61,11 @@ _FORK_DENSITY = 1.0 / 60e-3  # 1/m, to which densities of forks are compared
 
 
 class Naming(NamedTuple):
-    """What a lumen's branches are.
-
-    Attributes:
-        names: of the curves.
-        notes: names with their probability, and questions.
-        right: rows of the curves that share a brachiocephalic artery, named or not.
-    """
+    """Names of a lumen's curves, and notes: their probability, and questions."""
 
     names: list[str]
-    notes: list[str]
-    right: tuple[int, ...] = ()
+    notes: Sequence[str] = ()
+    right: tuple[int, ...] = ()  # curves that share a BCA, named or not
 
 
 class Hypothesis(NamedTuple):
@@ -99,23 +84,14 @@ def name_branches(
     curves: Sequence[np.ndarray],
     heart_last: bool,
 ) -> Naming:
-    """Names for the curves that leave an aortic arch.
-
-    Args:
-        ways: of the lumen.
-        bend: of its aorta.
-        scale: width of the aorta by that of a usual one.
-        found: offshoots of the arch, in the order of the bend's line.
-        curves: (m_i, 3) m, computed centrelines.
-        heart_last: whether the heart is at the last point of the line.
-    """
+    """Names for the curves (m_i, 3) m that leave an arch; see `hypotheses`."""
     share = hypotheses(bend, found, scale, {heart_last: 0.0})
     seen = list(found)[::-1] if heart_last else list(found)
     names: dict[int, str] = {}
     said, right, forked = [], [], []
     asks = False
     for place, one in enumerate(seen):
-        odds = summed(share, lambda key, place=place: key.labels[place])
+        odds = offshoots.summed(share, lambda key, place=place: key.labels[place])
         label = max(odds, key=odds.__getitem__)
         sure = odds[label]
         if not one.curves:
@@ -156,11 +132,7 @@ def neutral_names(curves: Sequence[np.ndarray]) -> list[str]:
 
 
 def renamed(names: Sequence[str], changes: Mapping[str, str], root: str) -> list[str]:
-    """Names after the user's changes.
-
-    Raises:
-        ValueError: if a name to change does not exist, or a new one is taken.
-    """
+    """Names after the user's changes; ValueError if one is unknown, or taken."""
     for old in changes:
         if old not in names:
             raise ValueError(
@@ -176,14 +148,10 @@ def renamed(names: Sequence[str], changes: Mapping[str, str], root: str) -> list
 def hypotheses(
     bend: Bend, found: Sequence[Offshoot], scale: float, odds: Mapping[bool, float]
 ) -> dict[Hypothesis, float]:
-    """Probability of every hypothesis about the offshoots of an arch.
+    """Probability of every hypothesis about offshoots in the order of an aorta's line.
 
-    Args:
-        bend: of the aorta.
-        found: its offshoots, in the order of its line.
-        scale: width of the aorta by that of a usual one.
-        odds: of what else is seen, log odds by whether the heart is at the last point
-            of the line; what is left out is excluded.
+    `scale` is its width by that of a usual one; `odds` are the log odds of what else is
+    seen, by whether the heart is at the last point, and exclude what they leave out.
     """
     # To the patient's right and back if the heart is at the first point.
     side = np.cross(bend.up, bend.along)
@@ -280,20 +248,14 @@ def question(
     seen: Sequence[Offshoot],
     names: Mapping[int, str],
 ) -> str:
-    """What the notes ask where not every branch has a name.
-
-    Args:
-        share: probabilities of hypotheses with the heart where it is taken to be.
-        seen: offshoots in their order from the heart.
-        names: of the curves, by their rows.
-    """
+    """What the notes ask about offshoots, from the heart on, that have no name."""
 
     def text(key: Hypothesis) -> str:
         missing = [name for name in key.pattern if name not in key.labels]
         without = f" without its {' and '.join(missing)}" if missing else ""
         return PATTERNS[key.pattern][1] + without
 
-    best = sorted(summed(share, text).items(), key=lambda item: -item[1])
+    best = sorted(offshoots.summed(share, text).items(), key=lambda item: -item[1])
     texts = [f"{text} ({value:.2f})" for text, value in best[:3] if value > 0.02]
     places = []
     for one in seen:

@@ -53,23 +53,14 @@ TWINS = 85e-3  # m that two curves share after all others have left: one vessel
 
 @dataclass(frozen=True)
 class Offshoot:
-    """A branch of the arch, with all that it leads to.
+    """A branch of the arch, with all that it leads to; m."""
 
-    Attributes:
-        place: (3,) m, where it leaves the lumen of the aorta.
-        s: m, arc length of the aorta there.
-        radius: m, of its lumen beyond that.
-        curves: rows of the computed centrelines in it; none if it was cut short.
-        fork: m past the ostium, first place at which it parts, or None.
-        rows: (n_i, 3) m, of each of its curves the part from the ostium on.
-    """
-
-    place: np.ndarray
-    s: float
-    radius: float
-    curves: tuple[int, ...]
-    fork: float | None
-    rows: tuple[np.ndarray, ...]
+    place: np.ndarray  # (3,), where it leaves the lumen of the aorta
+    s: float  # arc length of the aorta there
+    radius: float  # of its lumen beyond that
+    curves: tuple[int, ...]  # rows of the centrelines in it; none if it was cut short
+    fork: float | None  # past the ostium, the first place at which it parts
+    rows: tuple[np.ndarray, ...]  # (n_i, 3), its curves from the ostium on
 
 
 def offshoots(
@@ -77,11 +68,7 @@ def offshoots(
 ) -> list[Offshoot]:
     """Branches of an arch, in their order along the line of its aorta.
 
-    Args:
-        ways: of the lumen.
-        bend: of the aorta.
-        depth: (n,) m, of the points of its line.
-        curves: (m_i, 3) m, computed centrelines, from an end of the aorta on.
+    The line has depths (n,) m; curves (m_i, 3) m were computed from one of its ends on.
     """
     aorta = cKDTree(bend.line)
     groups_: list[tuple[list[int], list[np.ndarray], float]] = []
@@ -187,13 +174,8 @@ def leads(
 ) -> dict[int, tuple[str, float]]:
     """Names of the curves of a branch with their probabilities, by their rows.
 
-    Args:
-        ways: of the lumen.
-        bend: of its aorta.
-        one: the branch.
-        called: what the branch is, and the probability of that.
-        scale: width of the aorta by that of a usual one.
-        heart_last: whether the heart is at the last point of the aorta.
+    The branch is `called` something with a probability; `scale` is the width of the
+    aorta by that of a usual one, `heart_last` whether its last point is at the heart.
     """
     label, sure = called
     kept = without_twins(one.rows) if label in LEADS else [0]

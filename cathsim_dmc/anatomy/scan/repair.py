@@ -25,18 +25,10 @@ _AGAIN = "Smooth or remesh that place, or export the segmentation again."
 def mend(
     name: str, vertices: np.ndarray, faces: np.ndarray
 ) -> tuple[Surface, list[str]]:
-    """Close a surface, turn it outwards, and leave one part of it.
+    """Close a surface (V, 3) m, (F, 3), turn it outwards, and leave one part of it.
 
-    Args:
-        name: of the file, for messages.
-        vertices: (V, 3) m.
-        faces: (F, 3).
-
-    Returns:
-        The closed surface of one part, and what was changed, a line for each.
-
-    Raises:
-        ValueError: if it cannot be mended; says what is wrong and where.
+    Also returns what was changed, a line for each. ValueError if it cannot be mended;
+    says what is wrong in the file called `name`, and where.
     """
     work = _Work(name, vertices, faces)
     work.merge()

@@ -53,13 +53,6 @@ def edge_counts(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.unique(edges, axis=0, return_counts=True)
 
 
-def handles(faces: np.ndarray) -> int:
-    """Handles of a closed surface in one part, by its Euler characteristic."""
-    import igl
-
-    return 1 - igl.euler_characteristic(np.ascontiguousarray(faces)) // 2
-
-
 def parts(faces: np.ndarray) -> np.ndarray:
     """Number (F,) of the connected part that each triangle belongs to, from 0."""
     import igl
@@ -111,11 +104,7 @@ def decimated(
 
 
 def border_loops(faces: np.ndarray) -> list[np.ndarray]:
-    """Closed rows of vertices along the borders, in the direction of their faces.
-
-    Where two holes meet in a vertex, they become one loop each as far as that can
-    be told.
-    """
+    """Closed rows of vertices along the borders, in the direction of their faces."""
     import networkx
 
     pairs = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -169,12 +158,7 @@ def without_slivers(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
 
 
 def inner_shell(vertices: np.ndarray, *shells: np.ndarray) -> int | None:
-    """Which of two surfaces lies inside the other, or None if neither does.
-
-    Args:
-        vertices: (V, 3) m.
-        *shells: faces (n, 3) of the two surfaces, closed or open at vessel ends.
-    """
+    """Which of two surfaces, faces (n, 3), lies inside the other; None if neither."""
     import igl
 
     share = []
@@ -191,16 +175,13 @@ def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     """Faces (F,) bool of the inner surface of a wall, or None if it is no wall.
 
     A wall with open ends is one closed surface with holes through it. Seen from its
-    inner side almost every ray meets the wall again.
-
-    Args:
-        vertices: (V, 3) m.
-        faces: (F, 3), oriented alike, in one part.
+    inner side almost every ray meets the wall again. Faces (F, 3) are oriented alike.
     """
     import igl
 
-    if (edge_counts(faces)[1] != 2).any() or handles(faces) < 1:
-        return None  # open, or without a hole through it
+    closed = (edge_counts(faces)[1] == 2).all()
+    if not closed or igl.euler_characteristic(np.ascontiguousarray(faces)) > 0:
+        return None  # or without a hole through it
     area = areas(vertices, faces)
     outward = igl.per_face_normals(vertices, faces, np.zeros(3))
     outward *= np.sign(Surface(vertices, faces).volume)

@@ -1,9 +1,7 @@
-"""From curves drawn in a scan to a tree of vessels that starts at an inlet.
+"""From curves in a scan to a tree of vessels that starts at an inlet.
 
-Centrelines of a scan seldom reach the place where a device enters, and seldom start
-at the same point. Here each is continued to the inlet along the deepest way through
-the lumen, the shared beginnings are merged, and every curve is moved to the middle
-of the lumen, whose depth then serves as its radius.
+Each curve is continued to the inlet along the deepest way through the lumen, shared
+beginnings are merged, and every curve is moved to the middle of the lumen.
 """
 
 import re
@@ -41,18 +39,10 @@ def grow_tree(
     root_name: str,
     drawn: bool = True,
 ) -> VesselTree:
-    """Join the curves into one tree whose root starts at the inlet.
+    """Join curves (n, 3) m by name into one tree whose root starts at the inlet (3,) m.
 
-    Args:
-        field: depth of the lumen.
-        ways: of the lumen.
-        curves: (n, 3) m by vessel name, first point proximal.
-        inlet: (3,) m, end of the lumen where the root starts.
-        far: (3,) m, end of the root, or None: then the root ends where the last
-            of the curves leaves it.
-        root_name: name of the root.
-        drawn: whether the curves are drawn, and so may run off the deepest way and
-            start anywhere, or computed ways from the inlet on.
+    The root ends at `far` (3,) m, or where the last curve leaves it. Drawn curves may
+    run off the deepest way and start anywhere; others are computed from the inlet on.
     """
     before = ways.deepest_from(ways.node(inlet))
     raw = {}
@@ -117,13 +107,10 @@ def _separation(curve: np.ndarray, other: np.ndarray, field: SurfaceDepth) -> in
 
 
 def _parent(curve, lines, vessels, field) -> tuple[str, int]:
-    """Vessel that ``curve`` leaves last, and the index at which it does.
-
-    Two curves may leave a wide vessel side by side before they part: as long as
-    they have not left its lumen, that vessel is the parent of both.
-    """
+    """Vessel that ``curve`` leaves last, and the index at which it does."""
     at = {key: _separation(curve, line, field) for key, line in lines.items()}
     key = max(at, key=lambda name: at[name])
+    # Of curves that leave a wide vessel side by side it is the parent.
     while (vessel := vessels[key]).parent is not None:
         if vessel.centreline.project(curve[at[key]]).arc_length > vessel.ostium:
             break
@@ -181,15 +168,10 @@ def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
     """Give the common trunk of right branches its name, the brachiocephalic artery.
 
     Where curves share a trunk, the trunk is part of one of them: the right carotid
-    then leaves the right vertebral. If both are right branches, the part up to the
-    first of them becomes a vessel of its own and the parent of both, and of the left
-    carotid of a bovine arch, which leaves it before. Nothing changes if the trunk's
-    name is taken or no two right branches share one.
-
-    Args:
-        tree: as it was grown.
-        right: names of branches that are right ones, whatever they are called; others
-            are known by their names.
+    then leaves the right vertebral. If both are right branches, by their names or
+    because they are named in `right`, the part up to the first of them becomes a vessel
+    of its own and the parent of both, and of the left carotid of a bovine arch, which
+    leaves it before.
     """
     root = tree.root.name
     if TRUNK in tree.vessels:

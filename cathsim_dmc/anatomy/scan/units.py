@@ -23,13 +23,8 @@ def to_lps(
 ) -> np.ndarray:
     """Matrix (3, 3) that takes points of a scan to metres in LPS.
 
-    Args:
-        units: of the scan, a key of `UNITS`.
-        frame: "LPS" or "RAS".
-        axes: how that frame is turned in the patient; see `upright`.
-
-    Raises:
-        ValueError: if one of them is not as stated.
+    ValueError unless `units` is a key of `UNITS` and `frame` "LPS" or "RAS"; `axes`
+    say how that frame is turned in the patient, see `upright`.
     """
     scale = UNITS[bounds.choice("units", units, UNITS)]
     sign = _SYSTEMS[bounds.choice("mesh_frame", frame, _SYSTEMS)]
@@ -44,10 +39,7 @@ def upright(axes: str | ArrayLike | None) -> np.ndarray:
             says that +x points to the feet, +y to the left and +z to the front (L, R
             left, right; A, P front, back; S, I head, feet). Or nine numbers (3, 3),
             also as text: the patient's left, back and head as directions in the scan.
-            None and "LPS" leave points as they are.
-
-    Raises:
-        ValueError: if it is neither, or mirrors the patient.
+            ValueError if it is neither, or mirrors the patient.
     """
     if axes is None:
         return np.eye(3)

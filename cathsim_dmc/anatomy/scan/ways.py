@@ -23,12 +23,8 @@ NEAR = 2.5e-3  # m, of a place in the lumen to the lattice, if it belongs to it
 class Ways:
     """Shortest and deepest ways through a lumen.
 
-    Attributes:
-        points: (n, 3) m, the lattice's points in the lumen.
-        depth: (n,) m, of each.
-        links: (e, 2) rows of neighbouring points.
-        main: (n,) bool, in the largest connected piece.
-        nodes: (m,) rows of the points in that piece.
+    Its lattice has `points` (n, 3) m with their `depth` (n,) m and `links` (e, 2) of
+    neighbours; `main` (n,) bool is the largest connected piece, `nodes` (m,) its rows.
     """
 
     def __init__(self, field: SurfaceDepth):
@@ -89,11 +85,8 @@ class Ways:
     def along(self, curve: np.ndarray, name: str) -> np.ndarray:
         """Deepest way (m, 3) near ``curve`` (n, 3) m, from its start to its end.
 
-        Depth decides, but leaving the curve by ``CORRIDOR`` doubles the price, so
-        that a drawn curve chooses the vessel and the lumen the way through it.
-
-        Raises:
-            ValueError: if the lumen is closed between an end and the rest.
+        A drawn curve chooses the vessel and the lumen the way through it. ValueError
+        if the lumen is closed between an end and the rest.
         """
         for place, which in ((curve[0], "start"), (curve[-1], "end")):
             own = int(np.linalg.norm(self.points - place, axis=1).argmin())
