@@ -17,7 +17,7 @@ from import_cases import ASK, Case
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.scan.importer import import_scan
-from cathsim_dmc.anatomy.scan.naming import ANATOMICAL
+from cathsim_dmc.anatomy.scan.naming import BRANCHES
 
 ENTRY = 20e-3  # m, distance of the inlet from the end of the descending aorta
 LONG = 22e-3  # m past its ostium: shorter branches need no name
@@ -60,7 +60,7 @@ def compared(anatomy: Anatomy, tree: VesselTree, back: np.ndarray) -> dict:
             s = np.arange(start, line.length, 1e-3)
             found[name] = whose(tree, line.at(s).position @ back.T)
     for name, (first, last) in found.items():
-        if name in ANATOMICAL and name not in (first, last):
+        if name in (*BRANCHES, "rva") and name not in (first, last):
             wrong.append(f"{name} is {first}")
     for name, vessel in tree.vessels.items():
         if "_" in name:  # a second branch of a phantom's vessel, without a name

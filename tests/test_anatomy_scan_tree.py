@@ -57,7 +57,7 @@ def arch_scan(tmp_path_factory):
 
 
 def failed(anatomy):
-    return {one.name: one.detail for one in check_tree(anatomy) if not one.passed}
+    return {check: wrong for check, wrong in check_tree(anatomy).items() if wrong}
 
 
 def drawn(folder, name, *parts):

@@ -17,13 +17,9 @@ from cathsim_dmc import bounds
 
 Array = NDArray[np.float64]
 
-# Points x segments handled at once while projecting: stays within the L2 cache.
-_CHUNK_ELEMENTS = 64_000
-
-# Vertices closer than this (m) to a cut would repeat the cut point.
-_GAP = 1e-9
-# Points this little (m) beyond a flat end still lie in the vessel.
-_END_PLANE = 1e-9
+_CHUNK_ELEMENTS = 64_000  # points x segments projected at once, within the L2 cache
+_GAP = 1e-9  # m from a cut, in which a vertex would repeat the cut point
+_END_PLANE = 1e-9  # m beyond a flat end, which still lie in the vessel
 
 
 def as_points(points: ArrayLike) -> Array:
@@ -125,8 +121,7 @@ class Centreline:
     def _products(self) -> tuple[Array, Array]:
         """Matrix (3, 2 s) and offset (2 s,) of a product with points p (n, 3).
 
-        It gives p.d/|d|^2 and |p - a|^2 - |p|^2 for every segment from a along d, which
-        are all that a distance needs but for a few elementwise passes.
+        It gives p.d/|d|^2 and |p - a|^2 - |p|^2 for every segment from a along d.
         """
         start, (way, squared, _) = self.points[:-1], self._segments
         matrix = np.concatenate([(way / squared[:, None]).T, -2.0 * start.T], axis=1)

@@ -15,25 +15,17 @@ from cathsim_dmc.anatomy.centreline import (
     arc_lengths,
 )
 
-# Standard deviations of measured positions and radii, m: how far the spline may
-# depart from them, root mean square: less than what a lattice of 0.5 mm leaves open.
-_SMOOTHING = 0.35e-3
-_RADIUS_SMOOTHING = 0.15e-3
-# By how much a branch's radius grows at its ostium, m, if its parent has the room.
-_FLARE = 1e-3
+# By how much a spline may miss measured positions and radii, root mean square, m: less
+# than what a lattice of 0.5 mm leaves open.
+_SMOOTHING, _RADIUS_SMOOTHING = 0.35e-3, 0.15e-3
+_FLARE = 1e-3  # m, by which a radius grows at its ostium, if the parent has the room
 _STEP = 1e-3  # m, between the points of a built centreline
 _FINE = 0.25e-3  # m, steps in which an ostium is looked for
-# The lumen may not fold on the inner side of a bend: least ratio of the radius of
-# the bend to that of the lumen.
-_LEAST_BEND = 1.05
-# A branch keeps this share of its parent's radius free at its ostium.
-_WIDEST_OSTIUM = 0.95
-# The flare reaches this far into the parent beyond the estimate for a straight one.
-_FLARE_MARGIN = 1.25
-# Two lumens side by side need this much wall between them, m.
-_LEAST_WALL = 0.2e-3
-# A branch may share its lumen with its parent up to so many radii past its ostium.
-_LONGEST_JUNCTION = 8.0
+_LEAST_BEND = 1.05  # least radius of a bend, in radii of the lumen, which folds else
+_WIDEST_OSTIUM = 0.95  # of the parent's radius
+_FLARE_MARGIN = 1.25  # of a straight branch's flare
+_LEAST_WALL = 0.2e-3  # m, between two lumens side by side
+_LONGEST_JUNCTION = 8.0  # radii past its ostium, of a lumen shared with the parent
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,10 +19,9 @@ EDGE = 4e-3  # m, of a brick
 # Depths, m, between which a device touches the wall: from as deep as an impact takes
 # its axis into the wall to somewhat more than the radius of the thickest.
 SHELL = (-1e-3, 1.3e-3)
-# By how much, m, linear interpolation may miss the depth there: at 95 % of the points
-# of a brick, and at any of a brick that keeps the coarse lattice.
-TOLERANCE = 8e-6
-_COARSE = 3e-5
+# m that linear interpolation may miss there: at 95 % of the points of a brick, and at
+# any of a brick that keeps the coarse lattice.
+TOLERANCE, _COARSE = 8e-6, 3e-5
 LARGEST = 5_000_000  # bytes; where tolerance asks for more, it grows
 MOST_CELLS = 12  # along the edge of a brick
 QUANTUM = 1e-6  # m, of the depths kept in 16 bits, which reach to 32.767 mm
@@ -226,12 +225,9 @@ def _measured(measure: Measure, middles: Array, cells: int) -> Array:
 
 
 def _cells(exact: Array, eight: Array, room: int) -> np.ndarray:
-    """Cells (n,) along the edges of bricks; 1 for those that need no lattice.
+    """Cells (n,) along the edges of bricks, 1 for no lattice, that fit `room` bytes.
 
-    Args:
-        exact: (n, 5, 5, 5) m.
-        eight: (n, 2, 2, 2) m, the same at the corners.
-        room: memory of all bricks, bytes.
+    Their depths are known at points (n, 5, 5, 5) and at the corners (n, 2, 2, 2), m.
     """
     shell = exact.clip(*SHELL)
     plain = np.abs(_refined(eight, 4).clip(*SHELL) - shell).reshape(len(exact), -1)

@@ -28,10 +28,9 @@ _DIGEST = "digest"
 _SHIPPED = Path(__file__).parent / "data"
 _DIGITS = 9  # of lengths, m, that count: processors round differently
 _SUFFIX = ".npy"
-# Of what ships: neighbouring depths, of two bytes, are alike.
+# Neighbouring depths, of two bytes, are alike.
 _FILTERS = [{"id": lzma.FILTER_DELTA, "dist": 2}, {"id": lzma.FILTER_LZMA2}]
-# Modules whose code decides what a field holds.
-_MODULES = ("field", "tree_depth")
+_MODULES = ("field", "tree_depth")  # whose code decides what a field holds
 
 
 def cache_folder() -> Path:

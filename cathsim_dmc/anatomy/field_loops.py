@@ -12,11 +12,9 @@ ORIGIN, EDGE, SHAPE, QUANTUM, ENDS = 0, 3, 4, 7, 8
 END, FIRST_END = 8, 9
 MARGIN = 4e-3  # m, by which the box of a field exceeds the lumen
 FREE = 1.0  # m, depth of what lies behind an open end
-# As far behind an open end a device is free, m: two bricks more than the lattices there
-# belong to it. Farther off another vessel may pass.
+# m behind an open end, in which a device is free; farther off a vessel may pass.
 _NEAR = 28e-3
-# Past the plane of an open end, no wall is so thick, m.
-_THICK = 5e-3
+_THICK = 5e-3  # m, more than any wall past the plane of an open end
 
 
 @compiled

@@ -10,10 +10,8 @@ Depth = Callable[[np.ndarray], np.ndarray]
 SPACING = 1.5e-3  # m: vessels down to a radius of 1.3 mm stay connected
 FINEST = 0.4e-3  # m: the lattice is refined down to here where they do not
 
-# Points along the edges of the blocks that are looked at first, and of their parts.
-_BLOCKS = ((8, 2), (2, 1))
-# An interpolated depth may change by a little more than 1 m per m.
-_SLOPE = 1.2
+_BLOCKS = ((8, 2), (2, 1))  # points along the edges of blocks, and of their parts
+_SLOPE = 1.2  # m per m, most of an interpolated depth
 
 
 def inside(

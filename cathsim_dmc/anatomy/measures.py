@@ -7,17 +7,11 @@ import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
 
-# A branch is measured this far (m) past its ostium, where the mouth's funnel is over,
-# and its direction is that of the chord up to there.
-BRANCH_LEVEL = 10e-3
-# Direction of an end of the aorta: the chord over this length, m.
-_END_CHORD = 30e-3
-# The same where the aorta's turn begins: it bends most at the root.
-_START_CHORD = 15e-3
-# Where a branch stands out of the plane of the arch: this far (m) past its ostium.
-_OUT_OF_PLANE_AT = 40e-3
-# Bends are measured between tangents this far (m) apart.
-_BEND_CHORD = 15e-3
+BRANCH_LEVEL = 10e-3  # m past its ostium, where a branch is measured, funnel over
+_END_CHORD = 30e-3  # m, of the direction of an end of the aorta
+_START_CHORD = 15e-3  # m, the same at the root, where it bends most
+_OUT_OF_PLANE_AT = 40e-3  # m past its ostium, where a branch stands out of the plane
+_BEND_CHORD = 15e-3  # m, between the tangents of a bend
 
 
 def arch_type(drop: float) -> str:

@@ -28,8 +28,7 @@ _BREATHING = np.array([8.9e-3, 12.0e-3, 11.1e-3, 4.9e-3])
 _MEDIAL = np.array([1.0, 1.0, -1.0, -1.0])
 _INSPIRATION = (0.33, -0.47, -0.82)  # medial, posterior, superior
 PULSE_PRESSURE = 5.33  # kPa, 40 mmHg
-# Largest norm of the gradient of a displacement; at 1 space folds.
-STEEPEST = 0.6
+STEEPEST = 0.6  # norm of the gradient of a displacement, at most; at 1 space folds
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,11 +10,8 @@ from cathsim_dmc.anatomy.builder import ACCESSES
 from cathsim_dmc.anatomy.tree_file import read_tree
 
 _DATA = Path(__file__).parent / "data"
-# The published silicone phantoms, measured; see docs/anatomies.md. The tests hold them
-# to what was measured.
-MEASURED = ("type1", "type2")
-# All that come as a file of centrelines, `data/<name>.json`.
-TREES = (*MEASURED,)
+MEASURED = ("type1", "type2")  # the published silicone phantoms; docs/anatomies.md
+TREES = (*MEASURED,)  # those that come as a file of centrelines, `data/<name>.json`
 PHANTOMS = (*TREES, *arch.ARCHES)
 
 

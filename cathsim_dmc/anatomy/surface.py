@@ -6,12 +6,9 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.parts import Surface
 
-# Grid step, m: at most 20,000 triangles on an aortic arch with its branches.
-SPACING = 2.2e-3
-# A lumen narrower than this share of the step (radius) would show gaps: the step is
-# made smaller, to the same share, though not below the least one.
-_NARROW = 0.9
-_LEAST_SPACING = 1e-3
+SPACING = 2.2e-3  # m: at most 20,000 triangles on an aortic arch with its branches
+_NARROW = 0.9  # of the least radius: a wider step would show gaps
+_LEAST_SPACING = 1e-3  # m
 
 
 def _depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -11,19 +12,13 @@ from cathsim_dmc.anatomy.centreline import Array, Centreline, VesselTree
 from cathsim_dmc.anatomy.parts import End
 from cathsim_dmc.compiled import compiled
 
-# Farther from the wall than this, m, another vessel does not matter to a point.
-_SLACK = 3e-3
-# Points around a ring from which creases are looked for, and their way to one, m.
-_AROUND = 120
-_SEED = 1.5e-3
-_APART = 0.1e-3
+_SLACK = 3e-3  # m from the wall; a vessel farther off does not matter to a point
+_AROUND = 120  # points of a ring from which creases are looked for
+_SEED, _APART = 1.5e-3, 0.1e-3  # m, most of their way to one, and between two of them
 _GROUP = 2.5  # points along each axis of a group, about
-# Projections on the one wall and the other; walls that meet at 30° take the most.
-_ROUNDS = 30
-# A place on a wall that lies no further than this inside another vessel is wall, m.
-_TOUCHING = 5e-6
-# As far behind an open end, m, its lumen goes on; another vessel may pass farther off.
-_BEHIND = 20e-3
+_ROUNDS = 30  # projections on both walls; those that meet at 30° take the most
+_TOUCHING = 5e-6  # m; what lies no further inside another vessel is wall
+_BEHIND = 20e-3  # m behind an open end, in which its lumen goes on
 
 
 class TreeDepth:
@@ -47,12 +42,13 @@ class TreeDepth:
 
         # Centres (3), unit tangents (3) and radii of all rings; the first and the last
         # of each vessel; its two ends: 0 open, 1 closed, 2 within another vessel.
-        self._nodes = np.concatenate([_rings(line) for line in lines])
+        rings = [_rings(line) for line in lines]
+        self._nodes = np.concatenate(rings)
         self._spans = np.stack([stops[:-1], stops[1:] - 1], axis=1)
         first = [2 if row else closed(x.points[0]) for row, x in enumerate(lines)]
         last = [closed(line.points[-1]) for line in lines]
         self._tree = self._nodes, self._spans, np.stack([first, last], 1).astype(int)
-        self._creases = self._find_creases()
+        self._creases = self._find_creases(rings)
 
     def __call__(self, points: Array) -> Array:
         """Signed distances (n,) m at points (n, 3) m, > 0 inside."""
@@ -74,23 +70,21 @@ class TreeDepth:
         """Corners (3,), (3,) of a box around the lumen, m."""
         return _box(self._nodes)
 
-    def _find_creases(self) -> Array:
+    def _find_creases(self, rings: list[Array]) -> Array:
         found = [np.empty((0, 3))]
-        count = len(self._spans)
-        for one in range(count):
-            for two in range(one + 1, count):
-                seeds = self._on_walls(two)
-                low, high = _box(self._rings_of(one))
-                seeds = seeds[((seeds > low) & (seeds < high)).all(axis=1)]
-                seeds = seeds[np.abs(self._onto(one, two, seeds, 0)[:, 0]) < _SEED]
-                left = self._onto(one, two, seeds, _ROUNDS)
-                seeds = seeds[(np.abs(left) < _TOUCHING).all(axis=1)]
-                for other in set(range(count)) - {one, two}:
-                    inside = self._onto(other, two, seeds, 0)[:, 0] > _TOUCHING
-                    seeds = seeds[~inside]
-                # Many seeds come to one place.
-                _, kept = np.unique(np.rint(seeds / _APART), axis=0, return_index=True)
-                found.append(seeds[kept])
+        for one, two in combinations(range(len(rings)), 2):
+            seeds = _on_walls(rings[two])
+            low, high = _box(rings[one])
+            seeds = seeds[((seeds > low) & (seeds < high)).all(axis=1)]
+            seeds = seeds[np.abs(self._onto(one, two, seeds, 0)[:, 0]) < _SEED]
+            left = self._onto(one, two, seeds, _ROUNDS)
+            seeds = seeds[(np.abs(left) < _TOUCHING).all(axis=1)]
+            for other in set(range(len(rings))) - {one, two}:
+                inside = self._onto(other, two, seeds, 0)[:, 0] > _TOUCHING
+                seeds = seeds[~inside]
+            # Many seeds come to one place.
+            _, kept = np.unique(np.rint(seeds / _APART), axis=0, return_index=True)
+            found.append(seeds[kept])
         return np.concatenate(found)
 
     def _onto(self, one: int, two: int, seeds: Array, rounds: int) -> Array:
@@ -99,20 +93,16 @@ class TreeDepth:
         _onto_creases(self._tree, (one, two), seeds, rounds, left)
         return left
 
-    def _rings_of(self, vessel: int) -> Array:
-        first, last = self._spans[vessel]
-        return self._nodes[first : last + 1]
 
-    def _on_walls(self, vessel: int) -> Array:
-        """Points (n, 3) on the rings of a vessel, m."""
-        nodes = self._rings_of(vessel)
-        across = np.eye(3)[np.abs(nodes[:, 3:6]).argmin(axis=1)]
-        u = np.cross(nodes[:, 3:6], across)
-        u /= np.linalg.norm(u, axis=1, keepdims=True)
-        v = np.cross(nodes[:, 3:6], u)
-        angle = np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)[:, None, None]
-        spokes = np.cos(angle) * u + np.sin(angle) * v
-        return (nodes[:, :3] + nodes[:, 6:] * spokes).reshape(-1, 3)
+def _on_walls(nodes: Array) -> Array:
+    """Points (n, 3) on the rings of a vessel, m."""
+    across = np.eye(3)[np.abs(nodes[:, 3:6]).argmin(axis=1)]
+    u = np.cross(nodes[:, 3:6], across)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(nodes[:, 3:6], u)
+    angle = np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)[:, None, None]
+    spokes = np.cos(angle) * u + np.sin(angle) * v
+    return (nodes[:, :3] + nodes[:, 6:] * spokes).reshape(-1, 3)
 
 
 def _rings(line: Centreline) -> Array:

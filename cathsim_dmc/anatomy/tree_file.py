@@ -18,12 +18,9 @@ from cathsim_dmc.anatomy.curves import Curve
 FORMAT = "cathsim-vessel-tree"
 FORMAT_VERSION = 1
 _MM = 1e-3
-# A coordinate beyond this, mm, or a radius outside the range is another unit.
-_FARTHEST = 2000.0
-_RADII = (0.3, 60.0)
+_FARTHEST, _RADII = 2000.0, (0.3, 60.0)  # mm: other coordinates have another unit
 _MOST_POINTS = 20_000
-# Ways to say where inlets and goals are.
-_WAYS = {
+_WAYS = {  # to say where inlets and goals are
     "inlets": ("end", "arc_length_mm"),
     "goals": ("arc_length_mm", "past_ostium_mm", "position_mm"),
 }

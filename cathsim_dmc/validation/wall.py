@@ -86,9 +86,9 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
 def validate_anatomy(anatomy: Anatomy) -> Report:
     """Checks and measures an anatomy: generated, measured or imported."""
     checks = lumen_checks(anatomy)
-    for one in check_tree(anatomy):
-        name = f"{anatomy.name}: {one.name}, violations"
-        checks.append(Check.at_most(name, int(not one.passed), 0, "", one.detail))
+    for check, wrong in check_tree(anatomy).items():
+        name = f"{anatomy.name}: {check}, violations"
+        checks.append(Check.at_most(name, int(bool(wrong)), 0, "", wrong))
     findings = {anatomy.name: {"measures": measures.measure(anatomy.tree)}}
     return Report(f"anatomy of {anatomy.name}", checks, findings)
 

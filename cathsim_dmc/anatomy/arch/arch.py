@@ -59,18 +59,10 @@ def build_arch(
 # from a tip at the inlet. Spacings are the anatomical means, scaled like the branch
 # radii; take-offs and lengths are chosen so that the measured figures come out.
 TYPE_I = ArchParameters(
-    bca=BranchParameters(
-        radius=4.4e-3, end_radius=4.2e-3, take_off=math.radians(12.0), length=43e-3
-    ),
-    lcca=BranchParameters(
-        radius=3.1e-3, end_radius=2.9e-3, take_off=math.radians(12.0), length=43e-3
-    ),
+    bca=BranchParameters(4.4e-3, 4.2e-3, math.radians(12.0), 43e-3),
+    lcca=BranchParameters(3.1e-3, 2.9e-3, math.radians(12.0), 43e-3),
     lsa=BranchParameters(
-        radius=3.7e-3,
-        end_radius=3.4e-3,
-        take_off=math.radians(-20.0),
-        length=41e-3,
-        bend_azimuth=math.pi,
+        3.7e-3, 3.4e-3, math.radians(-20.0), 41e-3, bend_azimuth=math.pi
     ),
     ascending_radius=13.8e-3,
     bca_level_radius=13.8e-3,
@@ -86,18 +78,10 @@ TYPE_I = ArchParameters(
 # Anatomical means (61 healthy aortas, 217 and 118 CT studies); the LCCA tapers to
 # the mid common carotid. Arch radius as in the measured phantom.
 TYPE_II = ArchParameters(
-    bca=BranchParameters(
-        radius=6.25e-3, end_radius=5.5e-3, take_off=math.radians(44.9), length=44e-3
-    ),
-    lcca=BranchParameters(
-        radius=4.14e-3, end_radius=3.15e-3, take_off=math.radians(25.7), length=50e-3
-    ),
+    bca=BranchParameters(6.25e-3, 5.5e-3, math.radians(44.9), 44e-3),
+    lcca=BranchParameters(4.14e-3, 3.15e-3, math.radians(25.7), 50e-3),
     lsa=BranchParameters(
-        radius=5.2e-3,
-        end_radius=4.5e-3,
-        take_off=math.radians(-28.8),
-        length=45e-3,
-        bend_azimuth=math.pi,
+        5.2e-3, 4.5e-3, math.radians(-28.8), 45e-3, bend_azimuth=math.pi
     ),
     bca_drop=1.5,
 )
@@ -180,7 +164,6 @@ class ArchSeed:
         return sample(random_state, self.arch_type, variant=self.variant)
 
 
-# Names of the sets with the first of their seeds; no two share one.
 _FIRST_SEEDS = {"train": 1_000_000, "test": 2_000_000, "test_variants": 3_000_000}
 SETS = tuple(_FIRST_SEEDS)
 TRAIN_SIZE = 1000

@@ -5,11 +5,9 @@ from dataclasses import dataclass
 
 from cathsim_dmc import bounds
 
-# Two lumens side by side need this much wall between them, m.
-MINIMUM_SEPTUM = 1e-3
-# Tube in front of the ascending aorta by which a phantom is mounted, m: the device
-# starts with its steerable tip (70 mm) free of the introducer sheath and its head in
-# the ascending aorta.
+MINIMUM_SEPTUM = 1e-3  # m of wall between two lumens side by side
+# Tube in front of the ascending aorta, m: the device starts with its steerable tip
+# (70 mm) free of the introducer sheath and its head in the ascending aorta.
 INLET_TUBE = 70e-3
 
 LEVELS = ("ascending", "bca_level", "lcca_level", "lsa_level", "descending")

@@ -12,19 +12,14 @@ from cathsim_dmc.anatomy import measures
 from cathsim_dmc.anatomy.arch.parameters import ArchParameters, BranchParameters
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 
-# Range of the BCA drop in LCCA diameters for each type of arch (class by the
-# vertical distance from the BCA origin to the top of the arch).
-DROP_RANGES: Mapping[str, tuple[float, float]] = {
-    "I": (0.0, 1.0),
-    "II": (1.0, 2.0),
-    "III": (2.0, 3.0),
-}
+# Range of the BCA drop in LCCA diameters for each type of arch.
+DROP_RANGES: Mapping[str, tuple[float, float]]
+DROP_RANGES = {"I": (0.0, 1.0), "II": (1.0, 2.0), "III": (2.0, 3.0)}
 # How the branches leave the arch. Bovine: a common trunk of BCA and LCCA (78 %), or
 # the LCCA off the BCA further on (22 %). Aberrant: the right subclavian artery leaves
 # last and passes behind; the right carotid leaves first.
 VARIANTS = ("normal", "bovine_trunk", "bovine_branch", "aberrant")
-# Share of the types I, II and III (one of the published cohorts).
-_PREVALENCE = (0.336, 0.434, 0.230)
+_PREVALENCE = (0.336, 0.434, 0.230)  # of types I, II and III in a published cohort
 # Mean and standard deviation of the lumen diameters of the aorta, m (61 aortas).
 AORTA_DIAMETERS = {
     "ascending_radius": (29.5e-3, 3.9e-3),
@@ -48,10 +43,7 @@ PLANE_ROTATION = (50.3, 13.8)
 # Spacing of the ostia BCA-LCCA and LCCA-LSA, m; the wall between two flared ones.
 SPACINGS = (21.8e-3, 14.3e-3)
 _WALL = 2e-3
-# What no table gives is spread around the two measured phantoms. Their aortas turn by
-# 47 to 107 degrees up to the BCA, which the limb shares with the arch, stand out of
-# their plane by 4 mm (standard deviation), and tilt little; their branches leave the
-# plane by 5 to 25 degrees and are longer than their chords by 2 to 20 %.
+# What no table gives is spread around the two measured phantoms.
 ASCENDING_BEND = (30.0, 12.0)  # degrees
 _PLANE_TILT = (0.0, 6.0)  # degrees
 _SWAY = (4e-3, 3e-3)  # m
@@ -63,21 +55,14 @@ _DESCENDING_BEND = (0.0, 5.0)  # degrees
 _ARCH_RADIUS = (34e-3, 3.4e-3)  # m
 _ARCH_ASPECT = (0.9, 1.15)
 _DESCENDING_LENGTH = (105e-3, 125e-3)  # m, below the arch
-# Levels of one aorta are wide or narrow together; the share is an assumption.
-_AORTA_CORRELATION = 0.8
-# Draws stop at this many standard deviations of the untruncated distribution, which
-# is widened so that what is left has the deviation of the table.
-_CUT = 2.2
-_CUT_DEVIATION = 0.9162
+_AORTA_CORRELATION = 0.8  # of the levels of one aorta; an assumption
+# Draws stop at so many standard deviations, and what is left has so much of one.
+_CUT, _CUT_DEVIATION = 2.2, 0.9162
 _ATTEMPTS = 1000
-# Corrections of drop and ascending length towards what was drawn, at most, and how
-# near (m; LCCA diameters) they must come.
-_CORRECTIONS = 5
-_LENGTH_TOLERANCE = 2e-3
-_DROP_TOLERANCE = 0.05
+_CORRECTIONS = 5  # of drop and ascending length towards what was drawn, at most
+_LENGTH_TOLERANCE, _DROP_TOLERANCE = 2e-3, 0.05  # m; LCCA diameters
 _SHORTEST_LIMB = 6e-3  # m
-# The limb bends no more than with this multiple of the widest lumen radius.
-_LIMB_BEND = 1.4
+_LIMB_BEND = 1.4  # least radius of a limb's bend, in widest radii of the lumen
 
 Random = np.random.RandomState | np.random.Generator
 

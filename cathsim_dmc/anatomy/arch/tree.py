@@ -20,18 +20,12 @@ from cathsim_dmc.anatomy.centreline import (
 from cathsim_dmc.anatomy.curves import check_septa, flare_begin
 
 # Polyline steps, m: the chord of 2 mm on a 34 mm arch departs 0.015 mm from it.
-_STRAIGHT_STEP = 5e-3
-_CURVED_STEP = 2e-3
-_FLARE_STEP = 0.5e-3
-# By how much the radius of a branch grows at its ostium, at most, m.
-_FILLET = 2.5e-3
-# A branch must leave its parent within this angle of the wall's normal, rad, and
-# within this multiple of the parent's radius along its axis: an ostium more
-# oblique than that is a slit.
-_MOST_OBLIQUE = math.radians(60.0)
-_LONGEST_EXIT = 2.2
-# The second bend takes over within this length, m, so that no kink marks it.
-_BLEND = 8e-3
+_STRAIGHT_STEP, _CURVED_STEP, _FLARE_STEP = 5e-3, 2e-3, 0.5e-3
+_FILLET = 2.5e-3  # m, by which a radius grows at its ostium, at most
+# An ostium more oblique than this from the wall's normal, or farther from the parent's
+# axis in radii, is a slit.
+_MOST_OBLIQUE, _LONGEST_EXIT = math.radians(60.0), 2.2
+_BLEND = 8e-3  # m, in which the second bend takes over
 _INTEGRATION_STEP = 0.5e-3  # m
 _UPRIGHT = np.array([0.0, 0.0, 1.0])
 

@@ -1,6 +1,6 @@
 """Checks of a vessel tree against the surface of its lumen."""
 
-from typing import NamedTuple
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -33,26 +33,16 @@ START_CLEARANCE = 1e-3  # m between the device and the wall there
 START_ROOM = 10e-3  # m between the head at the start and a goal's ostium
 
 
-class TreeCheck(NamedTuple):
-    """What was looked at, whether it is right, and figures, or where it is wrong."""
+def check_tree(anatomy: Anatomy) -> dict[str, str]:
+    """Proves the tree of an anatomy against its closed surface; see docs/scans.md.
 
-    name: str
-    passed: bool
-    detail: str
-
-
-def check_tree(anatomy: Anatomy) -> list[TreeCheck]:
-    """Proves the tree of an anatomy against its closed surface; see docs/scans.md."""
+    Says what is wrong and where, by what was looked at; nothing where all is right.
+    """
     measure = SurfaceDepth(anatomy.surface)
-    out = []
-    for name, look in _CHECKS.items():
-        wrong, fine = look(anatomy, measure)
-        out.append(TreeCheck(name, not wrong, "; ".join(wrong) or fine))
-    return out
+    return {name: "; ".join(look(anatomy, measure)) for name, look in _CHECKS.items()}
 
 
-def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
-    wrong, least = [], np.inf
+def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
     for key, vessel in anatomy.tree.vessels.items():
         line = vessel.centreline
         # At the very ends a flat cap is as near as one likes.
@@ -64,17 +54,14 @@ def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
         depth = measure(place.position)
         floor = np.minimum(0.25 * place.radius, SLACK)
         worst = int((depth - floor).argmin())
-        least = min(least, float(depth.min()))
         if depth[worst] < min(floor[worst], 0.1e-3) - SLACK * 0.5:
-            wrong.append(
+            yield (
                 f"{key} leaves the lumen {s[worst] * 1e3:.0f} mm from its start, at "
                 f"{in_mm(place.position[worst])}, by {-depth[worst] * 1e3:.1f} mm"
             )
-    return wrong, f"at least {least * 1e3:.2f} mm deep"
 
 
-def _own_lumen(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
-    wrong = []
+def _own_lumen(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
     vessels = list(anatomy.tree.vessels.values())
     for vessel in vessels:
         line = vessel.centreline
@@ -87,60 +74,51 @@ def _own_lumen(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
             if other.parent is not None:
                 beside &= place.arc_length > other.ostium
             if (length := STEP * int(beside.sum())) > BESIDE:
-                wrong.append(
+                yield (
                     f"{vessel.name} runs {length * 1e3:.0f} mm in the lumen of "
                     f"{other.name}, around {in_mm(own.position[beside.argmax()])}"
                 )
-    return wrong, f"{len(vessels)}"
 
 
-def _parents(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
-    wrong = []
+def _parents(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
     for key, vessel in anatomy.tree.vessels.items():
         if vessel.parent is None:
             continue
         parent = anatomy.tree.vessel(vessel.parent)
         place = parent.centreline.project(vessel.centreline.points[0])
         if place.distance > place.radius:
-            wrong.append(
+            yield (
                 f"{key} starts {place.distance * 1e3:.1f} mm from the centreline of "
                 f"{parent.name}, outside of it"
             )
         if parent.parent is not None and place.arc_length < parent.ostium - 2e-3:
-            wrong.append(
+            yield (
                 f"{key} leaves {parent.name} {place.arc_length * 1e3:.0f} mm from its "
                 f"start, before that has an ostium ({parent.ostium * 1e3:.0f} mm)"
             )
-    return wrong, "in order"
 
 
-def _sides(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
+def _sides(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
     """Whether the arch leads from right and front to left and back, as named."""
-    tree, wrong = anatomy.tree, []
+    tree = anatomy.tree
     root = tree.root
     vessels = [tree.vessels[key] for key in ARCH_BRANCHES if key in tree.vessels]
     vessels = [vessel for vessel in vessels if vessel.parent == root.name]
     if len(vessels) < 2:
-        return [], "no arch"
+        return
     ostia = [vessel.mouth.position for vessel in vessels]
     along = np.diff(root.centreline.project(np.array(ostia)).arc_length)
     # What leaves in one lumen, as in a bovine arch, has no order.
     apart = along[np.abs(along) > ONE_OSTIUM]
     if (apart > 0).any() and (apart < 0).any():
         names = ", ".join(vessel.name for vessel in vessels)
-        wrong.append(f"{names} do not leave {root.name} in this order")
-    fine = f"{len(vessels)} in order"
+        yield f"{names} do not leave {root.name} in this order"
     bend = Bend.of(root.centreline.points, [v.centreline.points for v in vessels])
-    if bend.turn > TURN:
-        if (text := mirrored(bend.azimuth(bool(along.sum() < 0)))) is not None:
-            wrong.append(text)
-        elif not bend.upright:
-            fine += ", in a scan that does not stand upright"
-    return wrong, fine
+    if bend.turn > TURN and (text := mirrored(bend.azimuth(bool(along.sum() < 0)))):
+        yield text
 
 
-def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
-    wrong, farthest = [], 0.0
+def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
     vessels = anatomy.tree.vessels
     for key, vessel in vessels.items():
         line = vessel.centreline
@@ -156,18 +134,16 @@ def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]
         # What no device can follow was cut off, and is not missing.
         cut = TAIL + END_TRIM if end.radius < NARROW_END * TAIL_RADIUS else 0.0
         if beyond <= max(FREE, FREE_RADII * wide, cut):
-            farthest = max(farthest, beyond)
             continue
         # Or it ends in another vessel, where a ring of vessels closes.
         near = ahead[gap < JOINS + wide]
         others = [v.centreline for v in vessels.values() if v is not vessel]
         places = [other.project(near) for other in others]
         if not any((place.distance < 0.7 * place.radius).any() for place in places):
-            wrong.append(
+            yield (
                 f"{key} ends at {in_mm(end.position)}, but its lumen goes on for "
                 f"{beyond * 1e3:.0f} mm or more"
             )
-    return wrong, f"at most {farthest * 1e3:.1f} mm before"
 
 
 def _lumen_beyond(
@@ -198,29 +174,24 @@ def _lumen_beyond(
     return local[label == label[gap.argmin()]] + end.position
 
 
-def _goals(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
-    wrong = []
+def _goals(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
     for name, goal in anatomy.goals.items():
         line = anatomy.tree.vessel(goal.vessel).centreline
         off = float(np.linalg.norm(line.at(goal.arc_length).position - goal.position))
         if off > 1e-3:
-            wrong.append(
-                f"{name} lies {off * 1e3:.1f} mm from its place in {goal.vessel}"
-            )
+            yield f"{name} lies {off * 1e3:.1f} mm from its place in {goal.vessel}"
         depths = anatomy.tree.depths(goal.position)
         best = max(depths, key=lambda key: float(depths[key]))
         if float(depths[goal.vessel]) < float(depths[best]) - 0.5e-3:
-            wrong.append(f"{name} lies in {best}, not in {goal.vessel}")
+            yield f"{name} lies in {best}, not in {goal.vessel}"
         if not float(measure(goal.position)) > 0.0:
-            wrong.append(f"{name} lies outside the lumen")
-    return wrong, f"{len(anatomy.goals)} goals"
+            yield f"{name} lies outside the lumen"
 
 
-def _sizes(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
-    wrong = []
+def _sizes(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
     volume = anatomy.surface.volume
     if not VOLUME[0] <= volume <= VOLUME[1]:
-        wrong.append(
+        yield (
             f"the lumen holds {volume * 1e6:.2g} ml (allowed {VOLUME[0] * 1e6:g} to "
             f"{VOLUME[1] * 1e6:g}): the unit is wrong"
         )
@@ -228,33 +199,31 @@ def _sizes(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
         own = vessel.centreline.radii[vessel.centreline.arc_length >= vessel.ostium]
         middle = float(np.median(own))
         if not RADII[0] <= middle <= RADII[1] or own.max() > WIDEST:
-            wrong.append(
+            yield (
                 f"{key} has a radius of {middle * 1e3:.3g} mm (median; allowed "
                 f"{RADII[0] * 1e3:g} to {RADII[1] * 1e3:g})"
             )
-    return wrong, f"{volume * 1e6:.0f} ml"
 
 
-def _inlet(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
-    inlet, wrong = anatomy.inlet, []
+def _inlet(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
+    inlet = anatomy.inlet
     place = anatomy.tree.vessel(inlet.vessel).centreline.project(inlet.position)
     if place.distance > place.radius:
         away = f"{place.distance * 1e3:.0f} mm from the centreline of {inlet.vessel}"
-        wrong.append(f"it lies {away}")
+        yield f"it lies {away}"
     s = np.linspace(1e-3, max(2e-3, 0.5 * inlet.radius), 5)
     if measure(inlet.position + s[:, None] * inlet.direction).min() <= 0.0:
-        wrong.append("its direction does not lead into the lumen")
+        yield "its direction does not lead into the lumen"
     if inlet.radius < INLET_HOLE_RADIUS:
-        wrong.append(
+        yield (
             f"its radius of {inlet.radius * 1e3:.2g} mm is less than that of the "
             f"sheath's hole ({INLET_HOLE_RADIUS * 1e3:.2g} mm)"
         )
-    return wrong, f"{inlet.radius * 2e3:.1f} mm wide"
 
 
-def _start(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
+def _start(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
     """Whether a device that starts straight begins before every goal's ostium."""
-    inlet, tree, wrong = anatomy.inlet, anatomy.tree, []
+    inlet, tree = anatomy.inlet, anatomy.tree
     s = np.arange(START_CLEARANCE, START, STEP)
     depth = measure(inlet.position + s[:, None] * inlet.direction)
     # At the inlet's cap the surface is near, but open.
@@ -270,12 +239,11 @@ def _start(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
         ostium = branch.mouth.position
         here, there = anatomy.route(name).project(np.stack([head, ostium])).arc_length
         if here > there - START_ROOM:
-            wrong.append(
+            yield (
                 f"the ostium of {branch.name} is {there * 1e3:.0f} mm from the inlet "
                 f"and a device starts {here * 1e3:.0f} mm deep, past it: {name} cannot "
                 "be reached; choose an inlet farther back"
             )
-    return wrong, f"{run * 1e3:.0f} mm deep at most"
 
 
 _CHECKS = {

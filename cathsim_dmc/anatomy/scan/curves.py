@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from cathsim_dmc.anatomy.scan.units import to_lps, upright
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
-# Older versions of 3D Slicer write numbers for the names of frames.
-_FRAMES = {"1": "LPS", "0": "RAS"}
+_FRAMES = {"1": "LPS", "0": "RAS"}  # of older versions of 3D Slicer
 INSIDE = 0.7  # share of a centreline's points that must lie in the lumen
 
 

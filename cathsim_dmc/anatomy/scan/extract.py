@@ -1,6 +1,6 @@
 """Free ends of a lumen, its inlet, and centrelines computed between them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -315,7 +315,7 @@ def _ahead(ways: Ways, way: np.ndarray, toward: np.ndarray) -> bool:
     return float(one @ other) > 0.0
 
 
-def _rings(ways: Ways, before: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _rings(ways: Ways, before: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Pairs of ways from the inlet whose ends touch, for every ring of vessels."""
     back = _upstream(ways, before)[ways.links]
     gap = np.linalg.norm(np.diff(ways.points[back], axis=1)[:, 0], axis=1)
@@ -323,7 +323,6 @@ def _rings(ways: Ways, before: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]
     links = ways.links[ways.main[ways.links[:, 0]] & (gap > near)]
     depth = ways.depth[links].min(axis=1)
     label = groups(len(ways.points), links)[links[:, 0]]
-    rings = []
     for key in np.unique(label):
         # Of each place the deepest link.
         at = int(np.where(label == key, depth, -np.inf).argmax())
@@ -331,8 +330,7 @@ def _rings(ways: Ways, before: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]
         shared = common(ways.points[one], ways.points[other])
         own = [way[shared:] for way in (one, other)]
         if depth[at] >= DEVICE_RADIUS and sum(map(ways.length, own)) > RING:
-            rings.append((one, other))
-    return rings
+            yield one, other
 
 
 def _upstream(ways: Ways, before: np.ndarray) -> np.ndarray:

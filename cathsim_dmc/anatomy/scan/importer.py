@@ -134,15 +134,15 @@ def _anatomy(name, tree, opening, surface, say, note) -> Anatomy:
     say(f"tree: {', '.join(sizes)}")
     ends = flat_ends(tree, opening)
     anatomy = Anatomy(name, tree, opening, place_goals(tree), ends, surface)
-    for check in check_tree(anatomy):
-        if not check.passed and check.name != "start of the device" and anatomy.goals:
+    for check, wrong in check_tree(anatomy).items():
+        if wrong and check != "start of the device" and anatomy.goals:
             raise ValueError(
-                f"the tree does not agree with the surface ({check.name}): "
-                f"{check.detail}. Mend the surface or the centrelines there, or give "
-                "its frame (mesh_frame, axes), the inlet, or other centrelines."
+                f"the tree does not agree with the surface ({check}): {wrong}. Mend "
+                "the surface or the centrelines there, or give its frame (mesh_frame, "
+                "axes), the inlet, or other centrelines."
             )
-        if not check.passed:
-            note(f"{check.name}: {check.detail}")
+        if wrong:
+            note(f"{check}: {wrong}")
     return anatomy
 
 

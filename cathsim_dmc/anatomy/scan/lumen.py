@@ -15,12 +15,8 @@ from cathsim_dmc.anatomy.scan.topology import areas
 from cathsim_dmc.anatomy.scan.units import UNITS, to_lps, upright
 from cathsim_dmc.anatomy.surface import sampled
 
-# Diagonal of the box around a vessel tree, m: an intracranial segment, a whole aorta
-# with arms and legs.
-SIZE = (15e-3, 2.5)
-# Largest radius (95th percentile) of a scan's lumen, m: between that of a single
-# cerebral artery and that of an aneurysm of the aorta.
-WIDTH = (1.2e-3, 35e-3)
+SIZE = (15e-3, 2.5)  # m across: an intracranial segment, an aorta with arms and legs
+WIDTH = (1.2e-3, 35e-3)  # m, 95th percentile of radii: cerebral artery, aneurysm
 TYPICAL = 7e-3  # m, that radius where two units are possible
 _SAMPLES = 1000
 

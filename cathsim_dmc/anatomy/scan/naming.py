@@ -18,7 +18,6 @@ from cathsim_dmc.anatomy.scan.units import in_mm
 from cathsim_dmc.anatomy.scan.ways import Ways, common
 
 ARCH_BRANCHES = ("bca", "lcca", "lsa")  # in their order from the heart
-ANATOMICAL = frozenset((*ARCH_BRANCHES, "rcca", "rsa", "rva", "lva"))
 # Patterns of branches in their order from the heart, with their frequency and what they
 # are called. "bovine" is the common trunk of BCA and LCCA.
 PATTERNS = {
@@ -30,8 +29,7 @@ PATTERNS = {
 }
 CUT = 0.03  # probability that the scan shows nothing of a branch
 SHORT = 0.04  # that it is cut short
-# Arteries of the arch that have no name here, such as a thyroid or a bronchial one, are
-# thin: radius in m, and the standard deviation of the logarithm of a wider one.
+# Of thin arteries without a name: radius, m, and log deviation of a wider one.
 EXTRA_RADIUS, EXTRA_SPREAD = 2.0e-3, 0.8
 BETWEEN = 0.2  # of these, how many leave between LCCA and LSA, where vertebral ones do
 BUMP = 0.02  # that one that looks cut short is none

@@ -1,7 +1,7 @@
 """Branches as they leave an aorta: ostia, calibres, forks, and what they lead to."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import TypeVar
@@ -125,7 +125,7 @@ def _calibre(ways: Ways, row: np.ndarray, fork: float | None) -> float:
     return float(np.median(depth_of(ways, part if len(part) else row)))
 
 
-def _stubs(ways, bend, depth, curves, aorta) -> list[Offshoot]:
+def _stubs(ways, bend, depth, curves, aorta) -> Iterator[Offshoot]:
     """Branches that were cut short: lumen that rises from the aorta's wall."""
     nodes = ways.nodes
     distance, near = aorta.query(ways.points[nodes], distance_upper_bound=60e-3)
@@ -141,12 +141,11 @@ def _stubs(ways, bend, depth, curves, aorta) -> list[Offshoot]:
     height, at = (distance - wide)[outside], near[outside]
     points, radius = ways.points[nodes[outside]], ways.depth[nodes[outside]]
     if not len(points):
-        return []
+        return
     pairs = row[ways.links]
     label = groups(len(points), pairs[(pairs >= 0).all(axis=1)])
     known = cKDTree(np.concatenate([resample(curve) for curve in curves]))
     taken = np.unique(label[known.query(points)[0] < 1.2e-3])
-    found = []
     for key in np.setdiff1d(np.unique(label), taken):
         among = np.flatnonzero(label == key)
         span = 1e-3 * float(np.ptp(at[among]))
@@ -160,8 +159,7 @@ def _stubs(ways, bend, depth, curves, aorta) -> list[Offshoot]:
             and rise > 0.0
         ):
             calibre = float(radius[among].max()) + CELL
-            found.append(Offshoot(points[low], 1e-3 * at[low], calibre, (), None, ()))
-    return found
+            yield Offshoot(points[low], 1e-3 * at[low], calibre, (), None, ())
 
 
 def leads(

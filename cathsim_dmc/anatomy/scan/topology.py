@@ -1,6 +1,7 @@
 """Triangles and how they hang together: parts, borders, orientation, walls."""
 
 import contextlib
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -53,6 +54,13 @@ def edge_counts(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.unique(edges, axis=0, return_counts=True)
 
 
+def handles(faces: np.ndarray) -> int:
+    """Handles of a closed surface in one part, by its Euler characteristic."""
+    import igl
+
+    return 1 - igl.euler_characteristic(np.ascontiguousarray(faces)) // 2
+
+
 def parts(faces: np.ndarray) -> np.ndarray:
     """Number (F,) of the connected part that each triangle belongs to, from 0."""
     import igl
@@ -103,21 +111,20 @@ def decimated(
     return merged(points.astype(np.float64) / scale, fewer.astype(np.int64))
 
 
-def border_loops(faces: np.ndarray) -> list[np.ndarray]:
+def border_loops(faces: np.ndarray) -> Iterator[np.ndarray]:
     """Closed rows of vertices along the borders, in the direction of their faces."""
     import networkx
 
     pairs = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     key, back = pairs @ (count := faces.max() + 1, 1), pairs @ (1, count)
     graph = networkx.DiGraph(pairs[~np.isin(key, back)].tolist())
-    loops = []
     with contextlib.suppress(networkx.NetworkXNoCycle):
         while True:
             loop = networkx.find_cycle(graph)
             graph.remove_edges_from(loop)
             graph.remove_nodes_from([a for a, _ in loop if not graph.degree(a)])
-            loops.append(np.array([a for a, _ in loop]))
-    return [loop for loop in loops if len(loop) >= 3]
+            if len(loop) >= 3:
+                yield np.array([a for a, _ in loop])
 
 
 def without_slivers(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int]:
@@ -179,9 +186,8 @@ def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     """
     import igl
 
-    closed = (edge_counts(faces)[1] == 2).all()
-    if not closed or igl.euler_characteristic(np.ascontiguousarray(faces)) > 0:
-        return None  # or without a hole through it
+    if (edge_counts(faces)[1] != 2).any() or handles(faces) < 1:
+        return None  # open, or without a hole through it
     area = areas(vertices, faces)
     outward = igl.per_face_normals(vertices, faces, np.zeros(3))
     outward *= np.sign(Surface(vertices, faces).volume)

@@ -18,10 +18,8 @@ from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 TAIL = 15e-3  # m, end of a centreline that is cut off where it is too narrow
 TAIL_RADIUS = 1.1e-3  # m, of a 6 Fr device (1.0 mm) and a tenth to spare
 END_TRIM = 8e-3  # m, most that is cut off where a curve runs into its end
-# These keep what they share with others: vertebral arteries are their branches.
-TRUNKS = ("rsa", "lsa")
-# These, where they are named, keep what they share with what has no name.
-STEMS = ("bca", "lcca", "rcca")
+TRUNKS = ("rsa", "lsa")  # keep what they share with others, such as vertebral arteries
+STEMS = ("bca", "lcca", "rcca")  # keep what they share with what has no name
 MIN_RADIUS = 0.1e-3  # m, floor of a centreline's radius where it scrapes the wall
 TRUNK = "bca"  # name of the common trunk of the right branches
 # Branches of which the brachiocephalic artery is the trunk.
@@ -84,10 +82,12 @@ def _bulk(field: SurfaceDepth, curve: np.ndarray) -> float:
     return float(np.maximum(field(curve), 0.0).sum())
 
 
-def _separation(curve: np.ndarray, other: np.ndarray, field: SurfaceDepth) -> int:
+def _separation(
+    curve: np.ndarray, depth: np.ndarray, other: np.ndarray, field: SurfaceDepth
+) -> int:
     """Index of the last point of ``curve`` before it leaves ``other`` for good."""
     distance, nearest = cKDTree(other).query(curve)
-    apart = distance > np.maximum(0.4 * field(curve), 1e-3)
+    apart = distance > np.maximum(0.4 * depth, 1e-3)
     # They part for good where a wall stands between them: at a wide flat end, or where
     # two drawn curves begin, they may part and meet again in one lumen. After that
     # they may meet once more, in a ring of vessels.
@@ -108,7 +108,8 @@ def _separation(curve: np.ndarray, other: np.ndarray, field: SurfaceDepth) -> in
 
 def _parent(curve, lines, vessels, field) -> tuple[str, int]:
     """Vessel that ``curve`` leaves last, and the index at which it does."""
-    at = {key: _separation(curve, line, field) for key, line in lines.items()}
+    depth = field(curve)
+    at = {key: _separation(curve, depth, line, field) for key, line in lines.items()}
     key = max(at, key=lambda name: at[name])
     # Of curves that leave a wide vessel side by side it is the parent.
     while (vessel := vessels[key]).parent is not None:
@@ -124,7 +125,8 @@ def _shared_beginning(curves: list[np.ndarray], field: SurfaceDepth) -> np.ndarr
     others = [curve for curve in curves if curve is not longest]
     if not others:
         return longest[: max(4, int(0.6 * len(longest)))]
-    shared = max(_separation(longest, other, field) for other in others)
+    depth = field(longest)
+    shared = max(_separation(longest, depth, other, field) for other in others)
     return longest[: max(4, shared + 1)]
 
 
