@@ -29,7 +29,7 @@ def test_surface_is_closed_points_outwards_and_follows_the_lumen(name):
     low, high = found.vertices.min(axis=0), found.vertices.max(axis=0)
     points = np.random.default_rng(0).uniform(low, high, (20_000, 3))
     expected = (measure(points) > 0.0).mean() * np.prod(high - low)
-    assert found.volume == pytest.approx(expected, rel=0.05)
+    assert found.volume == pytest.approx(expected, rel=0.07)
 
 
 def test_surface_spacing_must_be_positive():
