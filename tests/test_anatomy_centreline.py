@@ -102,9 +102,7 @@ def test_depth_of_a_cylinder_and_its_open_ends():
         [[0, 0, 0.05], [0.004, 0, 0.05], [0.013, 0, 0.05], [0, 0, -0.003], [0, 0, 0.1]]
     )
     np.testing.assert_allclose(
-        vessels.depths(points)["aorta"],
-        [0.01, 0.006, -0.003, -0.003, 0.01],
-        atol=1e-12,
+        vessels.depths(points)["aorta"], [0.01, 0.006, -0.003, -0.003, 0.01], atol=1e-12
     )
     assert tree().depths(np.array([0.05, 0, 0.05]))["bca"] == pytest.approx(0.004)
 

@@ -15,11 +15,7 @@ _SLOPE = 1.2  # m per m, most of an interpolated depth
 
 
 def inside(
-    depth: Depth,
-    low: np.ndarray,
-    shape: np.ndarray,
-    spacing: float,
-    above: float = 0.0,
+    depth: Depth, low: np.ndarray, shape: np.ndarray, spacing: float, above: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lattice points deeper than a depth; only blocks near the lumen are evaluated.
 

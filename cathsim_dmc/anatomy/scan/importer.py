@@ -17,12 +17,7 @@ from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.curves import inside_part, read_curves
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS, listed
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
-from cathsim_dmc.anatomy.scan.naming import (
-    VESSEL_NAME,
-    Naming,
-    neutral_names,
-    renamed,
-)
+from cathsim_dmc.anatomy.scan.naming import VESSEL_NAME, Naming, neutral_names, renamed
 from cathsim_dmc.anatomy.scan.places import (
     cut_open,
     flat_ends,
