@@ -57,10 +57,7 @@ class Play:
         self.success = np.zeros(len(seeds), bool)
         self.force = np.zeros(len(seeds))
         turns = episodes.play(
-            episodes.BatchedSimulations(batch),
-            player.act,
-            lambda which: player.reset(view, which),
-            len(seeds),
+            batch, player.act, lambda which: player.reset(view, which)
         )
         for number, (action, step, running) in enumerate(turns):
             for i in np.flatnonzero(running):

@@ -147,9 +147,7 @@ def play(
     ends: dict[int, str] = {}
     lengths, forces = [0] * count, {}
     begin = functools.partial(policy.reset, view)
-    turns = episodes.play(
-        episodes.BatchedSimulations(simulation), policy.act, begin, count
-    )
+    turns = episodes.play(simulation, policy.act, begin)
     for number, (action, step, running) in enumerate(turns):
         if action is None:
             slides = _Slides(step.readings.insertion, limit.growth)

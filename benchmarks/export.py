@@ -59,8 +59,8 @@ def export(
             f"a policy cannot be called {name!r}; use lower-case letters, digits and "
             "underscores"
         )
-    if str(run).startswith(pretrained.PREFIX):
-        path = pretrained.pretrained_path(str(run))
+    path = pretrained.pretrained_path(run)
+    if path is not None:
         policy: Any = str(run)
         old, network, shapes, config = pretrained.read_pretrained(path)
         state, training = network.state_dict(), old["training"]

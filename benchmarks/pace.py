@@ -9,7 +9,6 @@ threads, images, stages, memory.
 
 import dataclasses
 import functools
-import itertools
 import statistics
 import time
 from collections.abc import Callable
@@ -20,7 +19,6 @@ from dm_control import composer
 
 from cathsim_dmc import suite
 from cathsim_dmc.policies import in_environment, make_policy
-from cathsim_dmc.simulation.episodes import ComposerSimulation, play
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check, Report
 
@@ -122,25 +120,15 @@ def pace(
         policy: Name of a policy in `cathsim_dmc.policies.POLICIES`.
     """
     act = in_environment(make_policy(policy, seed), environment)
-    timed, insertion, contacts = _Timed(environment), [], []
-    for _ in itertools.islice(play(timed, act), 1, steps + 1):
+    seconds, insertion, contacts = [], [], []
+    timestep = environment.reset()
+    while len(seconds) < steps and not timestep.last():
+        action, start = act(timestep), time.process_time()
+        timestep = environment.step(action)
+        seconds.append(time.process_time() - start)
         insertion.append(float(environment.task.readings.insertion))
         contacts.append(float(environment.task.contacts(environment.physics).found))
-    return Pace(np.array(insertion), np.array(timed.seconds), np.array(contacts))
-
-
-class _Timed(ComposerSimulation):
-    """A composer environment with the CPU seconds of each control step."""
-
-    def __init__(self, environment: composer.Environment):
-        super().__init__(environment)
-        self.seconds: list[float] = []
-
-    def step(self, action: np.ndarray):
-        start = time.process_time()
-        answer = super().step(action)
-        self.seconds.append(time.process_time() - start)
-        return answer
+    return Pace(np.array(insertion), np.array(seconds), np.array(contacts))
 
 
 def suite_overhead(policy: str, steps: int = STEPS) -> list[float]:

@@ -5,7 +5,6 @@ often has 1,024; these maps keep none.
 """
 
 import ctypes
-import functools
 import mmap
 import os
 import weakref
@@ -13,7 +12,9 @@ from typing import BinaryIO
 
 import numpy as np
 
-_SIZE, _PLACE, _FAILED = ctypes.c_size_t, ctypes.c_void_p, ctypes.c_void_p(-1).value
+if os.name == "posix":
+    _library = ctypes.CDLL(None, use_errno=True)
+    _library.mmap.restype = ctypes.c_void_p
 
 
 def mapped(stream: BinaryIO) -> np.ndarray:
@@ -29,13 +30,15 @@ def mapped(stream: BinaryIO) -> np.ndarray:
     if os.name != "posix":
         stream.seek(0)
         return np.frombuffer(bytearray(stream.read()), np.uint8)
-    access = mmap.PROT_READ | mmap.PROT_WRITE
-    start = _library().mmap(None, size, access, mmap.MAP_PRIVATE, stream.fileno(), 0)
-    if start == _FAILED:
+    access, length = mmap.PROT_READ | mmap.PROT_WRITE, ctypes.c_size_t(size)
+    file, offset = stream.fileno(), ctypes.c_long(0)
+    start = _library.mmap(None, length, access, mmap.MAP_PRIVATE, file, offset)
+    if start == ctypes.c_void_p(-1).value:
         raise OSError(ctypes.get_errno(), "cannot be mapped into memory")
     block = (ctypes.c_uint8 * size).from_address(start)
     # Not at exit: other threads may still look at it.
-    weakref.finalize(block, _library().munmap, start, size).atexit = False
+    place = ctypes.c_void_p(start)
+    weakref.finalize(block, _library.munmap, place, length).atexit = False
     return np.frombuffer(memoryview(block), np.uint8)
 
 
@@ -45,15 +48,5 @@ def release(pages: np.ndarray) -> None:
     What has been written into them is lost.
     """
     if os.name == "posix":
-        _library().madvise(pages.ctypes.data, pages.size, mmap.MADV_DONTNEED)
-
-
-@functools.cache
-def _library() -> ctypes.CDLL:
-    library = ctypes.CDLL(None, use_errno=True)
-    number = ctypes.c_int
-    library.mmap.restype = _PLACE
-    library.mmap.argtypes = [_PLACE, _SIZE, number, number, number, ctypes.c_long]
-    library.munmap.argtypes = [_PLACE, _SIZE]
-    library.madvise.argtypes = [_PLACE, _SIZE, number]
-    return library
+        place, size = ctypes.c_void_p(pages.ctypes.data), ctypes.c_size_t(pages.size)
+        _library.madvise(place, size, mmap.MADV_DONTNEED)

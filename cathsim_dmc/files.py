@@ -80,6 +80,18 @@ def naming(path: str | os.PathLike[str]) -> Iterator[None]:
         raise
 
 
+@contextlib.contextmanager
+def refused(
+    kind: type[Exception], text: str, *errors: type[Exception]
+) -> Iterator[None]:
+    """Raise errors of the block as another kind: one line, a text before their own."""
+    try:
+        yield
+    except errors as error:
+        line = " ".join(str(error).split())[:200] or type(error).__name__
+        raise kind(f"{text}: {line}") from error
+
+
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> Path:
     """Write a file atomically, see `atomic_path`; return its path."""
     with atomic_path(path) as temporary:

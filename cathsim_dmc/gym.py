@@ -1,11 +1,5 @@
 """Gymnasium ids of the tasks, registered when this module is imported.
 
-```python
-import gymnasium
-import cathsim_dmc.gym
-env = gymnasium.make("cathsim/type1_bca-v0", observation="image")
-```
-
 `gymnasium.make("cathsim_dmc.gym:cathsim/type1_bca-v0")` imports it by itself.
 """
 
@@ -22,10 +16,8 @@ VERSION = 0  # the same as in simulation.gymnasium, which is imported late
 # Ids with the names of their tasks.
 IDS = {f"{suite.DOMAIN}/{task}-v{VERSION}": task for task in suite.SUITE}
 
+_ENTRY = "cathsim_dmc.simulation.gymnasium:CathSimEnv"
+
 for _id, _task in IDS.items():
     if _id not in gymnasium.registry:
-        gymnasium.register(
-            _id,
-            entry_point="cathsim_dmc.simulation.gymnasium:CathSimEnv",
-            kwargs={"task": _task},
-        )
+        gymnasium.register(_id, _ENTRY, kwargs={"task": _task})

@@ -9,20 +9,11 @@ from cathsim_dmc.agents.learners import LEARNERS, config_from_dict
 def test_ppo_defaults_are_the_published_settings():
     config = PPOConfig()
     published = {
-        "minibatch_size": 32,
-        "steps_per_update": 512,
-        "gamma": 0.99,
-        "gae_lambda": 0.95,
-        "clip": 0.1,
-        "epochs": 20,
-        "entropy_coefficient": 5.85e-4,
-        "value_coefficient": 0.872,
-        "max_grad_norm": 1.0,
-        "learning_rate": 3e-4,
-        "hidden": (64, 64),
-        "activation": "tanh",
-        "total_frames": 600_000,
-    }
+        "minibatch_size": 32, "steps_per_update": 512, "epochs": 20, "gamma": 0.99,
+        "gae_lambda": 0.95, "clip": 0.1, "entropy_coefficient": 5.85e-4,
+        "value_coefficient": 0.872, "max_grad_norm": 1.0, "learning_rate": 3e-4,
+        "hidden": (64, 64), "activation": "tanh", "total_frames": 600_000,
+    }  # fmt: skip
     assert {name: getattr(config, name) for name in published} == published
 
 
@@ -44,9 +35,7 @@ def test_configs_survive_json(algorithm, preset):
     [
         (PPOConfig, {"num_envs": 7}, "num_envs is 7; .*divisor.*steps_per_update=512"),
         (PPOConfig, {"minibatch_size": 100}, "minibatch_size is 100"),
-        (PPOConfig, {"learning_rate": 10**400}, "learning_rate is .*finite number"),
         (PPOConfig, {"task_kwargs": {"a": float("inf")}}, "task_kwargs.*finite"),
-        (PPOConfig, {"training_reward": {"path": "x"}}, "training_reward.*finite"),
         (SACConfig, {"random_frames": 10}, "random_frames is 10.*256"),
         (SACConfig, {"replay_frames": 32}, "replay_frames is 32"),
     ],

@@ -38,7 +38,7 @@ def copied(recorded, tmp_path):
 @pytest.fixture(scope="module")
 def shapes():
     env = make_env(TASK, observation="tracking", task_kwargs=OPTIONS)
-    return NetworkShapes.of(env)
+    return NetworkShapes.of(env.observation_spec, env.action_spec)
 
 
 def test_a_dataset_repeats_in_its_own_environment(recorded, monkeypatch):
@@ -115,9 +115,9 @@ def test_what_does_not_fit_is_refused(recorded, shapes, tmp_path):
         record_demonstrations(TASK, recorded.path, 1)
     with pytest.raises(FileNotFoundError, match="create it"):
         record_demonstrations(TASK, tmp_path / "not" / "there", 1)
-    with pytest.raises(ValueError, match="episodes=0"):
+    with pytest.raises(ValueError, match="episodes is 0"):
         record_demonstrations(TASK, tmp_path / "none", 0)
-    with pytest.raises(ValueError, match="noise=-1"):
+    with pytest.raises(ValueError, match="noise is -1"):
         record_demonstrations(TASK, tmp_path / "none", 1, noise=-1)
 
 

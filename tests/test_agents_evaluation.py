@@ -10,7 +10,7 @@ from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.analysis.force_statistics import FIGURES, EpisodeForces, Statistics
 from cathsim_dmc.analysis.intervals import success_interval
-from cathsim_dmc.cli import tables
+from cathsim_dmc.cli import agents as commands
 
 SORTED = sorted(synthetic_env.SIZES)
 # Where "position" begins in the concatenated observation.
@@ -23,6 +23,10 @@ def expert(observation):
     action = torch.zeros(len(point), synthetic_env.ACTIONS)
     action[:, :3] = (-10 * point).clamp(-1, 1)
     return action
+
+
+def push(observation):
+    return torch.ones(*observation.batch_size, synthetic_env.ACTIONS)
 
 
 def play(**kwargs):
@@ -46,9 +50,6 @@ def test_each_seed_is_played_once_and_as_if_alone():
 
 
 def test_force_figures_are_those_of_the_steps():
-    def push(observation):
-        return torch.ones(*observation.batch_size, synthetic_env.ACTIONS)
-
     (episode,) = play(policy=push, episodes=1, seed=3).episodes
     env = synthetic_env.ReachEnv(1, seed=3)
     current = env.reset()
@@ -150,8 +151,7 @@ def test_one_condition_has_no_interval_over_its_episodes():
 
 def test_safe_success_counts_the_force_in_every_physics_step():
     def episode(success, force):
-        largest = Statistics(0.0, None, force)
-        forces = EpisodeForces(peak_sum=largest)
+        forces = EpisodeForces(peak_sum=Statistics(0.0, None, force))
         return EpisodeOutcome(0, 0.0, 1, True, success, forces, False, 1.0)
 
     episodes = (episode(True, 0.4), episode(True, 0.6), episode(False, 0.1))
@@ -168,11 +168,8 @@ def test_success_interval_against_a_published_value():
 def test_the_table_says_which_force_is_which(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
 
-    def push(observation):
-        return torch.ones(*observation.batch_size, synthetic_env.ACTIONS)
-
     result = play(policy=push, episodes=3)
-    tables.print_results(result)
+    commands.print_results(result)
     text = " ".join(capsys.readouterr().out.split())
     for name in FIGURES:
         assert f"{name.replace('_', ' ')}, mN" in text

@@ -82,11 +82,8 @@ def test_tip_frames_are_mujocos(rotation, roll):
     expected = physics.bind(joints).xaxis.reshape(-1, 2, 3)
     head = physics.bind(task.scene.catheter.head).xmat.reshape(3, 3)[:, 2]
     state = task.rollout.index.read(physics.data.ptr)
-    axes, direction = pursuit.tip_frames(
-        pursuit.Plan.for_case(task.rollout.case()),
-        state.joint_positions,
-        state.head_frame,
-    )
+    plan = pursuit.Plan.for_case(task.rollout.case())
+    axes, direction = pursuit.tip_frames(plan, state)
     # The y hinge sits on the frame that the x hinge has turned.
     np.testing.assert_allclose(axes, expected, atol=1e-9)
     np.testing.assert_allclose(direction, head, atol=1e-9)
@@ -265,10 +262,7 @@ def test_it_masters_the_tasks_gently(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "number, access",
-    [(3, "ascending"), (8, "descending")],
-)
+@pytest.mark.parametrize("number, access", [(3, "ascending"), (8, "descending")])
 def test_it_solves_arches_that_nobody_tuned_it_on(number, access):
     anatomy = arch.build_seed(arch.arch_set("test")[number], access=access)
     for goal in ("bca", "lcca", "lsa"):

@@ -19,7 +19,7 @@ from cathsim_dmc.agents import (
 from cathsim_dmc.agents.dagger import DAgger
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, load_transitions
 from cathsim_dmc.agents.imitation import BC
-from cathsim_dmc.agents.learners import make_learner
+from cathsim_dmc.agents.learners import LEARNERS
 from cathsim_dmc.agents.networks import NetworkShapes, network_of
 from cathsim_dmc.agents.sac import SAC
 from cathsim_dmc.agents.training import take_over
@@ -45,9 +45,8 @@ def dataset(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def shapes():
-    return NetworkShapes.of(
-        make_env("simple1_bca", observation="tracking", num_threads=1)
-    )
+    env = make_env("simple1_bca", observation="tracking", num_threads=1)
+    return NetworkShapes.of(env.observation_spec, env.action_spec)
 
 
 def small(algorithm, **changes):
@@ -149,7 +148,7 @@ def test_rare_withdrawals_weigh_as_much_as_the_rest(
     withdrawn, weight, shapes, tmp_path
 ):
     env = make_env("simple1_bca", observation="tracking", num_threads=1)
-    learner = make_learner(dagger(withdrawal_weight=5.0), shapes, tmp_path)
+    learner = DAgger(dagger(withdrawal_weight=5.0), shapes, tmp_path)
     learner.attach(env)
     target = torch.full((100, shapes.actions), -0.5)
     column = env.base_env.simulation.task.scene.catheter.translations[0]
@@ -183,7 +182,7 @@ def test_a_policy_starts_from_that_of_another_run(
 ):
     own = {"demonstrations": dataset} if algorithm == "bc" else {}
     config = small(algorithm, initial_policy=str(cloned), **own)
-    learner = make_learner(config, shapes, tmp_path)
+    learner = LEARNERS[algorithm].learner(config, shapes, tmp_path)
     vectors = load_transitions(dataset, "tracking", shapes)["observation_vector"]
     source = Checkpoint.open(cloned).policy()
     expected = act(source, vectors)

@@ -116,7 +116,7 @@ def test_convolutions_that_do_not_fit_the_image_are_refused():
 def test_standard_observations_satisfy_torchrl(observation):
     env = synthetic_env.make_env("reach", observation=observation, num_envs=3)
     check_env_specs(env)
-    shapes = NetworkShapes.of(env)
+    shapes = NetworkShapes.of(env.observation_spec, env.action_spec)
     if observation == "image":
         assert shapes == NetworkShapes(0, (1, 128, 128), synthetic_env.ACTIONS)
     else:

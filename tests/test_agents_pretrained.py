@@ -23,16 +23,9 @@ def exported(tmp_path_factory):
     """(Checkpoint, path of the weights) of a policy of the small environment."""
     directory = tmp_path_factory.mktemp("exported")
     config = make_config(
-        "ppo",
-        "demo",
-        total_frames=512,
-        num_envs=8,
-        steps_per_update=256,
-        hidden=[8],
-        normalisation_frames=16,
-        clip=0.3,
-        task_kwargs={"max_steps": 20},
-    )
+        "ppo", "demo", total_frames=512, num_envs=8, steps_per_update=256, hidden=[8],
+        normalisation_frames=16, clip=0.3, task_kwargs={"max_steps": 20},
+    )  # fmt: skip
     run = directory / "run"
     train(config, run, progress=False, make_env=synthetic_env.make_env)
 

@@ -8,56 +8,34 @@ import torch
 from tensordict import TensorDict
 
 from cathsim_dmc.agents import ConfigError, evaluate, make_config, train
-from cathsim_dmc.agents.checkpoint import (
-    Checkpoint,
-    checkpoints_in,
-)
+from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.sac import SAC
 from cathsim_dmc.agents.training import _truncate_diverged
 from cathsim_dmc.agents.training_log import read_metrics
 
 CLOCKS = ("seconds", "frames_per_second")
+SMALL = {
+    "task": "reach", "num_envs": 16, "learning_rate": 1e-3, "total_frames": 1_024,
+    "normalisation_frames": 256,
+}  # fmt: skip
 
 
 def small_ppo(**changes):
-    return make_config(
-        "ppo",
-        **{
-            "task": "reach",
-            "num_envs": 16,
-            "steps_per_update": 512,
-            "minibatch_size": 128,
-            "epochs": 2,
-            "learning_rate": 1e-3,
-            "total_frames": 1_024,
-            "metrics_frames": 512,
-            "checkpoint_frames": 512,
-            "normalisation_frames": 256,
-            **changes,
-        },
-    )
+    own = {
+        "steps_per_update": 512, "minibatch_size": 128, "epochs": 2,
+        "metrics_frames": 512, "checkpoint_frames": 512,
+    }  # fmt: skip
+    return make_config("ppo", **{**SMALL, **own, **changes})
 
 
 def small_sac(**changes):
-    return make_config(
-        "sac",
-        **{
-            "task": "reach",
-            "num_envs": 16,
-            "batch_size": 64,
-            "learning_rate": 1e-3,
-            "random_frames": 512,
-            "replay_frames": 4_096,
-            "updates_per_frame": 0.03125,
-            "initial_alpha": 0.1,
-            "total_frames": 1_024,
-            "metrics_frames": 256,
-            "checkpoint_frames": 256,
-            "normalisation_frames": 256,
-            **changes,
-        },
-    )
+    own = {
+        "batch_size": 64, "random_frames": 512, "replay_frames": 4_096,
+        "updates_per_frame": 0.03125, "initial_alpha": 0.1,
+        "metrics_frames": 256, "checkpoint_frames": 256,
+    }  # fmt: skip
+    return make_config("sac", **{**SMALL, **own, **changes})
 
 
 def run(config, out, **kwargs):
@@ -261,7 +239,7 @@ def test_a_run_is_neither_overwritten_nor_resumed_with_other_settings(tmp_path):
     run(small_ppo(total_frames=512), tmp_path)
     with pytest.raises(ConfigError, match="already holds a run"):
         run(small_ppo(total_frames=512), tmp_path)
-    with pytest.raises(ConfigError, match="clip: the run has 0.1, given is 0.3"):
+    with pytest.raises(ConfigError, match="clip: it has 0.1, given is 0.3"):
         run(small_ppo(clip=0.3), tmp_path, resume=True)
     with pytest.raises(ConfigError, match="algorithm"):
         run(small_sac(), tmp_path, resume=True)

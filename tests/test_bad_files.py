@@ -99,10 +99,7 @@ LOADERS = {
         lambda path: list(read_episodes(path.parent)),
         None,
     ),
-    "demos-v0/data/main_data.hdf5": (
-        lambda path: list(read_episodes(path.parent)),
-        (),
-    ),
+    "demos-v0/data/main_data.hdf5": (lambda path: list(read_episodes(path.parent)), ()),
     "lcca.mrk.json": (
         read_curve,
         ("type", "coordinateUnits", "coordinateSystem", "measurements"),

@@ -50,11 +50,7 @@ TASK = {
 CONFIG = TASK.keys() - {"observation", "device", "devices", "goal_radius", "reward"}
 CONFIG -= {"random"}
 NAVIGATE = {"anatomy": word(), "goal": word(), "access": word()}
-ARCHES = {
-    "arches": word(),
-    "pool": whole(1, 1000),
-    "first": whole(0, 10_000),
-}
+ARCHES = {"arches": word(), "pool": whole(1, 1000), "first": whole(0, 10_000)}
 FLUOROSCOPY = {
     "view": word().filter(lambda value: value != (1, 2))
     | st.tuples(number(-360, 360), st.just(0)),

@@ -18,7 +18,7 @@ from cathsim_dmc.agents.policies import FunctionPolicy
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.cli import agents as commands
-from cathsim_dmc.cli import installation, task_options
+from cathsim_dmc.cli import checks, task_options
 
 # What works.
 
@@ -107,12 +107,12 @@ def test_an_evaluation_takes_options_of_the_task(cathsim):
 
 
 def test_the_doctor_names_what_is_missing_and_what_to_do(cathsim, monkeypatch):
-    real = installation.metadata.version
+    real = checks.metadata.version
     versions = {"mujoco": "4.0.0"}
 
     def version(name):
         if name == "trimesh":
-            raise installation.metadata.PackageNotFoundError(name)
+            raise checks.metadata.PackageNotFoundError(name)
         return versions.get(name) or real(name)
 
     code, out, _ = cathsim("doctor", "--json")
@@ -121,7 +121,7 @@ def test_the_doctor_names_what_is_missing_and_what_to_do(cathsim, monkeypatch):
     assert {"Python", "numpy", "OMP_NUM_THREADS", "compiled kernels", "OpenGL"} < {
         *found
     }
-    monkeypatch.setattr(installation.metadata, "version", version)
+    monkeypatch.setattr(checks.metadata, "version", version)
     code, out, _ = cathsim("doctor")
     assert code == 1
     failed = [line for line in out.splitlines() if line.startswith("FAIL")]
@@ -184,7 +184,7 @@ def test_every_setting_is_a_typed_option(cathsim, tmp_path):
     assert code == 0, err
     assert Checkpoint.open(tmp_path).config == config.replace(total_frames=128)
     code, _, err = cathsim("train", "--out", tmp_path, "--resume", "--clip", 0.3)
-    assert code == 2 and "clip: the run has 0.1, given is 0.3" in err
+    assert code == 2 and "clip: it has 0.1, given is 0.3" in err
 
 
 @pytest.mark.parametrize("algorithm", LEARNERS)
@@ -241,10 +241,7 @@ def test_an_interrupted_training_says_how_to_go_on(cathsim, tmp_path):
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        ("eval", "random", "--task", "type1_bca", "--episodes", 30),
-        ("validate", "rod"),
-    ],
+    [("eval", "random", "--task", "type1_bca", "--episodes", 30), ("validate", "rod")],
 )
 @pytest.mark.slow
 def test_an_interrupt_leaves_one_line(arguments):

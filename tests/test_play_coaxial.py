@@ -143,10 +143,7 @@ def test_an_operator_moves_wire_and_catheter_in_the_window(monkeypatch, tmp_path
         steps = np.flatnonzero(first.action[:, entry])
         return steps + 1, np.unique(first.action[steps, entry])
 
-    for entry, (start, stop), sign in (
-        (1, (18, 28), 1.0),
-        (3, (20, 26), -1.0),
-    ):
+    for entry, (start, stop), sign in ((1, (18, 28), 1.0), (3, (20, 26), -1.0)):
         steps, signs = pressed(entry)
         assert signs == [sign]
         assert abs(steps[0] - start) <= 1 and abs(steps[-1] + 1 - stop) <= 2

@@ -10,13 +10,7 @@ from cathsim_dmc import policies, suite
 from cathsim_dmc.agents import evaluate, load_policy
 from cathsim_dmc.agents.training import train
 from cathsim_dmc.pictures import record
-from cathsim_dmc.policies import (
-    POLICIES,
-    Policy,
-    View,
-    in_environment,
-    make_policy,
-)
+from cathsim_dmc.policies import POLICIES, Policy, View, in_environment, make_policy
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 
 TASK = "simple1_bca"

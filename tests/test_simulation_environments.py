@@ -55,14 +55,11 @@ def test_every_face_takes_its_specs_from_the_table_without_an_episode(monkeypatc
 
 def test_a_task_satisfies_torchrl_and_gives_what_was_asked():
     env = make_env(
-        TASK,
-        observation=("sequential", "tracking"),
-        num_envs=2,
-        num_threads=1,
+        TASK, observation=("sequential", "tracking"), num_envs=2, num_threads=1,
         task_kwargs={"max_steps": 5},
-    )
+    )  # fmt: skip
     check_env_specs(env)
-    shapes = NetworkShapes.of(env)
+    shapes = NetworkShapes.of(env.observation_spec, env.action_spec)
     assert shapes.pixels == (3, 128, 128)
     assert shapes.actions == 21
     steps = env.rollout(7, break_when_any_done=False)
@@ -73,6 +70,7 @@ def test_a_task_satisfies_torchrl_and_gives_what_was_asked():
     ended = steps["next", "truncated"][:, :, 0]
     assert ended.nonzero()[:, 1].tolist() == [4, 4]
     assert not steps["next", "terminated"].any()
+    assert not steps["next", "info", "physics_error"].any()
     # The new episode begins with a history of its own: three equal images.
     fresh = steps["pixels"][:, 5]
     assert torch.equal(fresh[:, 0], fresh[:, 2])

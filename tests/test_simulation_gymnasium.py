@@ -47,8 +47,7 @@ def test_every_task_has_an_id():
             "randomisation": True,
         },
         pytest.param(
-            {"dtype": "float64", "observation": "segmentation"},
-            marks=pytest.mark.slow,
+            {"dtype": "float64", "observation": "segmentation"}, marks=pytest.mark.slow
         ),
     ],
 )

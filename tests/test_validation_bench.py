@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from cathsim_dmc.cli.measurements import validate
+from cathsim_dmc.cli.checks import validate
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY
 from cathsim_dmc.validation import bench, bench_data
 from cathsim_dmc.validation.bench_data import MESH, WIRES, Wire

@@ -15,6 +15,7 @@ from tensordict.nn import TensorDictSequential
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.config import TrainingConfig
+from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.learners import config_from_dict
 from cathsim_dmc.agents.networks import NetworkShapes, make_policy
 
@@ -62,7 +63,8 @@ class Checkpoint:
                 )
             path = found[-1]
         description = path / _DESCRIPTION
-        try:
+        wrong = OSError, LookupError, TypeError, AttributeError, ValueError
+        with files.refused(CheckpointError, str(description), *wrong):
             values = json.loads(description.read_text())
             if values["format"] != FORMAT:
                 raise ValueError(f"format is {values['format']!r}, not {FORMAT}")
@@ -74,8 +76,6 @@ class Checkpoint:
                 seconds=float(values["seconds"]),
                 sha256={name: values["sha256"][name] for name in (_POLICY, _LEARNING)},
             )
-        except (OSError, LookupError, TypeError, AttributeError, ValueError) as error:
-            raise CheckpointError(f"{description}: {line_of(error)}") from error
 
     def policy_state(self) -> dict[str, Any]:
         """Weights and statistics on the CPU; CheckpointError if damaged or missing."""
@@ -93,20 +93,16 @@ class Checkpoint:
     def _load(self, name: str) -> dict[str, Any]:
         path = self.path / name
         data = read_bytes(path, self.sha256[name])
-        try:
+        # torch's reader of weights fails in many ways.
+        with files.refused(CheckpointError, f"{path} holds no weights", Exception):
             # weights_only: a checkpoint from elsewhere must not be able to run code.
             return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-        except Exception as error:  # torch's reader of weights fails in many ways
-            text = f"{path} holds no weights: {line_of(error)}"
-            raise CheckpointError(text) from error
 
 
 def read_bytes(path: Path, sha256: str) -> bytes:
     """Content of a file; CheckpointError if it is missing or its checksum differs."""
-    try:
+    with files.refused(CheckpointError, f"{path} cannot be read", OSError):
         data = path.read_bytes()
-    except OSError as error:
-        raise CheckpointError(f"{path} cannot be read: {error}.") from error
     if hashlib.sha256(data).hexdigest() != sha256:
         raise CheckpointError(
             f"{path} is damaged: its SHA-256 is not {sha256[:12]}…, as the JSON file "
@@ -119,19 +115,11 @@ def policy_of(
     path: Path, state: Mapping[str, Any], shapes: NetworkShapes, config: TrainingConfig
 ) -> TensorDictSequential:
     """A policy ready to act; CheckpointError if the weights are of another network."""
-    try:
+    text = f"{path} does not fit the network described beside it"
+    with files.refused(CheckpointError, text, ValueError, TypeError, RuntimeError):
         policy = make_policy(shapes, config)
         policy.load_state_dict(dict(state))
-    except (ValueError, TypeError, RuntimeError) as error:
-        raise CheckpointError(
-            f"{path} does not fit the network described beside it: {line_of(error)}"
-        ) from error
     return policy.eval().requires_grad_(False)
-
-
-def line_of(error: Exception) -> str:
-    """An error as one line."""
-    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def checkpoints_in(run: Path) -> list[Path]:
@@ -142,13 +130,7 @@ def checkpoints_in(run: Path) -> list[Path]:
 
 
 def save_checkpoint(
-    run: Path,
-    config: TrainingConfig,
-    shapes: NetworkShapes,
-    frames: int,
-    seconds: float,
-    policy: Mapping[str, Any],
-    learning: Mapping[str, Any],
+    run: Path, learner: Learner, frames: int, seconds: float, learning: dict[str, Any]
 ) -> Path:
     """Write a checkpoint into a run's directory and drop the oldest ones.
 
@@ -166,25 +148,23 @@ def save_checkpoint(
         # No frame was added since, as when a run is interrupted right after saving.
         return target
     packages = ("torch", "torchrl", "mujoco", "dm-control")
+    sums: dict[str, str] = {}
     description = {
-        "format": FORMAT,
-        "frames": frames,
-        "seconds": seconds,
-        "config": config.to_dict(),
-        "shapes": shapes.to_dict(),
-        "sha256": {},
-        "versions": {name: version(name) for name in packages},
-    }
+        "format": FORMAT, "frames": frames, "seconds": seconds,
+        "config": learner.config.to_dict(), "shapes": learner.shapes.to_dict(),
+        "sha256": sums, "versions": {name: version(name) for name in packages},
+    }  # fmt: skip
     with files.atomic_directory(target) as temporary:
-        for file, state in ((_POLICY, policy), (_LEARNING, learning)):
+        states = {_POLICY: learner.policy_state(), _LEARNING: learning}
+        for file, state in states.items():
             # By way of memory: torch's own writer hides the cause on a full disk.
             stream = io.BytesIO()
             torch.save(dict(state), stream)
             data = stream.getvalue()
-            description["sha256"][file] = hashlib.sha256(data).hexdigest()
+            sums[file] = hashlib.sha256(data).hexdigest()
             files.write_bytes(temporary / file, data)
         files.write_json(temporary / _DESCRIPTION, description)
-    for old in checkpoints_in(run)[: -config.keep_checkpoints]:
+    for old in checkpoints_in(run)[: -learner.config.keep_checkpoints]:
         (old / _DESCRIPTION).unlink()  # first: without it, it is no checkpoint
         shutil.rmtree(old)
     return target

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 from cathsim_dmc import bounds
-from cathsim_dmc.bounds import MOST_START_SHARE
 
 # Convolutions of the published agents: (filters, kernel size, stride) of each.
 PUBLISHED_CONVOLUTIONS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))
@@ -67,26 +66,22 @@ def check_fields(config: Any) -> None:
         for base in reversed(type(config).__mro__):
             field = getattr(base, "__dataclass_fields__", {}).get(name)
             limits |= {} if field is None else field.metadata
-        value = checked(name, getattr(config, name), kind, **limits)
+        try:
+            value = checked(name, getattr(config, name), kind, **limits)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
         object.__setattr__(config, name, value)
 
 
 def checked(name: str, value: Any, kind: Any, **limits: Any) -> Any:
-    """A value of an annotated type, lists as tuples; or ConfigError."""
-    try:
-        return _checked(name, value, kind, limits)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
-
-
-def _checked(name: str, value: Any, kind: Any, limits: dict[str, Any]) -> Any:
+    """A value of an annotated type, lists as tuples; or ValueError."""
     origin, kinds = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         if value is None and types.NoneType in kinds:
             return None
         kinds = [one for one in kinds if one is not types.NoneType]
         # Of a name or names, the first is the name.
-        return _checked(name, value, kinds[-(not isinstance(value, str))], limits)
+        return checked(name, value, kinds[-(not isinstance(value, str))], **limits)
     if origin is Literal:
         return bounds.choice(name, value, kinds)
     if origin is Mapping:
@@ -94,13 +89,13 @@ def _checked(name: str, value: Any, kind: Any, limits: dict[str, Any]) -> Any:
         if kinds[1] is Any:
             return values
         return {
-            key: _checked(f"{name}[{key!r}]", one, kinds[1], limits)
+            key: checked(f"{name}[{key!r}]", one, kinds[1], **limits)
             for key, one in values.items()
         }
     if origin is tuple:
         if not isinstance(value, list | tuple) or not value:
             bounds.refuse(name, value, "a list with one entry or more")
-        return tuple(_checked(name, one, kinds[0], limits) for one in value)
+        return tuple(checked(name, one, kinds[0], **limits) for one in value)
     if kind is int:
         low = 1 if "positive" in limits else limits.get("low", -_MOST)
         return bounds.whole(name, value, low, limits.get("high", _MOST))
@@ -187,7 +182,7 @@ class TrainingConfig:
     training_reward: Mapping[str, float] | None = None
     training_max_steps: int | None = positive(None)
     training_start: tuple[float, float] | None = within(
-        None, low=0.0, high=MOST_START_SHARE
+        None, low=0.0, high=bounds.MOST_START_SHARE
     )
     num_envs: int = positive(16)
     num_threads: int | None = positive(None)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from typing_extensions import override
 
@@ -81,12 +81,12 @@ class DAggerConfig(TrainingConfig):
 class _Guided(TensorDictModuleBase):
     """Acts with expert or learner at random; records the expert's action."""
 
-    def __init__(self, policy: TensorDictSequential, view: View, lead: float):
+    def __init__(self, learner: "DAgger", view: View):
         super().__init__()
-        self.policy, self.share = policy, 1.0
-        self.in_keys = [*policy.in_keys, _BEGUN]
+        self.learner, self.policy = learner, learner.network
+        self.in_keys = [*self.policy.in_keys, _BEGUN]
         self.out_keys = ["action", EXPERT_ACTION]
-        self._teacher = Teacher(view, lead)
+        self._teacher = Teacher(view, learner.config.expert_lead)
         self._last = torch.zeros(view.num_simulations, view.num_actions)
 
     @torch.no_grad()
@@ -97,7 +97,7 @@ class _Guided(TensorDictModuleBase):
         self._teacher.reset(fresh.numpy())
         label = torch.as_tensor(self._teacher.act(self._last.double().numpy())).float()
         own = self.policy(tensordict.select(*self.policy.in_keys))["action"]
-        guided = torch.rand(len(label), 1) < self.share
+        guided = torch.rand(len(label), 1) < self.learner.share
         action = torch.where(guided, label, own.cpu())
         self._last = action.clone()
         tensordict["action"] = action.to(own.device)
@@ -121,9 +121,8 @@ class DAgger(CloningLearner):
     @override
     def attach(self, env: EnvBase) -> None:
         view = View(env.base_env.simulation)
-        self.policy = _Guided(self.network, view, self.config.expert_lead)
+        self.policy = _Guided(self, view)
         self._translations = list(view.task.scene.catheter.translations)
-        self._set_share()
 
     @override
     def _weights(self, target: torch.Tensor) -> torch.Tensor:
@@ -133,37 +132,22 @@ class DAgger(CloningLearner):
         weight = ((1.0 - share) / share).clamp(1.0, self.config.withdrawal_weight)
         return torch.where(withdrawn, weight, torch.ones_like(weight))
 
-    def _set_share(self) -> float:
-        """The share of the expert in the next round."""
-        share = self.config.expert_share ** (
-            self.gradient_steps // self.config.gradient_steps
-        )
-        if isinstance(self.policy, _Guided):
-            self.policy.share = share
-        return share
+    @property
+    def share(self) -> float:
+        """Share of the control steps of the present round that the expert acts in."""
+        rounds = self.gradient_steps // self.config.gradient_steps
+        return self.config.expert_share**rounds
 
     @override
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        config, share = self.config, self._set_share()
+        config, share = self.config, self.share
         self.replay.extend(batch.select(*self._keys).reshape(-1))
         self.observe(batch)
         rates = decaying(config.learning_rate, 0.0, config.gradient_steps)
-        figures = self.fit(self.replay.sample, config.batch_size, rates)
-        self._set_share()
+        figures = self.fit(self.replay.sample, rates)
         return {
             **figures,
             "expert_share": share,
             "replay_frames": float(len(self.replay)),
             "gradient_steps": float(self.gradient_steps),
         }
-
-    @override
-    def learning_state(self) -> dict[str, Any]:
-        return {**super().learning_state(), "replay": self.replay.state()}
-
-    @override
-    def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
-        super().load(policy, learning)
-        if "replay" in learning:
-            self.replay.load(learning["replay"])
-        self._set_share()

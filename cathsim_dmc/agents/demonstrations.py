@@ -12,7 +12,7 @@ import torch
 from dm_env import specs
 from tensordict import TensorDict, TensorDictBase
 
-from cathsim_dmc import suite
+from cathsim_dmc import bounds, suite
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import View
 from cathsim_dmc.policies.expert import ExpertPolicy
@@ -20,7 +20,7 @@ from cathsim_dmc.recording import dataset
 from cathsim_dmc.recording.dataset import DatasetError, read_episodes
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.simulation.episodes import BatchedSimulations, play
+from cathsim_dmc.simulation.episodes import play
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.observation_kind import Sizes
 
@@ -85,19 +85,16 @@ def record_demonstrations(
         ModuleNotFoundError: minari is not installed.
     """
     out = Path(out)
-    if episodes < 1:
-        raise ValueError(f"episodes={episodes}: at least one is needed")
-    if not 0 <= noise <= 1:
-        raise ValueError(f"noise={noise} must be a deviation in [0, 1]")
+    bounds.whole("episodes", episodes, 1)
+    bounds.number("noise", noise, 0.0, 1.0)
     dataset.check_free(out)
     from cathsim_dmc.simulation import gymnasium
 
     names = observation if isinstance(observation, str) else list(observation)
     options = {**(task_kwargs or {}), "observation": names}
     count = min(episodes, _SIMULATIONS)
-    simulation = BatchSimulation(
-        suite.make_task(task, **options), count, num_threads=num_threads or 0
-    )
+    made = suite.make_task(task, **options)
+    simulation = BatchSimulation(made, count, num_threads=num_threads or 0)
     buffers: list[Any] = []
     while len(buffers) < episodes:
         seeds = np.arange(count) + seed + len(buffers)
@@ -105,36 +102,28 @@ def record_demonstrations(
         buffers += played[: episodes - len(buffers)]
         if say is not None:
             say(f"{len(buffers)} of {episodes} episodes")
+    single = np.dtype("float32")
+    action = specs.BoundedArray((simulation.num_actions,), single, -1.0, 1.0)
     dataset.write(
         out,
         buffers,
         env_spec=gymnasium.env_spec(task, **options),
-        observation_space=gymnasium.space_of(
-            simulation.task.observation_specs, np.dtype("float32")
-        ),
-        action_space=gymnasium.space(
-            specs.BoundedArray((simulation.num_actions,), np.float32, -1.0, 1.0),
-            np.dtype("float32"),
-        ),
+        observation_space=gymnasium.space_of(made.observation_specs, single),
+        action_space=gymnasium.space(action, single),
         algorithm=f"scripted expert, noise {noise:g}",
         description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
         f"seeds from {seed}",
     )
-    means, largest = zip(*map(_forces, buffers), strict=True)
+    means = [np.mean(buffer.infos["wall_force_sum"][1:]) for buffer in buffers]
+    largest = [np.max(buffer.infos["wall_force_max"][1:]) for buffer in buffers]
     return Demonstrations(
         path=out,
         episodes=len(buffers),
         successes=sum(bool(buffer.infos["success"][-1]) for buffer in buffers),
         steps=sum(len(buffer.rewards) for buffer in buffers),
         mean_force=float(np.mean(means)),
-        max_force=float(max(largest)),
+        max_force=float(np.max(largest)),
     )
-
-
-def _forces(buffer: Any) -> tuple[float, float]:
-    """Mean of the sum over all contacts, and largest contact, of an episode, N."""
-    sums, largest = (buffer.infos[f"wall_force_{name}"][1:] for name in ("sum", "max"))
-    return np.mean(sums), np.max(largest)
 
 
 def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
@@ -157,8 +146,7 @@ def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
 
     begin = functools.partial(expert.reset, view)
     columns: dict[str, Any] = collections.defaultdict(list)
-    turns = play(BatchedSimulations(simulation), act, begin, len(seeds))
-    for action, step, running in turns:
+    for action, step, running in play(simulation, act, begin):
         columns["observations"].append(step.observation)
         columns["infos"].append(step.info())
         if action is not None:
@@ -195,9 +183,7 @@ def _buffer(seed: int, row: int, columns: Mapping[str, Any]) -> Any:
 
 
 def load_transitions(
-    path: str | Path,
-    observation: str | Sequence[str],
-    shapes: NetworkShapes,
+    path: str | Path, observation: str | Sequence[str], shapes: NetworkShapes
 ) -> TensorDictBase:
     """Transitions of a dataset's successful episodes, as a collector gives them.
 
@@ -221,7 +207,7 @@ def load_transitions(
     if not succeeded:
         raise DatasetError(f"none of the {len(episodes)} episodes in {path} succeeds")
     transitions = TensorDict.cat(succeeded)
-    found = NetworkShapes.sized(transitions, transitions["action"])
+    found = NetworkShapes.of(transitions, transitions["action"])
     if found != shapes:
         raise DatasetError(
             f"{path} holds {found}, and the task with the observation {observation!r} "

@@ -9,9 +9,6 @@ from tensordict import TensorDictBase
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, ForceTracker
 from cathsim_dmc.physics.forces import NAMES
 
-# Information of the environment about a step, beside the observation.
-INFO = "info"
-
 
 @dataclass(frozen=True)
 class EpisodeOutcome:
@@ -53,7 +50,7 @@ class EpisodeTracker:
         def read(value: torch.Tensor) -> np.ndarray:
             return value.reshape(batch.shape).numpy()
 
-        after, info = batch["next"], batch["next", INFO]
+        after, info = batch["next"], batch["next", "info"]
         reward, done = read(after["reward"]), read(after["done"])
         forces = [read(info[name]) for name in NAMES]
         finished = []

@@ -41,16 +41,12 @@ class CloningLearner(Learner):
         )
 
     def fit(
-        self,
-        sample: Callable[[int], TensorDictBase],
-        batch_size: int,
-        rates: torch.Tensor,
+        self, sample: Callable[[int], TensorDictBase], rates: torch.Tensor
     ) -> dict[str, float]:
         """Take gradient steps on the squared error of the action.
 
         Args:
             sample: Function that draws so many states with "expert_action".
-            batch_size: Number of states of a gradient step.
             rates: (steps,), learning rate of each step.
 
         Returns:
@@ -60,7 +56,7 @@ class CloningLearner(Learner):
         for rate in rates.tolist():
             for group in self.optimiser.param_groups:
                 group["lr"] = rate
-            mean, target = self._means(sample(batch_size))
+            mean, target = self._means(sample(self.config.batch_size))
             loss = ((mean.tanh() - target).square() * self._weights(target)).mean()
             self.descend(loss)
             losses.append({"loss": loss.detach()})
@@ -150,7 +146,7 @@ class BC(CloningLearner):
         after = min(progress + batch.numel() / config.total_frames, 1.0)
         steps = math.ceil(config.gradient_steps * after) - self.gradient_steps
         rates = decaying(1.0 - progress, 1.0 - after, steps) * config.learning_rate
-        figures = self.fit(self._sample, config.batch_size, rates)
+        figures = self.fit(self._sample, rates)
         return {**figures, "gradient_steps": float(self.gradient_steps)}
 
     def _sample(self, count: int) -> TensorDictBase:

@@ -29,12 +29,14 @@ class Learner(abc.ABC):
     policy: The policy to collect with; `network`, or one around it.
     critic_normalisers: Normalisers of what the critic alone reads.
     optimiser: Adam with the parameters of all networks, made by the subclass.
+    replay: `ReplayMemory` that is learnt from, if any; made by the subclass.
     gradient_steps: Number of gradient steps so far.
     """
 
     metrics: ClassVar[tuple[str, ...]]
     random_frames: int = 0
     optimiser: torch.optim.Optimizer
+    replay: Any = None
 
     def __init__(
         self,
@@ -50,7 +52,6 @@ class Learner(abc.ABC):
             directory: Directory of the run, for what the algorithm keeps on disk.
             critic_shapes: Sizes of what the critic reads; None for the policy's.
         """
-        del directory
         self.config, self.shapes = config, shapes
         self.device = torch.device(config.torch_device)
         self.network = make_policy(shapes, config).to(self.device)
@@ -112,6 +113,7 @@ class Learner(abc.ABC):
             "optimiser": self.optimiser.state_dict(),
             "gradient_steps": self.gradient_steps,
             "normalisers": self.critic_normalisers.state_dict(),
+            **({"replay": self.replay.state()} if self.replay is not None else {}),
         }
 
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
@@ -120,6 +122,8 @@ class Learner(abc.ABC):
         self.optimiser.load_state_dict(learning["optimiser"])
         self.gradient_steps = learning["gradient_steps"]
         self.critic_normalisers.load_state_dict(learning["normalisers"])
+        if self.replay is not None and "replay" in learning:
+            self.replay.load(learning["replay"])
 
 
 def means(steps: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, float]:

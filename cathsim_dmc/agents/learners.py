@@ -1,14 +1,12 @@
 """The algorithms by name: a new one is two classes and a line here."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.dagger import DAgger, DAggerConfig
 from cathsim_dmc.agents.imitation import BC, BCConfig
 from cathsim_dmc.agents.learner import Learner
-from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.ppo import PPO, PPOConfig
 from cathsim_dmc.agents.sac import SAC, SACConfig
 
@@ -43,13 +41,6 @@ def config_from_dict(values: Mapping[str, Any]) -> TrainingConfig:
     values = {name: one for name, one in values.items() if name != "tensorboard"}
     kind = _choice(LEARNERS, values.pop("algorithm", None), "algorithm").config
     return kind.from_dict(values)
-
-
-def make_learner(
-    config: TrainingConfig, shapes: NetworkShapes, directory: Path
-) -> Learner:
-    """The learner of a config's algorithm, with fresh weights."""
-    return LEARNERS[config.algorithm].learner(config, shapes, directory)
 
 
 def _choice(table: Mapping[str, Any], name: object, what: str) -> Any:

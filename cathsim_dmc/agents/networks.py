@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
+from cathsim_dmc import files
 from cathsim_dmc.agents.config import (
     ActorCriticConfig,
     ConfigError,
@@ -28,8 +28,6 @@ NORMAL_PIXELS = "pixels_normal"
 # A deviation below exp(-5) before the tanh explores nothing; above exp(2) all
 # actions are at their bounds.
 LOG_STD_RANGE = (-5.0, 2.0)
-
-
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 
 
@@ -48,12 +46,7 @@ class NetworkShapes:
     actions: int
 
     @classmethod
-    def of(cls, env: EnvBase) -> "NetworkShapes":
-        """The sizes of an environment's observation and action."""
-        return cls.sized(env.observation_spec, env.action_spec)
-
-    @classmethod
-    def sized(cls, observation: Any, action: Any) -> "NetworkShapes":
+    def of(cls, observation: Any, action: Any) -> "NetworkShapes":
         """The sizes of an observation and an action, or of their specs."""
         keys, pixels = list(observation.keys()), None
         if PIXELS in keys:
@@ -64,7 +57,7 @@ class NetworkShapes:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "NetworkShapes":
-        """The inverse of to_dict; ConfigError if a size is missing or no integer."""
+        """The inverse of to_dict; ValueError if a size is missing or no integer."""
         kinds = typing.get_type_hints(cls).items()
         return cls(**{n: checked(f"shapes.{n}", values.get(n), k) for n, k in kinds})
 
@@ -123,13 +116,10 @@ class Convolutions(nn.Module):
             layers += [nn.Conv2d(channels, filters, kernel, stride), nn.ReLU()]
             channels = filters
         self.filters = nn.Sequential(*layers, nn.Flatten(-3))
-        try:
+        size = f"{shape[1]} x {shape[2]} pixels; give fewer or smaller ones"
+        text = f"convolutions do not fit images of {size}"
+        with files.refused(ConfigError, text, RuntimeError):
             entries = self.filters(torch.zeros(shape)).numel()
-        except RuntimeError as error:
-            raise ConfigError(
-                f"convolutions do not fit images of {shape[1]} x {shape[2]} pixels; "
-                f"give fewer or smaller ones: {error}"
-            ) from error
         self.head = nn.Sequential(nn.Linear(entries, config.cnn_features), nn.ReLU())
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:

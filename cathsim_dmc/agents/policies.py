@@ -69,13 +69,10 @@ class TrainedPolicy(FunctionPolicy):
             self.task, self.task_kwargs = source.config.task, source.config.task_kwargs
             name = f"{source.config.algorithm} {source.path.name}"
         else:
-            card, self.network, self.shapes, self.config = pretrained.read_pretrained(
-                source
-            )
-            self.card, self.task, self.task_kwargs = (
-                card, card["task"], card["task_kwargs"],
-            )  # fmt: skip
-            name = f"{pretrained.PREFIX}{card['name']}"
+            card, network, shapes, config = pretrained.read_pretrained(source)
+            self.network, self.shapes, self.config = network, shapes, config
+            self.card, self.task = card, card["task"]
+            self.task_kwargs, name = card["task_kwargs"], f"pretrained:{card['name']}"
         super().__init__(self._answer, name)
         self.observation = self.config.observation
 
@@ -116,15 +113,12 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
         return policy
     if isinstance(policy, Checkpoint):
         return TrainedPolicy(policy)
-    if isinstance(policy, str | Path):
-        if str(policy) in POLICIES:
-            return make_policy(str(policy), seed)
-        if str(policy).startswith(pretrained.PREFIX):
-            policy = pretrained.pretrained_path(str(policy))
-        path = Path(policy)
-        is_file = path.suffix == pretrained.SUFFIX
-        return TrainedPolicy(path if is_file else Checkpoint.open(path))
-    return FunctionPolicy(policy)
+    if not isinstance(policy, str | Path):
+        return FunctionPolicy(policy)
+    if policy in POLICIES:
+        return make_policy(str(policy), seed)
+    path = pretrained.pretrained_path(policy)
+    return TrainedPolicy(Checkpoint.open(policy) if path is None else path)
 
 
 def task_and_options(
@@ -133,7 +127,6 @@ def task_and_options(
     """Task of a policy, and its options over those of the training.
 
     Args:
-        policy: Policy.
         task: Name of the task; None takes the one that the policy was trained on, or
             `navigate` where that has an anatomy of its own and `options` name another.
         options: Options of the task.

@@ -36,23 +36,14 @@ from cathsim_dmc.agents.networks import (
 # Larger minibatches and fewer passes: about a tenth of the published cost of learning
 # per frame.
 _LARGE_BATCHES: Mapping[str, Any] = {
-    "num_envs": 32,
-    "steps_per_update": 2_048,
-    "minibatch_size": 256,
-    "epochs": 10,
-    "clip": 0.2,
-    "target_kl": 0.05,
-}
+    "num_envs": 32, "steps_per_update": 2_048, "minibatch_size": 256, "epochs": 10,
+    "clip": 0.2, "target_kl": 0.05,
+}  # fmt: skip
 # Exploration noise that bends the whole tip for a while (docs/training.md).
 _TUNED: Mapping[str, Any] = {
-    **_LARGE_BATCHES,
-    **TUNED_TRAINING,
-    "hidden": (128, 128),
-    "initial_deviation": 0.7,
-    "noise_correlation": 0.9,
-    "noise_shared": 0.8,
-    "total_frames": 300_000,
-}
+    **_LARGE_BATCHES, **TUNED_TRAINING, "hidden": (128, 128), "initial_deviation": 0.7,
+    "noise_correlation": 0.9, "noise_shared": 0.8, "total_frames": 300_000,
+}  # fmt: skip
 _TERMS = ("loss_objective", "loss_critic", "entropy", "kl_approx", "clip_fraction")
 
 
@@ -112,16 +103,11 @@ class PPOConfig(ActorCriticConfig):
     def __post_init__(self):
         """Validate the algorithm's own fields after the shared ones."""
         super().__post_init__()
+        allowed = f"a divisor of steps_per_update={self.steps_per_update}"
         for name in ("num_envs", "minibatch_size"):
             value = getattr(self, name)
             # A smaller last minibatch would weigh its frames more than the others.
-            fits = self.steps_per_update % value == 0
-            require(
-                fits,
-                name,
-                value,
-                f"a divisor of steps_per_update={self.steps_per_update}",
-            )
+            require(self.steps_per_update % value == 0, name, value, allowed)
         require(self.minibatch_size > 1, "minibatch_size", self.minibatch_size, "> 1")
 
     @property

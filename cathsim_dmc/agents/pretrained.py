@@ -9,12 +9,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load
 from tensordict.nn import TensorDictSequential
 
-from cathsim_dmc.agents.checkpoint import (
-    CheckpointError,
-    line_of,
-    policy_of,
-    read_bytes,
-)
+from cathsim_dmc import files
+from cathsim_dmc.agents.checkpoint import CheckpointError, policy_of, read_bytes
 from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.learners import config_from_dict
 from cathsim_dmc.agents.networks import NetworkShapes
@@ -24,11 +20,9 @@ PREFIX = "pretrained:"
 SUFFIX = ".safetensors"
 DIRECTORY = Path(__file__).parents[1] / "pretrained"
 _PARTS: Mapping[str, type] = {
-    **dict.fromkeys(("name", "task", "sha256"), str),
-    **dict.fromkeys(
-        ("task_kwargs", "config", "shapes", "training", "evaluation"), dict
-    ),
-}
+    "name": str, "task": str, "sha256": str, "task_kwargs": dict, "config": dict,
+    "shapes": dict, "training": dict, "evaluation": dict,
+}  # fmt: skip
 
 
 def pretrained_names(directory: str | Path = DIRECTORY) -> list[str]:
@@ -36,9 +30,15 @@ def pretrained_names(directory: str | Path = DIRECTORY) -> list[str]:
     return sorted(path.stem for path in Path(directory).glob(f"*{SUFFIX}"))
 
 
-def pretrained_path(name: str) -> Path:
-    """Weights of the policy that ships under a name; CheckpointError lists names."""
-    name, names = name.removeprefix(PREFIX), pretrained_names()
+def pretrained_path(policy: str | Path) -> Path | None:
+    """Weights of "pretrained:NAME" or of a `.safetensors` file, None for others.
+
+    Raises:
+        CheckpointError: none ships under that name; lists those that do.
+    """
+    if not str(policy).startswith(PREFIX):
+        return Path(policy) if Path(policy).suffix == SUFFIX else None
+    name, names = str(policy).removeprefix(PREFIX), pretrained_names()
     if name not in names:
         there = ", ".join(PREFIX + one for one in names)
         raise CheckpointError(f"no policy {PREFIX}{name}; there are {there}.")
@@ -59,12 +59,11 @@ def read_pretrained(
     weights = Path(weights)
     card = read_card(weights.with_suffix(".json"))
     data = read_bytes(weights, card["sha256"])
-    try:
+    text = f"{weights} cannot be used"
+    with files.refused(CheckpointError, text, SafetensorError, ValueError):
         config = config_from_dict(card["config"])
         shapes = NetworkShapes.from_dict(card["shapes"])
         return card, policy_of(weights, load(data), shapes, config), shapes, config
-    except (SafetensorError, ValueError) as error:
-        raise CheckpointError(f"{weights} cannot be used: {line_of(error)}") from error
 
 
 def read_card(path: str | Path) -> dict[str, Any]:
@@ -79,11 +78,10 @@ def read_card(path: str | Path) -> dict[str, Any]:
     Raises:
         CheckpointError: it is missing or damaged.
     """
-    try:
+    errors = OSError, AttributeError, ValueError
+    with files.refused(CheckpointError, f"{path} cannot be read", *errors):
         card = json.loads(Path(path).read_text())
         wrong = [n for n, kind in _PARTS.items() if type(card.get(n)) is not kind]
-    except (OSError, AttributeError, ValueError) as error:
-        raise CheckpointError(f"{path} cannot be read: {error}.") from error
     if wrong or card.get("format") != FORMAT:
         raise CheckpointError(f"{path}: no card of format {FORMAT}; wrong is {wrong}.")
     return card

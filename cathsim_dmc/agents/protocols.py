@@ -34,19 +34,10 @@ class Protocol(NamedTuple):
 
 
 VARIED_RANGES = Randomisation(
-    friction=(0.02, 0.15),
-    stiffness=(0.7, 1.3),
-    loss=(0.5, 2.0),
-    viscosity=(0.5, 2.0),
-    start_radius=0.01,
-    start_insertion=(0.0, 0.06),
-    roll=(-np.pi, np.pi),
-    delay=(0, 3),
-    tracking_noise=0.5e-3,
-    view=(-10.0, 10.0),
-    gain=(0.85, 1.15),
-    kerma=(0.5, 2.0),
-)
+    friction=(0.02, 0.15), stiffness=(0.7, 1.3), loss=(0.5, 2.0), viscosity=(0.5, 2.0),
+    start_radius=0.01, start_insertion=(0.0, 0.06), roll=(-np.pi, np.pi), delay=(0, 3),
+    tracking_noise=0.5e-3, view=(-10.0, 10.0), gain=(0.85, 1.15), kerma=(0.5, 2.0),
+)  # fmt: skip
 
 PROTOCOLS = {
     # The task as it is; episodes differ by 1 mm of the start, so they are nearly one.
@@ -93,12 +84,13 @@ def parts(
     """
     options = {**task_kwargs, **protocol.task_kwargs}
     ranges = Randomisation.make(options.get("randomisation", False))
-    preset = suite.TASKS[task].options if task in suite.TASKS else {}
-    coaxial = options.get("devices", preset.get("devices"))
+    definition = suite.TASKS.get(task)
+    coaxial = options.get("devices", definition and definition.options.get("devices"))
     pools = [options]
     if not coaxial and options.get("device", "steerable_5f") in protocol.devices:
         pools = [{**options, "device": name} for name in protocol.devices]
-    arches = options.get("pool", POOL) if random_arch(task) else 1
+    random_arch = definition is not None and definition.random_arch
+    arches = options.get("pool", POOL) if random_arch else 1
     found, played = [], 0
     for number, own in enumerate(pools[:episodes]):
         count = len(range(number, episodes, len(pools)))
@@ -111,11 +103,6 @@ def parts(
         drawn = tuple(_conditions(ranges, one, arches, own) for one in seeds)
         found.append(Part(own, seeds, drawn if ranges != Randomisation() else ()))
     return tuple(found)
-
-
-def random_arch(task: str) -> bool:
-    """Whether each episode of a task draws an anatomy."""
-    return task in suite.TASKS and suite.TASKS[task].random_arch
 
 
 def _conditions(
@@ -140,7 +127,6 @@ def stratified(
     fewest are.
 
     Args:
-        ranges: What is drawn.
         wanted: Number of the arch of each episode in its pool.
         seed: The candidates begin there.
         arches: Number of arches in the pool, one of which a seed draws.
@@ -186,9 +172,10 @@ def distinct(task: str, task_kwargs: Mapping[str, Any]) -> bool:
 
     Tasks outside the suite are taken to.
     """
-    if task not in suite.TASKS:
+    definition = suite.TASKS.get(task)
+    if definition is None:
         return True
     ranges = Randomisation.make(task_kwargs.get("randomisation", False))
     wide = dataclasses.replace(ranges, start_radius=START_JITTER) != Randomisation()
     along = task_kwargs.get("start_along_route") is not None
-    return wide or along or random_arch(task) or ranges.start_radius > 2e-3
+    return wide or along or definition.random_arch or ranges.start_radius > 2e-3

@@ -12,9 +12,6 @@ from tensordict import TensorDict, TensorDictBase
 
 from cathsim_dmc import files
 
-# Key of an entry of a transition, nested ones as tuples.
-Key = str | tuple[str, ...]
-
 
 class ReplayError(ValueError):
     """The files of a replay are missing, damaged or not the ones asked for."""
@@ -30,17 +27,15 @@ class ReplayMemory:
 
     Args:
         directory: Folder of the files; made on the first `extend`.
+        keys: Entries of a transition, nested ones as tuples.
         max_bytes: Largest size of all files together; lowers the capacity if need be.
     """
 
     def __init__(
-        self, directory: Path, keys: Sequence[Key], capacity: int, max_bytes: int
+        self, directory: Path, keys: Sequence[Any], capacity: int, max_bytes: int
     ):
-        self.directory = directory
-        self.capacity = capacity
-        self.max_bytes = max_bytes
-        self.cursor = 0
-        self.size = 0
+        self.directory, self.capacity = directory, capacity
+        self.max_bytes, self.cursor, self.size = max_bytes, 0, 0
         names = {key: key if isinstance(key, str) else ".".join(key) for key in keys}
         self._paths = {key: self.directory / f"{n}.npy" for key, n in names.items()}
         self._storage: TensorDictBase | None = None
@@ -83,18 +78,17 @@ class ReplayMemory:
             return
         storage = TensorDict({}, [capacity])
         for key, path in self._paths.items():
-            try:
+            text = (
+                f"the replay of {size:,} transitions is lost: {path} is missing, "
+                "damaged or of another checkpoint. Resume without it "
+                "(without_replay=True, --without-replay): the run keeps its networks "
+                "and collects new transitions. What was found"
+            )
+            wrong = OSError, ValueError, TypeError, RuntimeError, EOFError
+            with files.refused(ReplayError, text, *wrong):
                 # "r+" would extend a file that is too short.
                 open_memmap(path, mode="r")
                 storage[key] = torch.from_numpy(open_memmap(path, mode="r+"))
-            except (OSError, ValueError, TypeError, RuntimeError, EOFError) as error:
-                line = " ".join(str(error).split())[:200]
-                raise ReplayError(
-                    f"the replay of {size:,} transitions is lost: {path} is missing, "
-                    f"damaged or of another checkpoint ({line}). Resume without it "
-                    "(without_replay=True, --without-replay): the run keeps its "
-                    "networks and collects new transitions."
-                ) from error
         self._storage, self.capacity = storage, capacity
         self.cursor, self.size = cursor, size
 

@@ -28,13 +28,9 @@ REPLAY_BYTES = 2 * 1024**3
 # The weight of the entropy must start near the size of a step's reward (0.05): at 0.1
 # and above the actions stay random for tens of thousands of frames.
 _TUNED: Mapping[str, Any] = {
-    **TUNED_TRAINING,
-    "updates_per_frame": 0.25,
-    "hidden": (256, 256),
-    "activation": "relu",
-    "initial_alpha": 1e-3,
-    "total_frames": 60_000,
-}
+    **TUNED_TRAINING, "updates_per_frame": 0.25, "hidden": (256, 256),
+    "activation": "relu", "initial_alpha": 1e-3, "total_frames": 60_000,
+}  # fmt: skip
 _TERMS = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy")
 
 
@@ -123,12 +119,8 @@ class SAC(Learner):
             lr=config.learning_rate,
             fused=True,
         )
-        keys = [*shapes.raw_keys, "reward", "done", "terminated"]
-        self.replay_keys = [
-            *shapes.raw_keys,
-            "action",
-            *[("next", key) for key in keys],
-        ]
+        after = [*shapes.raw_keys, "reward", "done", "terminated"]
+        self.replay_keys = [*shapes.raw_keys, "action", *[("next", k) for k in after]]
         limits = config.replay_frames, config.replay_bytes
         self.replay = ReplayMemory(directory / "replay", self.replay_keys, *limits)
         self.demonstrations: TensorDictBase | None = None
@@ -161,9 +153,8 @@ class SAC(Learner):
         self.normalise(sample["next"])
         losses = self.loss(sample)
         # Each term has gradients for its own parameters only, so one sum serves.
-        self.descend(
-            losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]
-        )
+        loss = losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]
+        self.descend(loss)
         self.targets.step()
         return {name: losses[name].detach() for name in _TERMS}
 
@@ -178,22 +169,13 @@ class SAC(Learner):
 
     @override
     def learning_state(self) -> dict[str, Any]:
-        loss = {
-            name: value
-            for name, value in self.loss.state_dict().items()
-            if isinstance(value, torch.Tensor)
-        }
-        return {
-            **super().learning_state(),
-            "loss": loss,
-            "replay": self.replay.state(),
-            "owed_steps": self.owed_steps,
-        }
+        loss = self.loss.state_dict().items()
+        loss = {name: value for name, value in loss if isinstance(value, torch.Tensor)}
+        own = {"loss": loss, "owed_steps": self.owed_steps}
+        return {**super().learning_state(), **own}
 
     @override
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
         super().load(policy, learning)
         self.loss.load_state_dict({**self.loss.state_dict(), **learning["loss"]})
-        if "replay" in learning:
-            self.replay.load(learning["replay"])
         self.owed_steps = learning["owed_steps"]

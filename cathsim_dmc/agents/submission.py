@@ -96,10 +96,11 @@ def digest_of(policy: str) -> str | None:
     """SHA-256 of a policy's weights or recorded actions; None without a file."""
     if policy in POLICIES:
         return None
-    if policy.startswith(pretrained.PREFIX):
-        policy = str(pretrained.pretrained_path(policy))
-    if policy.endswith((pretrained.SUFFIX, RECORDED)):
-        return hashlib.sha256(Path(policy).read_bytes()).hexdigest()
+    path = pretrained.pretrained_path(policy)
+    if policy.endswith(RECORDED):
+        path = Path(policy)
+    if path is not None:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
     sums = json.dumps(dict(Checkpoint.open(policy).sha256), sort_keys=True)
     return hashlib.sha256(sums.encode()).hexdigest()
 
@@ -124,15 +125,14 @@ class RecordedActions(Policy):
 
     def __init__(self, path: str | Path):
         """Reads a file of `record_actions`; ValueError if it is none or damaged."""
-        try:
+        wrong = LookupError, TypeError, ValueError
+        with files.refused(ValueError, f"{path} holds no recorded actions", *wrong):
             header, actions = files.read_arrays(path, ("header", "actions")).values()
             values = json.loads(str(header))
             self.name = f"{values['policy']}, recorded actions"
             self.task, self.task_kwargs = values["task"], dict(values["task_kwargs"])
             self.observation = values["observation"]
             self.actions = bounds.array("actions", actions, "f", (-1, -1, -1))
-        except (LookupError, TypeError, ValueError) as error:
-            raise ValueError(f"{path} holds no recorded actions: {error}") from error
         self._rows, self._step = slice(0, 0), 0
 
     def reset(self, view: View, which: np.ndarray) -> None:

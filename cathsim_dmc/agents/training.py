@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,14 +23,13 @@ from cathsim_dmc.agents.checkpoint import (
     Checkpoint,
     CheckpointError,
     checkpoints_in,
-    line_of,
     save_checkpoint,
 )
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
-from cathsim_dmc.agents.episodes import INFO, EpisodeTracker
+from cathsim_dmc.agents.episodes import EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
 from cathsim_dmc.agents.learner import Learner, make_collector
-from cathsim_dmc.agents.learners import make_learner
+from cathsim_dmc.agents.learners import LEARNERS
 from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 from cathsim_dmc.agents.training_log import TrainingLog, crossed
@@ -81,7 +80,6 @@ def train(
     dropped, episodes that were running start anew. One process at a time trains there.
 
     Args:
-        config: Settings: what to train, and how.
         resume: Whether to continue the run there. One that was killed before its
             first checkpoint starts anew.
         progress: Whether to show progress on standard error.
@@ -98,23 +96,27 @@ def train(
         OSError: the disk is full, or the directory cannot be written to.
     """
     run = Path(out_dir)
-    try:
+    text = f"torch_device={config.torch_device!r} cannot be used here, 'cpu' always can"
+    with files.refused(ConfigError, text, RuntimeError, AssertionError):
         torch.zeros(1, device=config.torch_device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise ConfigError(
-            f"torch_device={config.torch_device!r} cannot be used here "
-            f"({line_of(error)}); 'cpu' always can."
-        ) from error
     with contextlib.ExitStack() as stack:
         stack.enter_context(_only_process(run))
         checkpoint = _prepare(run, config, resume)
         stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(config.torch_threads)
-        env = _make_environment(config, checkpoint, make_env)
+        # A resumed run gets fresh episodes: another stretch of the same seeds.
+        stretch = [config.seed, checkpoint.frames if checkpoint else 0]
+        seed = int(np.random.SeedSequence(stretch).generate_state(1)[0]) % 2**31
+        env = make_env(
+            config.task, observation=config.collected_observation,
+            num_envs=config.num_envs, num_threads=config.num_threads, seed=seed,
+            task_kwargs=config.training_kwargs,
+        )  # fmt: skip
         torch.manual_seed(config.seed)
-        learner = make_learner(config, NetworkShapes.of(env), run)
+        shapes = NetworkShapes.of(env.observation_spec, env.action_spec)
+        learner = LEARNERS[config.algorithm].learner(config, shapes, run)
         learner.attach(env)
-        state = _start(learner, env, config, checkpoint, without_replay)
+        state = _start(learner, env, checkpoint, without_replay)
         collector = make_collector(config, learner, env, state["frames"])
         stack.callback(collector.shutdown)
         files.write_json(run / CONFIG_FILE, config.to_dict())
@@ -123,8 +125,8 @@ def train(
             torch.set_rng_state(state["rng"])
         else:
             torch.manual_seed(config.seed + 1)
-        log = TrainingLog(run, config, learner.metrics, state, progress)
-        stack.callback(log.close)
+        log = TrainingLog(run, learner, state, progress)
+        stack.callback(log.bar.close)
         interruption = stack.enter_context(_interruption())
         return _loop(run, iter(collector), learner, log, interruption)
 
@@ -134,13 +136,9 @@ def _only_process(run: Path) -> Iterator[None]:
     """Make the directory of a run; lock it until this process ends, even killed."""
     run.mkdir(parents=True, exist_ok=True)
     lock = FileLock(run / ".lock")
-    try:
+    text = f"another process trains in {run}; wait for its end, or choose a new folder"
+    with files.refused(ConfigError, text, Timeout):
         lock.acquire(blocking=False)
-    except Timeout as error:
-        raise ConfigError(
-            f"another process trains in {run}: wait for its end, or choose another "
-            "directory."
-        ) from error
     try:
         yield
     finally:
@@ -167,50 +165,28 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
     if not existing:
         return None
     checkpoint = Checkpoint.open(existing[-1])
-    changed = checkpoint.config.changed_for_resume(config).items()
-    if changed:
-        lines = (
-            f"{n}: the run has {old!r}, given is {new!r}" for n, (old, new) in changed
-        )
+    if changed := checkpoint.config.changed_for_resume(config):
         raise ConfigError(
-            f"{run} cannot be resumed with other settings ({'; '.join(lines)}). Resume "
-            "with the run's own, or start a new run in another directory. These may "
-            f"change: {sorted(config.resumable)}."
+            f"{run} cannot be resumed with other settings ({_differing(changed)}). "
+            "Resume with the run's own, or start a new run in another directory. These "
+            f"may change: {sorted(config.resumable)}."
         )
     return checkpoint
 
 
-def _make_environment(
-    config: TrainingConfig, checkpoint: Checkpoint | None, make_env: EnvFactory
-) -> EnvBase:
-    # A resumed run gets fresh episodes: another stretch of the same seeds.
-    frames = checkpoint.frames if checkpoint else 0
-    seed = int(np.random.SeedSequence([config.seed, frames]).generate_state(1)[0])
-    return make_env(
-        config.task,
-        observation=config.collected_observation,
-        num_envs=config.num_envs,
-        num_threads=config.num_threads,
-        seed=seed % 2**31,
-        task_kwargs=config.training_kwargs,
+def _differing(pairs: Mapping[str, tuple[Any, Any]]) -> str:
+    return "; ".join(
+        f"{name}: it has {old!r}, given is {new!r}"
+        for name, (old, new) in pairs.items()
     )
 
 
 def _start(
-    learner: Learner,
-    env: EnvBase,
-    config: TrainingConfig,
-    checkpoint: Checkpoint | None,
-    without_replay: bool,
+    learner: Learner, env: EnvBase, checkpoint: Checkpoint | None, without_replay: bool
 ) -> dict[str, Any]:
-    """Load a checkpoint or an initial policy, or take the first statistics.
-
-    Returns:
-        What earlier processes of the run have counted: frames, seconds, episodes, and
-        the figures of the last of these; and from a checkpoint the state "rng" of
-        torch's generator.
-    """
+    """Load a checkpoint or an initial policy; what earlier processes have counted."""
     if checkpoint is None:
+        config = learner.config
         if config.initial_policy is not None:
             take_over(learner.network, config, learner.shapes)
         elif config.normalisation_frames and not learner.random_frames:
@@ -221,14 +197,13 @@ def _start(
     policy, state = checkpoint.policy_state(), checkpoint.learning_state()
     if without_replay:
         state["learner"].pop("replay", None)
-    try:
+    text = (
+        f"{checkpoint.path} cannot be continued from, though its policy may still be "
+        f"evaluated: it does not fit what {checkpoint.config.algorithm} learns with"
+    )
+    wrong = KeyError, TypeError, AttributeError, RuntimeError
+    with files.refused(CheckpointError, text, *wrong):
         learner.load(policy, state.pop("learner"))
-    except (KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path} cannot be continued from: it does not fit what "
-            f"{checkpoint.config.algorithm} learns with ({line_of(error)}). Its policy "
-            "may still be evaluated."
-        ) from error
     return {"frames": checkpoint.frames, "seconds": checkpoint.seconds, **state}
 
 
@@ -253,17 +228,13 @@ def take_over(
         )
     pairs = {n: (getattr(source.config, n), getattr(config, n)) for n in _ALIKE}
     pairs["sizes"] = source.shapes, shapes
+    pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
     seen = source.config.observation, config.observation
     if _entries(seen[0]) != _entries(seen[1]):
         pairs["observation"] = seen
-    differing = [
-        f"{what}: it has {theirs!r}, given is {ours!r}"
-        for what, (theirs, ours) in pairs.items()
-        if theirs != ours
-    ]
-    if differing:
+    if pairs:
         raise ConfigError(
-            f"{name} does not fit ({'; '.join(differing)}); give the same settings, or "
+            f"{name} does not fit ({_differing(pairs)}); give the same settings, or "
             "another policy."
         )
     given, state = source.network.state_dict(), network.state_dict()
@@ -282,10 +253,7 @@ def take_over(
 
 
 def _entries(names: str | tuple[str, ...]) -> list[str]:
-    """Entries of an observation without the word of where they are from.
-
-    "route" and "biplane" have the same: one measures what the other reconstructs.
-    """
+    """Entries but for the word of where they are from: "route" is as "biplane"."""
     rows = observations.entries(observations.resolve(names))
     return sorted(entry.key.partition("_")[2] or entry.key for entry in rows)
 
@@ -307,9 +275,7 @@ def _loop(
             "episodes": log.episodes,
             "window": list(log.window),
         }
-        shapes, policy = learner.shapes, learner.policy_state()
-        counted = log.frames, log.seconds
-        return save_checkpoint(run, config, shapes, *counted, policy, learning)
+        return save_checkpoint(run, learner, log.frames, log.seconds, learning)
 
     tracker = EpisodeTracker(config.num_envs)
     saved, since = log.frames, time.monotonic()
@@ -341,12 +307,9 @@ def _loop(
 
 
 def _truncate_diverged(batch: TensorDictBase) -> None:
-    """Count a diverged simulation as cut off, not as ended by the task.
-
-    Rewards are negative distances, so an end worth nothing afterwards would be the
-    best of all: the agent would learn to break the simulation.
-    """
-    batch["next", "terminated"] &= ~batch["next", INFO, "physics_error"].bool()
+    """Count a diverged simulation as cut off, not as ended by the task."""
+    # Rewards are negative distances: the agent would learn to break the simulation.
+    batch["next", "terminated"] &= ~batch["next", "info", "physics_error"].bool()
 
 
 @contextlib.contextmanager

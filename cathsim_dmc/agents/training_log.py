@@ -16,6 +16,7 @@ from tqdm import tqdm
 from cathsim_dmc import files
 from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.episodes import EpisodeOutcome
+from cathsim_dmc.agents.learner import Learner
 
 # Seconds between two lines of progress in a log file, where no terminal redraws them.
 LINE_INTERVAL = 15.0
@@ -23,7 +24,7 @@ _LINE = "{desc}: {n_fmt}{unit} [{elapsed}, {rate_fmt}{postfix}]\n"
 # Number of finished episodes over which the running figures are taken.
 EPISODE_WINDOW = 100
 
-# Columns of metrics.csv that are means over the last episodes, and what they are of.
+# Columns of metrics.csv that are means over these, and what they are of.
 _FIGURES = {
     "episode_reward": "reward",
     "episode_length": "length",
@@ -46,45 +47,33 @@ class TrainingLog:
         episodes: Number of finished episodes likewise.
         window: Figures of the last `EPISODE_WINDOW` of these.
         row: Last row of metrics.csv that was written; empty before the first.
+        bar: Shows the progress.
     """
 
     def __init__(
-        self,
-        run: Path,
-        config: TrainingConfig,
-        metrics: Sequence[str],
-        state: Mapping[str, Any],
-        progress: bool,
+        self, run: Path, learner: Learner, state: Mapping[str, Any], progress: bool
     ):
         """Opens the files, shows the progress and starts the clock.
 
         Args:
-            metrics: Names of the learner's own figures.
             state: What earlier processes of the run have counted: frames, seconds,
                 episodes and the figures ("window") of the last of these.
             progress: Whether to show progress on standard error.
         """
+        config: TrainingConfig = learner.config
         self.frames, self.episodes = state["frames"], state["episodes"]
         self.window = deque(map(list, state["window"]), maxlen=EPISODE_WINDOW)
         self.row: dict[str, float | None] = {}
         self._interval = config.metrics_frames
-        self._path, self._columns = run / "metrics.csv", [*COLUMNS, *metrics]
+        self._path, self._columns = run / "metrics.csv", [*COLUMNS, *learner.metrics]
         # A killed run has rows beyond its checkpoint.
         rows = _texts(self._path) if self._path.exists() else []
         self._rows: list[dict] = [r for r in rows if int(r["frames"]) <= self.frames]
         self._write()
-        self._bar = progress_bar(
-            f"{config.algorithm} {config.task}",
-            " frames",
-            total=config.total_frames,
-            initial=self.frames,
-            disable=not progress,
-        )
+        label, total = f"{config.algorithm} {config.task}", config.total_frames
+        done = {"initial": self.frames, "disable": not progress}
+        self.bar = progress_bar(label, " frames", total=total, **done)
         self._before, self._began = state, time.monotonic()
-
-    def close(self) -> None:
-        """Closes the progress bar."""
-        self._bar.close()
 
     @property
     def seconds(self) -> float:
@@ -107,10 +96,9 @@ class TrainingLog:
         """
         before, self.frames = self.frames, self.frames + frames
         self.episodes += len(finished)
-        self.window.extend(
-            [v if v is None else float(v) for v in _VALUES(episode)]
-            for episode in finished
-        )
+        for episode in finished:
+            values = _VALUES(episode)
+            self.window.append([v if v is None else float(v) for v in values])
         means = {**_episode_means(self.window), "step_reward": step_reward}
         if last or crossed(before, self.frames, self._interval):
             new, seconds = self.frames - self._before["frames"], self.seconds
@@ -122,15 +110,13 @@ class TrainingLog:
                 **means,
                 **losses,
             }
-            texts = {
-                name: f"{value:.9g}" if isinstance(value, float) else value
-                for name, value in self.row.items()
-            }
+            cells = self.row.items()
+            texts = {n: f"{v:.9g}" if isinstance(v, float) else v for n, v in cells}
             self._rows.append(texts)
             self._write()
         known = {name: value for name, value in means.items() if value is not None}
-        self._bar.set_postfix(known, refresh=False)
-        self._bar.update(frames)
+        self.bar.set_postfix(known, refresh=False)
+        self.bar.update(frames)
 
     def _write(self) -> None:
         text = io.StringIO()
@@ -148,14 +134,9 @@ def progress_bar(label: str, unit: str, **options: Any) -> tqdm:
     terminal = sys.stderr.isatty()
     interval = 0.1 if terminal else LINE_INTERVAL
     return tqdm(
-        desc=label,
-        unit=unit,
-        mininterval=interval,
-        maxinterval=max(interval, 10.0),
-        dynamic_ncols=terminal,
-        bar_format=None if terminal else _LINE,
-        **options,
-    )
+        desc=label, unit=unit, mininterval=interval, maxinterval=max(interval, 10.0),
+        dynamic_ncols=terminal, bar_format=None if terminal else _LINE, **options,
+    )  # fmt: skip
 
 
 def _texts(path: Path) -> list[dict[str, str]]:

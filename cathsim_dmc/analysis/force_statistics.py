@@ -1,9 +1,4 @@
-"""Definitions of the forces of an episode.
-
-Four quantities of a control step, three statistics of each over an episode, and four
-named figures, which evaluations, results and cards report. docs/forces.md explains
-them and relates them to the published figures.
-"""
+"""Definitions of the forces of an episode, explained in docs/forces.md."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -80,11 +75,7 @@ class ForceTracker:
     """Forces of the running episodes of N simulations, step by step."""
 
     def __init__(self, num_simulations: int):
-        """Starts N episodes.
-
-        Args:
-            num_simulations: N.
-        """
+        """Starts N episodes."""
         self._steps: list[list[np.ndarray]] = [[] for _ in range(num_simulations)]
 
     def add(self, forces: Sequence[np.ndarray]) -> None:
@@ -99,7 +90,8 @@ class ForceTracker:
         return EpisodeForces(*map(_statistics, np.transpose(steps)))
 
 
-def _statistics(values: np.ndarray) -> Statistics | None:
+def _statistics(row: Sequence[float] | np.ndarray) -> Statistics | None:
+    values = np.asarray(row, dtype=np.float64)
     if np.isnan(values).any():
         return None
     touching = values[values > 0]
@@ -109,16 +101,12 @@ def _statistics(values: np.ndarray) -> Statistics | None:
 
 def recorded_forces(episode: Episode) -> EpisodeForces:
     """Statistics of a recorded episode; empty without a single step."""
-    columns = {
-        "sum": episode.wall_force_sum,
-        "max": episode.wall_force_max,
-        "peak_sum": episode.meta.get("wall_force_peak_sum"),
-        "peak_max": episode.meta.get("wall_force_peak_max"),
-    }
     if not episode.steps:
         return EpisodeForces()
-    known = {n: np.asarray(one, float) for n, one in columns.items() if one is not None}
-    return EpisodeForces(**{name: _statistics(one) for name, one in known.items()})
+    peaks = (episode.meta.get(f"wall_force_peak_{name}") for name in ("sum", "max"))
+    columns = episode.wall_force_sum, episode.wall_force_max, *peaks
+    found = (None if one is None else _statistics(one) for one in columns)
+    return EpisodeForces(*found)
 
 
 def millinewtons(mean: float | None, deviation: float | None = None) -> str:

@@ -8,7 +8,6 @@ import numpy as np
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.files import atomic_path
 
-SUFFIX = ".png"
 # Cells of 2 mm: about the diameter of the device, below which neighbouring contacts
 # of one place would be told apart.
 CELL = 2e-3
@@ -118,6 +117,6 @@ def heatmap(
     axes.set(xlim=x_mm[[0, -1]], ylim=z_mm[[0, -1]], aspect="equal")
     axes.set(xlabel="x, mm (patient left →)", ylabel="z, mm (head ↑)")
     axes.set_title(title, fontsize=11)
-    with atomic_path(path, SUFFIX) as temporary:
+    with atomic_path(path, ".png") as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)
     return field

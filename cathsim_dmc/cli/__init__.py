@@ -27,9 +27,9 @@ COMMANDS = {
     "demos": ("agents:demos", "Write demonstrations of the expert as a dataset."),
     "replay": ("recordings:replay", "Open a recording in the Rerun viewer."),
     "play": ("agents:play", "Cannulate by keyboard, with the forces on the screen."),
-    "doctor": ("installation:doctor", "Check what is installed; say what to do."),
+    "doctor": ("checks:doctor", "Check what is installed; say what to do."),
     "phantom": ("phantoms:phantoms", "Make, import and check anatomies."),
-    "validate": ("measurements:validate", "Compare the physics with theory."),
+    "validate": ("checks:validate", "Compare the physics with theory."),
 }
 
 

@@ -2,44 +2,58 @@
 
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 from tyro import conf
 
 # torchrl goes before dm_control.
 from cathsim_dmc import agents  # isort: skip
 
-from cathsim_dmc import bounds, files, suite
+from cathsim_dmc import __version__, bounds, files, suite
 from cathsim_dmc import play as by_hand
 from cathsim_dmc.agents import evaluation, submission
 from cathsim_dmc.agents.demonstrations import DEMONSTRATION_SEED
+from cathsim_dmc.agents.episodes import EpisodeOutcome
+from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.agents.policies import task_and_options
 from cathsim_dmc.agents.training_log import LINE_INTERVAL, progress_bar
-from cathsim_dmc.analysis.force_statistics import millinewtons, recorded_forces
-from cathsim_dmc.cli import tables
-from cathsim_dmc.cli.options import EVALUATION_SEED, Json, Task, Threads, print_json
+from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons, recorded_forces
+from cathsim_dmc.cli.options import Json, Task, Threads, print_json, say
 from cathsim_dmc.cli.task_options import TaskOptions, task_kind
 from cathsim_dmc.pictures import recorded
 from cathsim_dmc.pictures.animation import SUFFIXES
 from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
-PolicyName = Annotated[
-    str,
-    conf.Positional,
-    conf.arg(
-        help="Directory of a run or checkpoint, or name of a policy: random, push, "
-        "expert, idle, curl, random_curl, pretrained:NAME."
-    ),
-]
+_POLICY = (
+    "Directory of a run or checkpoint, or name of a policy: random, push, expert, "
+    "idle, curl, random_curl, pretrained:NAME."
+)
+PolicyName = Annotated[str, conf.Positional, conf.arg(help=_POLICY)]
 _TASK = (
     "Task of `cathsim list`; by default the one that the policy was trained on, or "
     "navigate where `--anatomy` names another anatomy."
 )
 PolicysTask = Annotated[str | None, conf.arg(help=_TASK)]
 Options = Annotated[TaskOptions, conf.arg(name="", constructor=task_kind())]
+_CAPTION = (
+    "Mean ± standard deviation over episodes. Mean force: sum over all contacts at the "
+    "end of a control step, mean over all steps. Mean contact force: largest single "
+    "contact at the end of a control step, mean over the steps with contact. Max "
+    "force: largest single contact at the end of any control step. Peak force: the "
+    "same in any physics step. Safe success: the goal reached while the sum over all "
+    "contacts stays at or below a limit in every physics step."
+)
+_NEARLY_ONE = (
+    " Success without interval: the episodes differ only by 1 mm of the start; "
+    "`--protocol varied` plays distinct conditions."
+)
 
 
 def evaluate(
@@ -47,7 +61,7 @@ def evaluate(
     /,
     task: PolicysTask = None,
     episodes: int | None = None,
-    seed: int = EVALUATION_SEED,
+    seed: int = evaluation.EVALUATION_SEED,
     protocol: Literal["published", "varied"] = "published",
     out: Path | None = None,
     baseline: bool = True,
@@ -78,7 +92,7 @@ def evaluate(
     bounds.choice("task", task, suite.SUITE)
     contacts = evaluation.ContactLog()
 
-    def play(who: Any, out_dir: Path | None = None) -> evaluation.EvaluationResult:
+    def play(who: Any, out_dir: Path | None = None) -> EvaluationResult:
         name = getattr(who, "name", who)
         with progress_bar(name, " steps", delay=LINE_INTERVAL) as bar:
 
@@ -106,10 +120,75 @@ def evaluate(
         # No figure of a policy has a bar to keep.
         print_json({"checks": [], **values})
         return 0
-    tables.print_results(*results.values())
+    print_results(*results.values())
     if report:
-        tables.print_episodes(results["policy"])
+        print_episodes(results["policy"])
     return 0
+
+
+def print_results(*results: EvaluationResult) -> None:
+    """Print figures of evaluations of one task side by side."""
+    first, columns = results[0], [_figures(result) for result in results]
+    title = f"{first.task}, seeds from {first.seeds[0]}"
+    caption = _CAPTION + _NEARLY_ONE * (not first.distinct)
+    heads = ("policy", *(result.policy for result in results))
+    table = Table(*heads, title=title, caption=caption, caption_justify="left")
+    for name in columns[0]:
+        table.add_row(name, *(column[name] for column in columns))
+    Console().print(table)
+
+
+def _figures(result: EvaluationResult) -> dict[str, str]:
+    summary = result.summary()
+    success = f"{100 * summary['success']:.0f} %"
+    if summary["success_ci95"] is not None:
+        low, high = (round(100 * bound) for bound in summary["success_ci95"])
+        success += f" ({low}–{high})"
+    forces = {name: result.mean_sd(f"forces.{name}") for name in FIGURES}
+    safe = summary["safe_success"].items()
+    return {
+        "reward": f"{summary['reward']:.1f} ± {summary['reward_sd']:.1f}",
+        "steps": f"{summary['length']:.0f} ± {summary['length_sd']:.0f}",
+        **{f"{n.replace('_', ' ')}, mN": millinewtons(*f) for n, f in forces.items()},
+        "success": success,
+        **{f"safe success, {limit}": f"{100 * rate:.0f} %" for limit, rate in safe},
+    }
+
+
+def print_episodes(result: EvaluationResult) -> None:
+    """Print what was played and how each episode ended: task, model, outcome."""
+    settings = result.settings
+    chosen = ", ".join(f"{k}={v}" for k, v in settings["task_kwargs"].items())
+    title = (
+        f"task {result.task}, protocol {settings['protocol']}; model: "
+        f"cathsim_dmc {__version__}, {chosen or 'options of the task'}"
+    )
+    drawn = result.conditions or ({},) * len(result.episodes)
+    played = zip(result.seeds, drawn, result.episodes, strict=True)
+    rows = [_outcome(*each) for each in played]
+    table = Table(*rows[0], title=title)
+    for row in rows:
+        table.add_row(*row.values())
+    # A pipe has no width that the columns would have to fit.
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
+
+
+def _outcome(
+    seed: int, conditions: Mapping[str, Any], episode: EpisodeOutcome
+) -> dict[str, str]:
+    end = "goal reached" if episode.success else "out of time"
+    forces = episode.forces
+    return {
+        "seed": str(seed),
+        "arch": str(conditions.get("arch", "–")),
+        "device": str(conditions.get("device", "–")),
+        "end": "physics error" if episode.physics_error else end,
+        "time, s": f"{episode.length * CONTROL_TIMESTEP:.1f}",
+        "path ratio": f"{episode.path_ratio:.2f}",
+        "mean force, mN": millinewtons(forces.mean_force),
+        "peak force, mN": millinewtons(forces.peak_force),
+        "largest sum, N": f"{forces.peak_sum.maximum:.2f}" if forces.peak_sum else "–",
+    }
 
 
 def submit(
@@ -140,7 +219,7 @@ def record(
     out: Path | None = None,
     gif: Path | None = None,
     task: PolicysTask = None,
-    seed: int = EVALUATION_SEED,
+    seed: int = evaluation.EVALUATION_SEED,
     fluoroscopy: bool = True,
     *,
     options: Annotated[
@@ -215,17 +294,11 @@ def demos(
         seed: Seed of the first episode; the others count up.
         options: Options of the task.
     """
+    names = observation if len(observation) != 1 else observation[0]
     done = agents.record_demonstrations(
-        task,
-        out,
-        episodes,
-        observation=observation if len(observation) != 1 else observation[0],
-        seed=seed,
-        noise=noise,
-        task_kwargs=options.given,
-        num_threads=threads,
-        say=lambda text: print(text, file=sys.stderr, flush=True),
-    )
+        task, out, episodes, observation=names, seed=seed, noise=noise,
+        task_kwargs=options.given, num_threads=threads, say=say,
+    )  # fmt: skip
     if json:
         print_json({**vars(done), "path": str(done.path)})
         return 0
@@ -259,15 +332,8 @@ def play(
             a checkpoint, or name of a policy, such as "pretrained:type1_bca".
         options: Options of the task.
     """
-    written = by_hand.play(
-        task,
-        out,
-        seed=seed,
-        episodes=episodes,
-        speed=speed,
-        task_kwargs=options.given,
-        policy=agents.load_policy(policy, seed) if policy else None,
-    )
-    for path in written:
+    player = agents.load_policy(policy, seed) if policy else None
+    how: Any = {"seed": seed, "episodes": episodes, "speed": speed, "policy": player}
+    for path in by_hand.play(task, out, task_kwargs=options.given, **how):
         print(path)
     return 0

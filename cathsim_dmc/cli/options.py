@@ -1,6 +1,7 @@
 """Options, exit codes and printing that several commands share."""
 
 import json
+import sys
 from typing import Annotated, Any
 
 from tyro import conf
@@ -14,6 +15,11 @@ Task = Annotated[str, conf.Positional, conf.arg(help=_TASK)]
 Json = Annotated[bool, conf.arg(help="Whether to print one JSON object alone.")]
 _THREADS = "Number of threads of the simulation; one per core by default."
 Threads = Annotated[int | None, conf.arg(help=_THREADS)]
+
+
+def say(text: str) -> None:
+    """Print a line of progress on standard error."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def print_json(values: Any) -> None:

@@ -14,7 +14,7 @@ from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.places import describe
 from cathsim_dmc.anatomy.tree_file import read_tree
-from cathsim_dmc.cli.options import Json, print_json, show
+from cathsim_dmc.cli.options import Json, print_json, say, show
 from cathsim_dmc.pictures.figure import anatomy_figure
 
 phantoms = SubcommandApp()
@@ -63,19 +63,10 @@ def import_phantom(
             )
     notes: list[str] = []
     anatomy = import_scan(
-        mesh,
-        centreline,
-        units=units,
-        mesh_frame=frame,
-        axes=axes,
-        labels=label,
-        name=name or out.name,
-        inlet=inlet,
-        heart=heart,
+        mesh, centreline, units=units, mesh_frame=frame, axes=axes, labels=label,
+        name=name or out.name, inlet=inlet, heart=heart, progress=say, notes=notes,
         rename={old: new for old, _, new in changes},
-        progress=lambda text: print(text, file=sys.stderr, flush=True),
-        notes=notes,
-    )
+    )  # fmt: skip
     anatomy.save(out)
     style.save(anatomy_figure(anatomy), out / _PICTURE)
     files = {"directory": str(out), "picture": str(out / _PICTURE), "notes": notes}
@@ -85,10 +76,7 @@ def import_phantom(
 
 @phantoms.command
 def build(
-    tree: Annotated[Path, conf.Positional],
-    /,
-    out: Path,
-    access: str | None = None,
+    tree: Annotated[Path, conf.Positional], /, out: Path, access: str | None = None
 ) -> int:
     """Build an anatomy around centrelines.
 

@@ -1,12 +1,11 @@
 """`cathsim dataset` and `replay`."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 from tyro import conf
 
-from cathsim_dmc.cli.options import Json, print_json
+from cathsim_dmc.cli.options import Json, print_json, say
 from cathsim_dmc.recording import viewer
 from cathsim_dmc.recording.image_set import ImageSetOptions, write
 
@@ -26,12 +25,7 @@ def dataset(
         processes: Number of processes; one per core by default.
         options: Content of the data set.
     """
-    done = write(
-        out,
-        options,
-        processes=processes,
-        say=lambda text: print(text, file=sys.stderr, flush=True),
-    )
+    done = write(out, options, processes=processes, say=say)
     if json:
         print_json(done)
         return 0
@@ -41,10 +35,7 @@ def dataset(
 
 
 def replay(
-    recording: Annotated[Path, conf.Positional],
-    /,
-    web: bool = False,
-    port: int = 9090,
+    recording: Annotated[Path, conf.Positional], /, web: bool = False, port: int = 9090
 ) -> int:
     """Open a recording in the Rerun viewer.
 

@@ -15,6 +15,7 @@ from tyro import conf
 # torchrl goes before dm_control.
 from cathsim_dmc import agents  # isort: skip
 
+from cathsim_dmc import files
 from cathsim_dmc.agents.learners import config_from_dict
 from cathsim_dmc.cli.options import INTERRUPTED
 from cathsim_dmc.cli.task_options import field_helps, task_kind
@@ -54,16 +55,15 @@ def command(arguments: list[str]) -> Any:
             algorithm or preset.
     """
     settings, resumed = _settings(arguments)
-    kinds = {"settings": _setting_kind(settings), "options": task_kind(vars(settings))}
+    own, others = _setting_kind(settings), task_kind(vars(settings))
     name = conf.arg(help="Task of `cathsim list`.", metavar="TASK")
     task = dataclasses.field(default=settings.task if resumed else dataclasses.MISSING)
     fields: list[tuple[str, Any, Any]] = [
         ("task", conf.Positional[Annotated[str, name]], task),
         ("run", Annotated[_Run, conf.arg(name="")], dataclasses.field()),
+        ("settings", Annotated[own, conf.arg(name="")], own()),
+        ("options", Annotated[others, conf.arg(name="task")], others()),
     ]
-    for group, kind in kinds.items():
-        shown = Annotated[kind, conf.arg(name="" if group == "settings" else "task")]
-        fields.append((group, shown, dataclasses.field(default_factory=kind)))
     options = dataclasses.make_dataclass("Train", fields, kw_only=True, frozen=True)
 
     def train(options: Any) -> int:
@@ -72,7 +72,24 @@ def command(arguments: list[str]) -> Any:
         The defaults of the settings are those of the algorithm and preset chosen; a run
         that is resumed keeps its own.
         """
-        return _train(options, settings)
+        run = options.run
+        config = settings.replace(
+            task=options.task,
+            **vars(options.settings),
+            task_kwargs={**settings.task_kwargs, **options.options.given},
+        )
+        how = {"resume": run.resume, "without_replay": run.without_replay}
+        result = agents.train(config, run.out, progress=not run.quiet, **how)
+        if result.interrupted:
+            again = ["cathsim", "train", config.task, "--out", str(run.out), "--resume"]
+            print(
+                f"interrupted after {result.frames} of {config.total_frames} frames, "
+                f"which are saved; go on with: {shlex.join(again)}",
+                file=sys.stderr,
+            )
+            return INTERRUPTED
+        print(f"{result.frames} frames in {result.seconds:.0f} s: {result.checkpoint}")
+        return 0
 
     # The class of the options is made here, so no annotation can name it.
     train.__annotations__["options"] = Annotated[options, conf.arg(name="")]
@@ -89,17 +106,14 @@ def _settings(arguments: list[str]) -> tuple[agents.TrainingConfig, bool]:
     found, _ = parser.parse_known_args(arguments)
     path = Path(found.out or ".") / "config.json"
     if found.resume and found.out and not found.preset and path.is_file():
-        try:
+        text = f"{path} holds no settings of a run"
+        with files.refused(ValueError, text, ValueError, TypeError):
             config = config_from_dict(dict(json.loads(path.read_text())))
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"{path} holds no settings of a run: {error}") from error
         if found.algo in (None, config.algorithm):
             return config, True
-    chosen = (
-        _Run.algo if found.algo is None else found.algo,
-        _Run.preset if found.preset is None else found.preset,
-    )
-    return agents.make_config(*chosen), False
+    given = {"algorithm": found.algo, "preset": found.preset}.items()
+    chosen = {name: value for name, value in given if value is not None}
+    return agents.make_config(**chosen), False
 
 
 def _setting_kind(settings: agents.TrainingConfig) -> type:
@@ -113,29 +127,3 @@ def _setting_kind(settings: agents.TrainingConfig) -> type:
         field = dataclasses.field(default_factory=default)
         fields.append((item.name, Annotated[item.type, about], field))
     return dataclasses.make_dataclass("Settings", fields, kw_only=True, frozen=True)
-
-
-def _train(options: Any, settings: agents.TrainingConfig) -> int:
-    run = options.run
-    config = settings.replace(
-        task=options.task,
-        **vars(options.settings),
-        task_kwargs={**settings.task_kwargs, **options.options.given},
-    )
-    result = agents.train(
-        config,
-        run.out,
-        resume=run.resume,
-        progress=not run.quiet,
-        without_replay=run.without_replay,
-    )
-    if result.interrupted:
-        again = ["cathsim", "train", config.task, "--out", str(run.out), "--resume"]
-        print(
-            f"interrupted after {result.frames} of {config.total_frames} frames, which "
-            f"are saved; go on with: {shlex.join(again)}",
-            file=sys.stderr,
-        )
-        return INTERRUPTED
-    print(f"{result.frames} frames in {result.seconds:.0f} s: {result.checkpoint}")
-    return 0

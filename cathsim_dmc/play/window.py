@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc import files
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.play.controls import Controls
 
@@ -36,18 +37,12 @@ class FluoroscopyWindow:
         Raises:
             ValueError: if there is no Tk or no display.
         """
-        try:
+        text = "the fluoroscopy window needs tkinter; install your system's python3-tk"
+        with files.refused(ValueError, text, ImportError):
             import tkinter as tk
-        except ImportError as error:
-            raise ValueError(
-                "the fluoroscopy window needs tkinter; install your system's python3-tk"
-            ) from error
-        try:
+        text = "no window can be opened; set DISPLAY, or run under xvfb-run"
+        with files.refused(ValueError, text, tk.TclError):
             root = tk.Tk(className="cathsim")
-        except tk.TclError as error:
-            raise ValueError(
-                f"no window can be opened ({error}); set DISPLAY, or run under xvfb-run"
-            ) from error
         self._tk, self._root, self._controls = tk, root, controls
         self._planes = _planes(task)
         self._random = np.random.RandomState(0)
@@ -104,11 +99,9 @@ class FluoroscopyWindow:
             self._screen.create_oval(*box, outline="green2")
         self._panel.delete("all")
         for row, (name, value) in enumerate([*lines_of(task), (message, "")]):
-            y = 24 * (row + 1)
-            self._panel.create_text(14, y, text=name, fill="grey70", anchor="w")
-            self._panel.create_text(
-                _PANEL - 14, y, text=value, fill="white", anchor="e"
-            )
+            y, write = 24 * (row + 1), self._panel.create_text
+            write(14, y, text=name, fill="grey70", anchor="w")
+            write(_PANEL - 14, y, text=value, fill="white", anchor="e")
         self.poll()
         while (left := until - time.monotonic()) > 0:
             time.sleep(min(left, 0.005))

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
+from cathsim_dmc import bounds
 from cathsim_dmc.policies.expert import ExpertPolicy, Teacher
-from cathsim_dmc.policies.policy import Policy, in_environment
+from cathsim_dmc.policies.policy import Policy, View, in_environment
 from cathsim_dmc.policies.scripted import Curl, Idle, Push, Random, RandomCurl
-from cathsim_dmc.policies.view import View
 
 # Policies by name: a new one is a class and a line here.
 POLICIES: dict[str, Callable[[int], Policy]] = {
@@ -28,16 +28,7 @@ def make_policy(name: str, seed: int = 0) -> Policy:
     Raises:
         ValueError: there is none of that name; lists those that exist.
     """
-    if name not in POLICIES:
-        raise ValueError(f"no policy {name!r}; there are {', '.join(POLICIES)}")
-    return POLICIES[name](seed)
+    return POLICIES[bounds.choice("policy", name, POLICIES)](seed)
 
 
-__all__ = [
-    "POLICIES",
-    "Policy",
-    "Teacher",
-    "View",
-    "in_environment",
-    "make_policy",
-]
+__all__ = ["POLICIES", "Policy", "Teacher", "View", "in_environment", "make_policy"]

@@ -100,17 +100,10 @@ class State(NamedTuple):
     @classmethod
     def fresh(cls, shape: tuple[int, ...], joints: int = 0) -> "State":
         """State (...) at the start of an episode, of a tip of so many joints."""
-        unknown, no, zero = (
-            np.full(shape, np.nan),
-            np.zeros(shape, bool),
-            np.zeros(shape),
-        )
-        none = np.zeros(shape, int)
-        counts = none, none, none
-        return cls(
-            *(unknown, no, no, zero, zero, zero, *counts, unknown),
-            bend=np.zeros((*shape, joints, 2)),
-        )
+        unknown, zero = np.full(shape, np.nan), np.zeros(shape)
+        no, none = np.zeros(shape, bool), np.zeros(shape, int)
+        counts, bend = (none, none, none), np.zeros((*shape, joints, 2))
+        return cls(unknown, no, no, zero, zero, zero, *counts, unknown, bend)
 
 
 def aim(

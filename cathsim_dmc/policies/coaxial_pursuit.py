@@ -31,13 +31,8 @@ from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
-from cathsim_dmc.policies.attempts import (
-    AttemptSettings,
-    State,
-    advance,
-    aim,
-    translation,
-)
+from cathsim_dmc.policies import attempts
+from cathsim_dmc.policies.attempts import AttemptSettings, State
 from cathsim_dmc.policies.pursuit import turned
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
@@ -116,7 +111,6 @@ class CoaxialPlan(Route):
 
     def told(self, state: State, action: np.ndarray) -> State:
         """The memory as it is, which no action is part of."""
-        del action
         return state
 
     def decide(
@@ -137,11 +131,11 @@ class CoaxialPlan(Route):
         Returns:
             Action (N, 2 K) in [-1, 1] and the new state.
         """
-        place, ahead = aim(self, settings, state, readings.head)
+        place, ahead = attempts.aim(self, settings, state, readings.head)
         error, away = _directions(self, readings, devices, place, ahead)
         offsets = np.asarray(settings.offsets)
         error = error + offsets[state.attempts % len(offsets)][:, None]
-        state = advance(settings, state, place, readings.insertion)
+        state = attempts.advance(settings, state, place, readings.insertion)
         turns = away > settings.aside
         action = np.zeros((len(error), 2 * error.shape[1]))
         rate = settings.turning * np.angle(np.exp(1j * error)) / _TURN
@@ -149,7 +143,7 @@ class CoaxialPlan(Route):
         leader = devices.insertion.argmax(axis=1)[:, None]
         looks = np.where(turns, np.cos(error), 1.0)
         cosine = np.take_along_axis(looks, leader, axis=1)[:, 0]
-        speed = translation(settings, state, wall_force.max, cosine)
+        speed = attempts.translation(settings, state, wall_force.max, cosine)
         deep = np.maximum(place.arc_length - self.ostium, 0.0)
         action[:, 0::2] = _led(settings, state, devices.insertion, speed, deep)
         return np.clip(action, -1.0, 1.0), state
@@ -162,10 +156,7 @@ def _led(
     speed: np.ndarray,
     deep: np.ndarray,
 ) -> np.ndarray:
-    """Translations (N, K) that keep the devices at their leads.
-
-    A wire that leads goes on alone when it is deep (N,), m, in the last branch.
-    """
+    """Translations (N, K) at the leads; a leading wire deep in a branch goes alone."""
     leads = np.asarray(settings.leads)
     lead = leads[state.attempts % len(leads)]
     lead = np.where(lead > 0.0, np.maximum(lead, deep), lead)[:, None]
@@ -183,12 +174,7 @@ def _directions(
     place: Place,
     ahead: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """By what angles the ends of the devices look past the route, and it bends away.
-
-    Returns:
-        Rotation (N, K) that would turn the side of each device to the route, and angle
-        (N, K) from the link before its shaped end to a point of the route ahead, rad.
-    """
+    """Rotations (N, K) of the ends to the route, and its bends (N, K) away, rad."""
     insertion = devices.insertion
     gaps = insertion.max(axis=1, keepdims=True) - insertion
     rows, last = np.arange(len(gaps)), len(plan.nodes) - 2
@@ -209,13 +195,7 @@ def _directions(
 
 
 def _before(frame: np.ndarray, joints: np.ndarray, number: int) -> np.ndarray:
-    """Frames (N, 3, 3) of the links before those of some frames.
-
-    Args:
-        frame: (N, 3, 3), of the links that are the `number`-th from the end.
-        joints: (N, J), `Readings.joint_positions`: in each joint x before y.
-        number: 1 for the last link.
-    """
+    """Frames (N, 3, 3) of the links before given ones, `number`-th from the end."""
     place = joints.shape[1] // 2 - number  # of the joint; two slides precede it
     for axis in (1, 0) if posture.x_first(place) else (0, 1):
         frame = turned(frame, axis, -joints[:, -2 * number + axis])

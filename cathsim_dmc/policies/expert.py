@@ -12,9 +12,8 @@ import numpy as np
 from cathsim_dmc.physics.readings import merged, part
 from cathsim_dmc.policies.attempts import State
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
-from cathsim_dmc.policies.policy import Policy
+from cathsim_dmc.policies.policy import Policy, View
 from cathsim_dmc.policies.pursuit import Plan
-from cathsim_dmc.policies.view import View
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.route import locate
 
@@ -52,11 +51,7 @@ class ExpertPolicy(Policy):
     state: State
 
     def __init__(self, seed: int = 0):
-        """Starts before the first episode.
-
-        Args:
-            seed: Not used: the expert draws no random numbers.
-        """
+        """Starts before the first episode; the expert draws no random numbers."""
         self._plans: _Plans | None = None
 
     def reset(self, view: View, which: np.ndarray) -> None:
@@ -82,11 +77,7 @@ class ExpertPolicy(Policy):
         return action
 
     def follow(self, action: np.ndarray) -> None:
-        """Replace the last actions by those that were carried out.
-
-        Args:
-            action: (N, A) in [-1, 1].
-        """
+        """Replace the last actions by those carried out, (N, A) in [-1, 1]."""
         self.state = self._plan.told(self.state, action)
 
 
@@ -109,21 +100,15 @@ class Teacher:
                 reaches the left common carotid of Type I without retries; the
                 brachiocephalic artery of Type II takes -0.02, the catheter first.
         """
-        self._plans, self._insertion = (
-            _Plans(view),
-            np.full(view.num_simulations, np.nan),
-        )
+        self._plans = _Plans(view)
+        self._insertion = np.full(view.num_simulations, np.nan)
         # A longer look-ahead than the expert's needs no retry.
         self._coaxial = CoaxialSettings(
             leads=(lead,), offsets=(0.0,), lookahead_factors=(1.4,)
         )
 
     def reset(self, which: np.ndarray) -> None:
-        """Forgets the simulations that begin a new episode.
-
-        Args:
-            which: (N,) bool.
-        """
+        """Forgets the simulations, (N,) bool, that begin a new episode."""
         self._insertion[which] = np.nan
 
     def act(self, last_action: np.ndarray) -> np.ndarray:

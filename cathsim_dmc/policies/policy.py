@@ -1,4 +1,4 @@
-"""Base class of all policies."""
+"""Base class of all policies, and what they may see of the simulations."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -7,7 +7,31 @@ import dm_env
 import numpy as np
 from dm_control import composer
 
-from cathsim_dmc.policies.view import View
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.rollout import Rollout
+
+
+class View:
+    """N simulations of one task: those of a batch, or a composer environment.
+
+    Attributes:
+        num_simulations: N.
+        num_actions: Number A of entries of an action.
+        task: The task that all of them run.
+    """
+
+    def __init__(self, simulations: BatchSimulation | composer.Environment):
+        """Takes simulations; they need no episode yet."""
+        batched = isinstance(simulations, BatchSimulation)
+        self.task = simulations.task
+        self.num_simulations = simulations.num_simulations if batched else 1
+        self.num_actions: int = self.task.num_actions
+        self._stepped = simulations if batched else self.task
+
+    @property
+    def rollout(self) -> Rollout:
+        """What is measured of them; arrays (N, ...), see `tasks.rollout.Rollout`."""
+        return self._stepped.rollout
 
 
 class Policy:

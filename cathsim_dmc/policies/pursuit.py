@@ -24,13 +24,8 @@ import numpy as np
 from cathsim_dmc.entities import devices
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
-from cathsim_dmc.policies.attempts import (
-    AttemptSettings,
-    State,
-    advance,
-    aim,
-    translation,
-)
+from cathsim_dmc.policies import attempts
+from cathsim_dmc.policies.attempts import AttemptSettings, State
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.route import Route
 
@@ -86,17 +81,14 @@ class Plan(Route):
                 f"device {catheter.device.name!r} has no motors in its tip, so the "
                 f"expert cannot steer it; choose one of {', '.join(steerable)}"
             )
-        hinges, numbers = [], {}
         columns = {joint.name: n for n, joint in enumerate(catheter.joints)}
-        for joint in catheter.mjcf_model.find_all("joint"):
-            if joint.type == "slide":
-                continue
-            numbers[joint.name] = len(hinges)
-            hinges.append((columns[joint.name], int(np.argmax(joint.axis))))
+        found = catheter.mjcf_model.find_all("joint")
+        axes = {j.name: int(np.argmax(j.axis)) for j in found if j.type != "slide"}
+        numbers = {name: number for number, name in enumerate(axes)}
         motors = [numbers[motor.joint.name] for motor in catheter.tip_motors]
         return cls(
             **vars(Route.of(case.objective)),
-            hinges=tuple(hinges),
+            hinges=tuple((columns[name], axis) for name, axis in axes.items()),
             tip=np.array(motors).reshape(-1, 2),
             steering_angle=catheter.device.steering_angle,
             link_length=float(catheter.link_lengths[-1]),
@@ -131,45 +123,39 @@ class Plan(Route):
         Returns:
             Action (..., A) in [-1, 1] and the new state.
         """
-        place, way = aim(self, settings, state, readings.head)
-        joints, frame = readings.joint_positions, readings.head_frame
-        axes, direction = tip_frames(self, joints, frame)
+        place, way = attempts.aim(self, settings, state, readings.head)
+        axes, direction = tip_frames(self, readings)
         target = self.at(place.arc_length + way)
         turn, cosine = _rotation_to(direction, target - readings.head)
         bend = _follow_the_leader(self, state, readings.insertion)
         bend = bend + _correction(settings, axes, turn)
         bend = np.clip(bend, -self.steering_angle, self.steering_angle)
-        state = advance(settings, state, place, readings.insertion)
-        speed = translation(settings, state, wall_force.max, cosine)
+        state = attempts.advance(settings, state, place, readings.insertion)
+        speed = attempts.translation(settings, state, wall_force.max, cosine)
         action = np.zeros((*speed.shape, self.num_actions))
         motors = self.tip.size
-        told = (bend / self.steering_angle).reshape(*speed.shape, -1)
-        action[..., :motors], action[..., motors] = told, speed
+        action[..., :motors] = (bend / self.steering_angle).reshape(*speed.shape, -1)
+        action[..., motors] = speed
         insertion = np.array(readings.insertion)
         return action, state._replace(bend=bend, insertion=insertion)
 
 
-def tip_frames(
-    plan: Plan, joints: np.ndarray, head: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def tip_frames(plan: Plan, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """Hinge axes of the tip and direction of the head, world frame.
 
     They are found from the head backwards, so they hold for any roll of the device.
 
-    Args:
-        joints: (..., J), `Readings.joint_positions`.
-        head: (..., 3, 3), `Readings.head_frame`.
-
     Returns:
         Axes (..., M, 2, 3) of the x and y hinges of the tip and direction (..., 3).
     """
-    first, frame = plan.tip.min(), head
+    first, frame = plan.tip.min(), readings.head_frame
+    joints, direction = readings.joint_positions, frame[..., 2]
     axes = []
     for column, axis in reversed(plan.hinges[first:]):
         axes.append(frame[..., axis])
         frame = turned(frame, axis, -joints[..., column])
     stacked = np.stack(axes[::-1], axis=-2)
-    return stacked[..., plan.tip - first, :], head[..., 2]
+    return stacked[..., plan.tip - first, :], direction
 
 
 def _rotation_to(direction: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.policies.policy import Policy
-from cathsim_dmc.policies.view import View
+from cathsim_dmc.policies.policy import Policy, View
 
 
 class _Scripted(Policy):
@@ -65,26 +64,23 @@ class RandomCurl(_Scripted):
 class Idle(_Scripted):
     """No push, tip motors at rest."""
 
-    name = "idle"
-
-
-class Push(_Scripted):
-    """Full push, tip motors at rest."""
-
-    name = "push"
+    name, push, bend = "idle", 0.0, 0.0
 
     def reset(self, view: View, which: np.ndarray) -> None:
-        """Look up which entries of an action push."""
+        """Look up which entries of an action push, and bend the tip about x."""
         super().reset(view, which)
-        self._action[:, view.task.scene.catheter.translations] = 1.0
+        catheter = view.task.scene.catheter
+        self._action[:, catheter.translations] = self.push
+        self._action[:, 0 : len(catheter.tip_motors) : 2] = self.bend
+
+
+class Push(Idle):
+    """Full push, tip motors at rest."""
+
+    name, push = "push", 1.0
 
 
 class Curl(Push):
     """Full push, the tip bent as far as it goes: the device jams."""
 
-    name = "curl"
-
-    def reset(self, view: View, which: np.ndarray) -> None:
-        """Look up which entries of an action bend the tip about x."""
-        super().reset(view, which)
-        self._action[:, 0 : len(view.task.scene.catheter.tip_motors) : 2] = 1.0
+    name, bend = "curl", 1.0

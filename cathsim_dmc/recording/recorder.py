@@ -15,7 +15,7 @@ from dm_control.rl import control
 from cathsim_dmc import __version__, bounds
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.records import DEVICE_SERIES, device_meta, vessel_state
-from cathsim_dmc.simulation.episodes import ComposerSimulation, play
+from cathsim_dmc.simulation.episodes import play_alone
 
 Policy = Callable[[Any], np.ndarray]
 _TERM = "reward_"  # before the names of reward terms
@@ -90,13 +90,13 @@ class EpisodeRecorder:
         if seed is not None:
             self._env.random_state.seed(seed)
         choose = functools.partial(self._action, policy)
-        turns = play(ComposerSimulation(self._env), choose)
+        turns = play_alone(self._env, choose)
         next(turns)
         rows = _Rows(list)
         rows.add(**self._state())
         steps, end = 0, {"termination": None, "discount": 1.0}
         try:
-            for action, timestep, _ in itertools.islice(turns, max_steps):
+            for action, timestep in itertools.islice(turns, max_steps):
                 termination = self._task.termination
                 end = {"termination": termination, "discount": timestep.discount}
                 # The environment itself ends an episode by diverged physics, discount

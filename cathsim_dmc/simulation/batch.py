@@ -27,18 +27,10 @@ from cathsim_dmc.tasks.step import Step
 # What composer calls on a task; the batch steps the rollout instead, so a task that
 # overrides one of these would mean something else here.
 _HOOKS = (
-    "initialize_episode_mjcf",
-    "initialize_episode",
-    "before_step",
-    "before_substep",
-    "after_substep",
-    "after_step",
-    "get_reward",
-    "get_discount",
+    "initialize_episode_mjcf", "initialize_episode", "before_step", "before_substep",
+    "after_substep", "after_step", "get_reward", "get_discount",
     "should_terminate_episode",
-)
-
-
+)  # fmt: skip
 _ALIVE: weakref.WeakSet["BatchSimulation"] = weakref.WeakSet()
 
 
@@ -161,7 +153,7 @@ class BatchSimulation:
         self.stepper.run()
         return _own(self.rollout.finish())
 
-    def _refuse_fork(self):
+    def _refuse_fork(self) -> None:
         if os.getpid() != self._process:
             raise RuntimeError(
                 "the process has forked, and a fork has no threads of the batch; make "
@@ -242,18 +234,16 @@ class _BatchStepper(Stepper):
 
 
 class _PoolStepper(_BatchStepper):
-    """Simulations each in the anatomy that it has drawn."""
+    """Simulations each in the anatomy that it has drawn.
+
+    Where episodes write into a model each simulation has its own; those that have
+    drawn one anatomy share one otherwise.
+    """
 
     def __init__(self, task: Navigation, *arguments):
-        """Makes the models.
-
-        Where episodes write into a model each simulation has its own; those that have
-        drawn one anatomy share one otherwise.
-        """
-        own = any(effect.model_fields for effect in task.effects)
         super().__init__(task, *arguments)
         model = self.batch.model
-        self._own = own
+        self._own = own = any(effect.model_fields for effect in task.effects)
         self._models = [copy.copy(model) if own else model for _ in self.rows]
         self._loaded: dict[int | Case, Any] = {}
 

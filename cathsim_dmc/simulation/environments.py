@@ -5,15 +5,8 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torchrl import envs
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import (
-    Compose,
-    DoubleToFloat,
-    EnvBase,
-    StepCounter,
-    Transform,
-    TransformedEnv,
-)
 
 # All numeric entries of an observation, concatenated in the order of their names.
 # Not called "state": TorchRL gives that name a meaning of its own.
@@ -30,7 +23,7 @@ def make_env(
     num_threads: int | None = None,
     seed: int | Sequence[int] = 0,
     task_kwargs: Mapping[str, Any] | None = None,
-) -> EnvBase:
+) -> envs.EnvBase:
     """A seeded environment of batch size [num_envs] whose observations are standard.
 
     Args:
@@ -49,14 +42,8 @@ def make_env(
     # Imported late: importing this module must not load MuJoCo.
     from cathsim_dmc.simulation.torchrl import BatchedEnv
 
-    env = BatchedEnv(
-        task,
-        num_envs,
-        num_threads=num_threads,
-        seed=seed,
-        observation=observation,
-        task_kwargs=task_kwargs,
-    )
+    options: Any = {"observation": observation, "task_kwargs": task_kwargs}
+    env = BatchedEnv(task, num_envs, num_threads=num_threads, seed=seed, **options)
     return standard_observations(env)
 
 
@@ -81,7 +68,7 @@ def standard(
     return seen
 
 
-class StandardObservation(Transform):
+class StandardObservation(envs.Transform):
     """Replaces entries of the observation of an environment as `standard` does."""
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -108,7 +95,7 @@ class StandardObservation(Transform):
         return observation_spec
 
 
-def standard_observations(env: EnvBase) -> TransformedEnv:
+def standard_observations(env: envs.EnvBase) -> envs.TransformedEnv:
     """An environment whose observation is VECTOR and/or PIXELS, see `standard`.
 
     Nested entries (forces and other information) are no part of the observation and
@@ -118,4 +105,5 @@ def standard_observations(env: EnvBase) -> TransformedEnv:
     keys = [name for name, leaf in spec.items() if not isinstance(leaf, Composite)]
     seen = standard({key: spec[key].zero() for key in keys}, batch)
     observe = StandardObservation(in_keys=keys, out_keys=list(seen))
-    return TransformedEnv(env, Compose(DoubleToFloat(), observe, StepCounter()))
+    steps = envs.DoubleToFloat(), observe, envs.StepCounter()
+    return envs.TransformedEnv(env, envs.Compose(*steps))

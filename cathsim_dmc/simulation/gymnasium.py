@@ -85,7 +85,7 @@ class CathSimEnv(gymnasium.Env):
         self.observation_space = space_of(entries, self._dtype)
         self.action_space = space(self.environment.action_spec(), self._dtype)
         self._machines: dict[Surface, angiograph.Angiograph] = {}
-        self._begun, self._ended = False, True
+        self._ended: bool | None = None  # before the first episode
         self._closed = False
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
@@ -94,26 +94,22 @@ class CathSimEnv(gymnasium.Env):
         if seed is not None:
             self.environment.random_state.seed(seed)
         timestep = self.environment.reset()
-        self._begun, self._ended = True, False
+        self._ended = False
         info = self.environment.task.info()
         return _converted(timestep.observation, self._dtype), info
 
     def step(self, action: np.ndarray):
         """Advances by one control step; see `gymnasium.Env.step`."""
-        if self._ended:
+        if self._ended is not False:
             raise gymnasium.error.ResetNeeded(
                 "the episode has ended, or none has begun; call reset()"
             )
         timestep = self.environment.step(action)
         self._ended = timestep.last()
         terminated = self._ended and timestep.discount == 0
-        return (
-            _converted(timestep.observation, self._dtype),
-            float(timestep.reward),
-            terminated,
-            self._ended and not terminated,
-            self.environment.task.info(),
-        )
+        observation = _converted(timestep.observation, self._dtype)
+        reward, truncated = float(timestep.reward), self._ended and not terminated
+        return observation, reward, terminated, truncated, self.environment.task.info()
 
     def render(self) -> np.ndarray | None:
         """Fluoroscopy (rows, columns, 3) uint8, two planes side by side."""
@@ -122,7 +118,7 @@ class CathSimEnv(gymnasium.Env):
                 'render() without a render_mode; make the environment with "rgb_array"'
             )
             return None
-        if not self._begun:
+        if self._ended is None:
             raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")
         task = self.environment.task
         surface, rollout = task.scene.anatomy.surface, task.rollout

@@ -12,7 +12,6 @@ from torchrl.envs import EnvBase
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.step import Step
 
 
@@ -55,10 +54,7 @@ class BatchedEnv(EnvBase):
             seeds=seed,
         )
         super().__init__(device="cpu", batch_size=[num_envs])
-        self._make_specs(self.simulation.task)
-
-    def _make_specs(self, task: Navigation) -> None:
-        shape = self.batch_size
+        task, shape = self.simulation.task, self.batch_size
         entries = {k: _spec(spec, shape) for k, spec in task.observation_specs.items()}
         flag = Binary(1, (*shape, 1), dtype=torch.bool)
         number = Unbounded((*shape, 1), dtype=torch.float32)
@@ -86,23 +82,15 @@ class BatchedEnv(EnvBase):
     def _step(self, tensordict: TensorDict) -> TensorDict:
         step = self.simulation.step(tensordict["action"].numpy())
         result = self._tensors(step)
-        result["reward"] = _column(step.outcome.reward, torch.float32)
-        result["terminated"] = _column(step.terminated, torch.bool)
-        result["truncated"] = _column(step.truncated, torch.bool)
+        result["reward"] = _tensor(step.outcome.reward)[:, None]
+        result["terminated"] = _tensor(step.terminated)[:, None]
+        result["truncated"] = _tensor(step.truncated)[:, None]
         result["done"] = result["terminated"] | result["truncated"]
         return result
 
     def _tensors(self, step: Step) -> TensorDict:
-        entries = {
-            key: torch.as_tensor(value)
-            if value.dtype == np.uint8
-            else torch.as_tensor(value).to(torch.float32)
-            for key, value in step.observation.items()
-        }
-        info = {
-            key: _column(value, torch.bool if value.dtype == bool else torch.float32)
-            for key, value in step.info().items()
-        }
+        entries = {key: _tensor(value) for key, value in step.observation.items()}
+        info = {key: _tensor(value)[:, None] for key, value in step.info().items()}
         entries["info"] = TensorDict(info, batch_size=self.batch_size)
         return TensorDict(entries, batch_size=self.batch_size)
 
@@ -124,5 +112,6 @@ def _spec(spec: specs.Array, batch: torch.Size) -> TensorSpec:
     return Bounded(spec.minimum.item(), spec.maximum.item(), shape, dtype=dtype)
 
 
-def _column(values: np.ndarray, dtype: torch.dtype) -> torch.Tensor:
-    return torch.as_tensor(values).to(dtype)[:, None]
+def _tensor(values: np.ndarray) -> torch.Tensor:
+    tensor = torch.as_tensor(values)
+    return tensor if tensor.dtype in (torch.uint8, torch.bool) else tensor.float()

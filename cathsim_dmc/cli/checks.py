@@ -1,16 +1,18 @@
-"""`cathsim doctor`: what is installed, and what to do about what is missing."""
+"""`cathsim doctor`, what is installed, and `cathsim validate`, the physics."""
 
+import importlib
 import os
 import platform
 import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from packaging.requirements import Requirement
+from tyro import conf
 
-from cathsim_dmc.cli.options import CHECK_FAILED, Json, print_json
+from cathsim_dmc.cli.options import CHECK_FAILED, Json, print_json, say, show
 from cathsim_dmc.collision import loops
 
 _OPENGL = "import mujoco; mujoco.GLContext(8, 8).make_current()"
@@ -81,3 +83,31 @@ def _opengl() -> Finding:
     setting = os.environ.get("MUJOCO_GL", "not set")
     found = f"{'works' if works else 'none'} (MUJOCO_GL {setting})"
     return Finding("OpenGL", found, note=advice)
+
+
+def validate(
+    part: Annotated[
+        Literal["rod", "pair", "wall", "vessel", "forces", "bench"], conf.Positional
+    ],
+    /,
+    data: Path | None = None,
+    json: Json = False,
+) -> int:
+    """Compare the physics with theory, or with measured guidewires.
+
+    Args:
+        part: Rod and drives; coaxial devices; contact with the wall and its shape;
+            flow, wall and motion of the vessel; force sensors; guidewires on a bench.
+        data: Of `bench`: folder with phantom.stl and wires.json (docs/bench.md).
+    """
+    module = "force_sensors" if part == "forces" else part
+    found = importlib.import_module(f"cathsim_dmc.validation.{module}")
+    run = getattr(found, f"validate_{part}")
+    if (data is not None) != (part == "bench"):
+        raise ValueError(
+            "`validate bench` and it alone takes --data DIR, a folder with phantom.stl "
+            "and wires.json (docs/bench.md)"
+        )
+    if part == "bench":
+        return show(run(data, say), json)
+    return show(run(), json)
