@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from dm_control import mjcf
 
-from cathsim_dmc.entities import devices
+from cathsim_dmc.entities import coaxial_loops, devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.chain import (
@@ -44,44 +44,23 @@ def published():
     return compiled()
 
 
-def link_bodies(physics):
-    model = physics.model.ptr
-    return [
-        body
-        for body in range(model.nbody)
-        if model.body(body).name.startswith("catheter/link_")
-    ]
-
-
-def capsule_inertia(mass, radius, length):
-    """Principal moments of a solid capsule whose axis has a length between centres."""
-    cylinder = math.pi * radius**2 * length
-    ball = 4 / 3 * math.pi * radius**3
-    m_cyl = mass * cylinder / (cylinder + ball)
-    m_ball = mass - m_cyl
-    axial = m_cyl * radius**2 / 2 + m_ball * 2 * radius**2 / 5
-    transverse = m_cyl * (length**2 / 12 + radius**2 / 4) + m_ball * (
-        2 * radius**2 / 5 + length**2 / 4 + 3 * length * radius / 8
-    )
-    return transverse, transverse, axial
-
-
 @pytest.mark.parametrize("name", devices.DEVICES)
 def test_masses_and_inertias_are_the_physical_ones(name):
     """composer's own arena raises masses below 1e-5 kg and inertias below 1e-11."""
     catheter, physics = compiled(name)
     device, model = catheter.device, physics.model.ptr
-    bodies = link_bodies(physics)
+    bodies = physics.bind(catheter.links).element_id
     # The device, the blood that it displaces and the blood in its lumen.
     areas = np.pi * (device.outer_radius**2 + device.inner_radius**2)
     moved = device.linear_density + BLOOD_DENSITY * areas
     masses = moved * catheter.link_lengths
     np.testing.assert_allclose(model.body_mass[bodies], masses, rtol=1e-9)
     assert model.body_mass[bodies].sum() == pytest.approx(moved * LENGTH, rel=1e-9)
-    expected = [
-        capsule_inertia(mass, device.outer_radius, length)
+    moments = [
+        coaxial_loops._inertia(mass, device.outer_radius, length)
         for mass, length in zip(masses, catheter.link_lengths, strict=True)
     ]
+    expected = [(across, across, along) for across, along in moments]
     compiled_moments = np.sort(model.body_inertia[bodies], axis=-1)[:, ::-1]
     np.testing.assert_allclose(compiled_moments, expected, rtol=1e-6)
     if name == "microcatheter_021":  # or floors would not have acted
@@ -156,7 +135,7 @@ def test_straight_device_ends_at_its_origin(published):
     catheter, physics = published
     physics.reset()
     np.testing.assert_allclose(physics.bind(catheter.head).xpos, 0, atol=1e-12)
-    bodies = link_bodies(physics)
+    bodies = physics.bind(catheter.links).element_id
     starts = physics.data.ptr.xpos[bodies]
     np.testing.assert_allclose(starts[:, :2], 0, atol=1e-12)
     np.testing.assert_allclose(

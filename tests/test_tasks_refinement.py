@@ -32,30 +32,14 @@ def test_an_impact_in_shorter_steps_is_not_as_deep(monkeypatch):
     assert _deepest(80) > deepest
 
 
-@pytest.mark.parametrize(
-    ("contact", "coarse"),
-    [
-        ((0.1, 1e-4), False),
-        ((4.9, 2.9e-4), False),
-        ((5.1, 1e-4), True),
-        ((0.1, 3.1e-4), True),
-    ],
-)
-def test_hard_and_deep_contacts_need_shorter_steps(contact, coarse):
-    force, depth = contact
-    rows = np.zeros((2, 3, 4 * forces.CONTACT_SIZE))
-    rows[1, 2, [0, 1, 4]] = 1, force, -depth
-    assert forces.too_coarse(*forces.wall_force(rows)).tolist() == [False, coarse]
-
-
 def test_what_goes_deep_in_the_last_physics_step_is_seen():
     batch = BatchSimulation(suite.make_task("type1_lcca"), 1, num_threads=1)
     batch.reset()
-    before, never = np.array([1e-4]), np.array([False])
+    before, given = np.array([1e-4]), (np.array([False]), forces.DEEPEST)
     batch.batch.qpos[:, batch.rollout.index.insertion_qpos] += 0.1
-    assert batch.stepper._depth_at_end(before.copy(), never) == before
+    assert batch.stepper._depth_at_end(before.copy(), *given) == before
     batch.batch.qvel[:, batch.rollout.index.dofs.start] = 1.0
-    assert batch.stepper._depth_at_end(before.copy(), never) > 1e-3
+    assert batch.stepper._depth_at_end(before.copy(), *given) > 1e-3
 
 
 @pytest.mark.parametrize(

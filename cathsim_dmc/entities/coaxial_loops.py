@@ -255,7 +255,6 @@ def pressure(lengths, overlap, bends, turns, axial, start, ways, coefficient, fa
     With the moment M and the compression P, the force is M'' + Pκ per length.
 
     Args:
-        lengths: (L,), of the links, m.
         axial: (K, J), see `axial`, N.
         start: (K,), compression where each device leaves the others, N.
         ways: (K - 1,) in [-1, 1], fraction of the friction that acts on device k,

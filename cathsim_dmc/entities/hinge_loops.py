@@ -95,11 +95,6 @@ def bent(angles):
 
 
 @compiled
-def _dot(one, other):
-    return one.real * other.real + one.imag * other.imag
-
-
-@compiled
 def unloaded_hinges(shape):
     """Angles (J, 2) of the hinges about x and y of the unloaded chain, rad.
 
@@ -137,7 +132,8 @@ def free_hinges(shape, compliance, angles):
         over[0] = _difference(x, y, first, _STEP, 0.0)
         over[1] = _difference(x, y, first, 0.0, _STEP)
         pull = (shape[j] - bends[j]) * unit(-twists[j])
-        free[j, 0], free[j, 1] = x + _dot(over[0], pull), y + _dot(over[1], pull)
+        free[j, 0] = x + (over[0].conjugate() * pull).real
+        free[j, 1] = y + (over[1].conjugate() * pull).real
     # Torsional moment of all beyond the joint: derivative of the energy by a twist.
     moment = 0.0
     for j in range(joints - 1, -1, -1):
@@ -146,5 +142,5 @@ def free_hinges(shape, compliance, angles):
         turn = _twist_rates(x, y, first)
         for axis in range(2):
             free[j, axis] -= compliance[j] * moment * turn[axis]
-        moment -= _dot(shape[j], 1j * bends[j]) / compliance[j]
+        moment -= (shape[j].conjugate() * 1j * bends[j]).real / compliance[j]
     return free

@@ -141,56 +141,36 @@ def userdata_size(effects: Sequence[Effect], chain: Chain) -> int:
     return taken + 1 if taken else 0
 
 
-class Effects:
-    """The effects of a task, one after the other."""
+def bind(effects: Sequence[Effect], world: World) -> dict[int, float]:
+    """Gives each effect its part of the world.
 
-    def __init__(self, effects: Sequence[Effect], world: World):
-        """Gives each effect its part of the world.
+    Args:
+        effects: Of one rollout only.
+        world: Simulations; its parameters are all of `userdata`.
 
-        Args:
-            effects: Of one rollout only.
-            world: Simulations; its parameters are all of `userdata`.
+    Returns:
+        What `userdata` holds beside parameters, by place, in every episode.
 
-        Raises:
-            ValueError: if the scene was built for other effects.
-        """
-        self._effects, self._user = tuple(effects), world.parameters
-        needed = userdata_size(effects, world.chain)
-        if self._user.shape[1] != needed:
-            raise ValueError(
-                f"the effects of the task take {needed} numbers of userdata, and the "
-                f"scene has room for {self._user.shape[1]}: build it with the same "
-                "configuration"
-            )
-        # What `userdata` holds beside parameters, by place.
-        self._labels: dict[int, float] = {}
-        start = 0
-        for effect in self._effects:
-            count, mark = effect.num_parameters(world.chain), 0
-            first = start + _HEADER if count else start
-            if count and effect.forces is not None:
-                from cathsim_dmc.physics import callbacks  # late, as numba takes long
+    Raises:
+        ValueError: if the scene was built for other effects.
+    """
+    user, needed = world.parameters, userdata_size(effects, world.chain)
+    if user.shape[1] != needed:
+        raise ValueError(
+            f"the effects of the task take {needed} numbers of userdata, and the "
+            f"scene has room for {user.shape[1]}: build it with the same configuration"
+        )
+    labels: dict[int, float] = {}
+    start = 0
+    for effect in effects:
+        count, mark = effect.num_parameters(world.chain), 0
+        first = start + _HEADER if count else start
+        if count and effect.forces is not None:
+            from cathsim_dmc.physics import callbacks  # late, as numba takes long
 
-                mark, self._labels[needed - 1] = callbacks.install(effect.forces), MARK
-            if count:
-                self._labels |= {start: mark, start + 1: count}
-            start = first + count
-            parameters = self._user[:, first:start]
-            effect.bind(dataclasses.replace(world, parameters=parameters))
-
-    def enter(self, index: int, anatomy: Anatomy) -> None:
-        """Takes the anatomy of one simulation; see `Effect.enter`."""
-        for effect in self._effects:
-            effect.enter(index, anatomy)
-
-    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
-        """Begins an episode of one simulation; see `Effect.restart`."""
-        self._user[index, list(self._labels)] = list(self._labels.values())
-        for effect in self._effects:
-            effect.restart(index, episode, random_state)
-
-    def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
-        """Control (N, U) of the actuators for an action (N, A)."""
-        for effect in self._effects:
-            action = effect.act(action, state)
-        return action
+            mark, labels[needed - 1] = callbacks.install(effect.forces), MARK
+        if count:
+            labels |= {start: mark, start + 1: count}
+        start = first + count
+        effect.bind(dataclasses.replace(world, parameters=user[:, first:start]))
+    return labels

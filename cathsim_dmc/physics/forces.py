@@ -92,20 +92,3 @@ def wall_force(rows: np.ndarray) -> tuple[WallForce, np.ndarray]:
 
     *force, deepest = forces_loops.summed(rows, CONTACT_SIZE)
     return WallForce(*force), deepest
-
-
-def too_coarse(
-    force: WallForce, depth: np.ndarray, deepest: float | None = None
-) -> np.ndarray:
-    """Whether control steps need shorter physics steps.
-
-    Args:
-        force: Of N control steps.
-        depth: (N,), m, of the deepest contact in them.
-        deepest: m; None for `DEEPEST`.
-
-    Returns:
-        (N,) bool: some contact is harder than `HARDEST` or deeper than `deepest`.
-    """
-    limit = DEEPEST if deepest is None else deepest
-    return (force.peak_max > HARDEST) | (depth > limit)

@@ -97,7 +97,7 @@ class SlidingDevices(SingleDevice):
 
     def __init__(self, stack: DeviceStack):
         """Takes the entity of the devices."""
-        self._entity, self._stack, self._rods = stack, stack.stack, stack.rods
+        self._entity, self._stack = stack, stack.stack
 
     def num_parameters(self, chain: Chain) -> int:
         """Insertions, and rotations of nodes."""

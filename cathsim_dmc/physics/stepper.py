@@ -111,10 +111,11 @@ class Stepper(abc.ABC):
             Force on the wall over it, and whether MuJoCo has warned in it, (N,) bool.
         """
         warned, (force, depth) = self._warned(), forces.wall_force(self.contact_rows)
-        depth = self._depth_at_end(depth, warned)
+        limit = forces.DEEPEST if self.deepest is None else self.deepest
+        depth = self._depth_at_end(depth, warned, limit)
         # A wall that gives is soft enough for half the step, as a rule.
         for parts in (forces.REFINEMENT,) if self.deepest is None else (2, 8):
-            coarse = forces.too_coarse(force, depth, self.deepest) & ~warned
+            coarse = ((force.peak_max > forces.HARDEST) | (depth > limit)) & ~warned
             if not np.count_nonzero(coarse):
                 break
             self._refine(np.flatnonzero(coarse), parts)
@@ -133,7 +134,9 @@ class Stepper(abc.ABC):
         self._forward(indices)
         self._change(indices, "disableflags", lambda flags: flags & ~_ACTUATION)
 
-    def _depth_at_end(self, depth: np.ndarray, warned: np.ndarray) -> np.ndarray:
+    def _depth_at_end(
+        self, depth: np.ndarray, warned: np.ndarray, limit: float
+    ) -> np.ndarray:
         """Depth (N,) m of the deepest contact in a control step, and at its end.
 
         Contacts are looked for once more where a link may have gone too deep.
@@ -142,7 +145,6 @@ class Stepper(abc.ABC):
             names = ("qvel", "cdof", "xpos", "subtree_com")
             self._views = tuple(getattr(self.arrays, name) for name in names)
         way = self._timestep * _fastest(*self._views, *self._links)
-        limit = forces.DEEPEST if self.deepest is None else self.deepest
         suspect = (depth + way > limit) & (depth <= limit) & ~warned
         for index in np.flatnonzero(suspect).tolist():
             model, data = self._model_of(index), self._scratch

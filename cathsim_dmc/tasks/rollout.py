@@ -14,9 +14,9 @@ from numpy.random import RandomState
 from cathsim_dmc.imaging import endoluminal
 from cathsim_dmc.imaging.angiograph import Planes
 from cathsim_dmc.imaging.device import Shadow
-from cathsim_dmc.physics import forces
+from cathsim_dmc.physics import effects, forces
 from cathsim_dmc.physics import vessel as vessels
-from cathsim_dmc.physics.effects import Effects, World
+from cathsim_dmc.physics.effects import World
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import ModelIndex, Readings
 from cathsim_dmc.physics.sliding import SingleDevice
@@ -83,15 +83,17 @@ class Rollout:
         )
         self.index = ModelIndex(model, scene.catheter, scene.robot)
         self._read = self.index.reader(state)
-        self._listed = listed = config.effects_on(scene.catheter)
+        self._effects = config.effects_on(scene.catheter)
         stepper.deepest = config.vessel.deepest
-        self.moving = next((one for one in listed if isinstance(one, Moving)), None)
-        self._devices = cast(SingleDevice, listed[-1])
+        moving = (effect for effect in self._effects if isinstance(effect, Moving))
+        self.moving = next(moving, None)
+        self._devices = cast(SingleDevice, self._effects[-1])
         depth = scene.placement.start_depth
         places = model, scene.catheter, self.index, depth, state, stepper.field
-        self._effects = Effects(listed, World(*places, parameters=state.userdata))
+        world = World(*places, parameters=state.userdata)
+        self._labels = effects.bind(self._effects, world)
         for index in range(count):
-            self._effects.enter(index, scene.anatomy)
+            self._enter(index)
         self._routes: list[Route] = []
         if observations.needs(self._names, ROUTE):
             self._routes = [Route.of(case.objective) for case in cases]
@@ -156,13 +158,19 @@ class Rollout:
             self.case(index).scene.anatomy.lumen.release()
             self._case_of[index] = number
             self._stepper.load(index, self.case(index))
-            self._effects.enter(index, self.case(index).scene.anatomy)
+            self._enter(index)
         case = self.case(index)
         case.start.write(self._state.qpos[index], episode, random_state)
-        self._effects.restart(index, episode, random_state)
+        self._state.userdata[index, list(self._labels)] = list(self._labels.values())
+        for effect in self._effects:
+            effect.restart(index, episode, random_state)
         if self._sensors.planes:
             self._sensors.planes[index] = case.angiograph.planes(episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
+
+    def _enter(self, index: int) -> None:
+        for effect in self._effects:
+            effect.enter(index, self.case(index).scene.anatomy)
 
     def _pose_robot(self) -> None:
         self._state.qpos[:, self.index.robot_qpos] = self._devices.follower_posture()
@@ -175,7 +183,9 @@ class Rollout:
         """
         self._previous_action, self._action = self._action, action
         self._pose_robot()
-        self._stepper.begin(self._effects.act(action, self.readings))
+        for effect in self._effects:
+            action = effect.act(action, self.readings)
+        self._stepper.begin(action)
 
     def start(self, indices: np.ndarray) -> Step:
         """First measurement of new episodes, after the forward pass.
@@ -231,7 +241,7 @@ class Rollout:
         self.readings, self.wall_force = self._read(), force
         self.devices = self._devices.read(self.readings)
         time, last = CONTROL_TIMESTEP * self.steps, self._stepper.contact_rows[:, -1]
-        self.vessel = vessels.read(self._listed, time, self.readings, last)
+        self.vessel = vessels.read(self._effects, time, self.readings, last)
         self.resting = self._at_rest(self.readings)
 
     def _at_rest(self, state: Readings) -> Readings:

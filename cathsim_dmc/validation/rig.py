@@ -188,7 +188,7 @@ class Rig:
         if isinstance(self.catheter, DeviceStack):
             chain_fields.write_still(self.catheter, self.model, self.gaps)
         if blood is not None:
-            # What blood needs of a `World`; see `Effects` for its place in `userdata`.
+            # What blood needs of a `World`, placed in `userdata` as by `effects.bind`.
             parameters = self.data.userdata[None, 2:-1]
             self.data.userdata[1] = parameters.size
             first = slice(int(ids(self.model, self.catheter.links)[0]), None)
