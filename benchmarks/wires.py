@@ -17,6 +17,7 @@ from cathsim_dmc.cli.options import show
 from cathsim_dmc.entities.device import Arc, Device, Section
 from cathsim_dmc.entities.devices import METAL_POISSON_RATIO
 from cathsim_dmc.validation import bench, bench_data
+from cathsim_dmc.validation.rig import Rig
 
 _CORE = Section.isotropic(190e-6, METAL_POISSON_RATIO)  # N·m²
 
@@ -61,10 +62,40 @@ def variants() -> dict[str, dict[str, Any]]:
     return found
 
 
+class Experiment(bench.Experiment):
+    """A bench on which the core of a wire may taper."""
+
+    def held(
+        self, wire: bench_data.Wire, wall: Any, turn: float = 0.0, **changes: Any
+    ) -> bench.Held:
+        """A wire on the bench; "taper" by kind of the wire, see `grind`."""
+        taper = changes.pop("taper", {}).get(wire.kind)
+        held = super().held(wire, wall, turn, **changes)
+        if taper is not None:
+            grind(held.rig, *taper)
+        return held
+
+
+def grind(rig: Rig, length: float, thinnest: float) -> None:
+    """Lets the core taper: EI goes with the fourth power of its diameter.
+
+    Args:
+        length: from the tip to where the core has its diameter, m.
+        thinnest: of the diameter, at the tip.
+    """
+    lengths, stiffness = rig.lengths, rig.device.shaft.bending_stiffness
+    share = np.minimum(lengths[::-1].cumsum()[::-1] / length, 1.0)
+    here = stiffness * (thinnest + (1.0 - thinnest) * share[1:]) ** 4
+    joints = 2.0 * here / (lengths[1:] + lengths[:-1])
+    for number, own in enumerate(joints, start=1):
+        for name in "xy":
+            rig.model.joint(f"{rig.name}/bend_{name}_{number}").stiffness = own
+
+
 def main(folder: str) -> int:
     """Print the report of the bench with the sensitivities as JSON."""
     report = bench.validate_bench(folder, say)
-    experiment = bench.Experiment(bench_data.read(folder))
+    experiment = Experiment(bench_data.read(folder))
     wires = {wire.name: wire for wire in experiment.bench.wires}
     found: dict[str, dict[str, float]] = {}
     for name, changes in variants().items():

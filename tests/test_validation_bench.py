@@ -94,7 +94,7 @@ def test_a_wire_has_its_weight_in_blood(folder):
     path, _, _, lumen = folder
     experiment = bench.Experiment(bench_data.read(path))
     wire = experiment.bench.wires[0]
-    rig = experiment.held(wire, lumen, down="left")._rig
+    rig = experiment.held(wire, lumen, down="left").rig
     weight = rig.model.body_mass.sum() * rig.model.opt.gravity / rig.lengths.sum()
     device = bench.DEVICES["straight"]
     displaced = BLOOD_DENSITY * np.pi * device.outer_radius**2

@@ -75,9 +75,8 @@ class Experiment:
     ) -> Held:
         """A wire on the bench, with changes of `Held`, see `compare`."""
         device = changes.pop("device", DEVICES)[wire.kind]
-        taper = changes.pop("taper", {}).get(wire.kind)
         down = self.bench.down[changes.pop("down", DOWN)]
-        return Held(wall, wire, device, down, turn, taper=taper, **changes)
+        return Held(wall, wire, device, down, turn, **changes)
 
     def compare(
         self,
@@ -92,8 +91,8 @@ class Experiment:
         Args:
             turns: of the wire about its axis, rad.
             scale: by which the lumen is larger.
-            **changes: of the setting: `friction`, `down`, `overshoot`; by kind of the
-                wire `device` and `taper`.
+            **changes: of the setting: `friction`, `down`, `overshoot`; `device` by kind
+                of the wire.
         """
         start, shapes = {"led": self._nearest(wire), "laid": wire}.get(way), []
         for turn in turns if way == "pushed" or start is not None else ():

@@ -45,7 +45,6 @@ class Held:
         *,
         friction: float = FRICTION,
         overshoot: float = 0.0,
-        taper: tuple[float, float] | None = None,
     ):
         """Builds the scene; vectors are in the frame of the mesh.
 
@@ -57,8 +56,6 @@ class Held:
             turn: of the device about its axis, rad.
             friction: Coulomb coefficient.
             overshoot: by which the wire is pushed too far and pulled back, m.
-            taper: m from the tip to where the core has its diameter, and by what factor
-                it is thinner at the tip; None for the two sections of the device.
 
         Raises:
             ValueError: if less of the wire is inserted than its tip is long.
@@ -77,7 +74,7 @@ class Held:
         first = shaft / (np.ceil(shaft / _LINK) - 0.5)
         fine = Discretisation(reach + first / 2, shaft_link=first * (1 + 1e-6))
         rig = Rig(device, fine, stroke=reach + 1e-3, friction=friction)
-        self._rig = rig
+        self.rig = rig
         axis = wire.direction
         across = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
         across /= np.linalg.norm(across)
@@ -98,18 +95,6 @@ class Held:
             shape = {"type": "mesh", "mesh": "hull", "mass": 0}
         body.add("geom", name="wall", **shape, **wall_contact(friction))
         rig.compile()
-        if taper is not None:
-            self._grind(device.shaft.bending_stiffness, *taper)
-
-    def _grind(self, stiffness: float, length: float, thinnest: float) -> None:
-        """Lets the core taper: EI goes with the fourth power of its diameter."""
-        rig, lengths = self._rig, self._rig.lengths
-        share = np.minimum(lengths[::-1].cumsum()[::-1] / length, 1.0)
-        here = stiffness * (thinnest + (1.0 - thinnest) * share[1:]) ** 4
-        joints = 2.0 * here / (lengths[1:] + lengths[:-1])
-        for number, own in enumerate(joints, start=1):
-            for name in "xy":
-                rig.model.joint(f"{rig.name}/bend_{name}_{number}").stiffness = own
 
     def push(self) -> np.ndarray:
         """Pushes the wire in, from outside; its shape (n, 3) at rest, m.
@@ -117,7 +102,7 @@ class Held:
         Raises:
             RuntimeError: if the simulation diverges.
         """
-        self._rig.data.qpos[:] = 0.0
+        self.rig.data.qpos[:] = 0.0
         return self._advance(0.0)
 
     def release(self, points: np.ndarray) -> np.ndarray:
@@ -126,7 +111,7 @@ class Held:
         Args:
             points: (n, 3) m, moved to the entry and, where too short, made longer.
         """
-        rig = self._rig
+        rig = self.rig
         end = points[-1] - points[-2]
         longer = points[-1] + 2.0 * self.length * end / np.linalg.norm(end)
         local = (np.vstack([points, longer]) - points[0]) @ self._frame
@@ -141,7 +126,7 @@ class Held:
 
     def _advance(self, place: float) -> np.ndarray:
         """Moves the carriage to the inserted length; the shape of `push`."""
-        rig = self._rig
+        rig = self.rig
         actuator = rig.model.actuator(f"{rig.name}/insertion").id
         servo = rig.model.actuator_actadr[actuator]
         step = MAX_PUSH_SPEED * rig.model.opt.timestep
