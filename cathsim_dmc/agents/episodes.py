@@ -51,7 +51,10 @@ class EpisodeTracker:
             return value.reshape(batch.shape).numpy()
 
         after, info = batch["next"], batch["next", "info"]
-        reward, done = read(after["reward"]), read(after["done"])
+        names = "success", "physics_error", "path_ratio"
+        success, error, ratio = (read(info[name]) for name in names)
+        names = "reward", "done", "terminated"
+        reward, done, terminated = (read(after[name]) for name in names)
         forces = [read(info[name]) for name in NAMES]
         finished = []
         for step in range(batch.shape[1]):
@@ -64,11 +67,11 @@ class EpisodeTracker:
                         env=env,
                         reward=float(self.reward[env]),
                         length=int(self.length[env]),
-                        terminated=bool(after["terminated"][env, step]),
-                        success=bool(info["success"][env, step]),
+                        terminated=bool(terminated[env, step]),
+                        success=bool(success[env, step]),
                         forces=self.forces.finish(env),
-                        physics_error=bool(info["physics_error"][env, step]),
-                        path_ratio=float(info["path_ratio"][env, step]),
+                        physics_error=bool(error[env, step]),
+                        path_ratio=float(ratio[env, step]),
                     )
                 )
                 self.reward[env] = self.length[env] = 0
