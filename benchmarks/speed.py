@@ -34,7 +34,7 @@ from pace import (
 
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.cli.options import show
-from cathsim_dmc.imaging import Shadow
+from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check, Report

@@ -68,7 +68,8 @@ def scene(builder, tmp_path_factory):
 @needs_node
 def test_webassembly_moves_and_draws_as_python_does(builder, scene, tmp_path):
     from cathsim_dmc import suite
-    from cathsim_dmc.imaging import Angiograph, Shadow
+    from cathsim_dmc.imaging.angiograph import Angiograph
+    from cathsim_dmc.imaging.device import Shadow
 
     rng = np.random.RandomState(0)
     actions = rng.uniform(-1, 1, (25, 21))

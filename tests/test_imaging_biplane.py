@@ -5,10 +5,10 @@ import pytest
 from test_imaging_device import RADIUS
 
 from cathsim_dmc.anatomy import phantoms
-from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.biplane import TRACE_SPACING, Biplane
 from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 
 
 @pytest.fixture(scope="module")

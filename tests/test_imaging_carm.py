@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_imaging_thickness import unproject
 
-from cathsim_dmc.imaging import CArm
+from cathsim_dmc.imaging.carm import CArm
 
 angles = st.floats(-3.0, 3.0)
 tilts = st.floats(-1.4, 1.4)

@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
-from cathsim_dmc.imaging import CArm, Shadow, device_attenuation
-from cathsim_dmc.imaging.device import add_disc
+from cathsim_dmc.imaging.carm import CArm
+from cathsim_dmc.imaging.device import Shadow, add_disc, device_attenuation
 
 RADIUS = 0.84e-3
 SCRATCH = np.empty((3, 20))

@@ -7,15 +7,10 @@ from hypothesis import strategies as st
 from test_imaging_device import RADIUS, curve
 from test_imaging_thickness import ball
 
-from cathsim_dmc.imaging import (
-    CArm,
-    Fluoroscope,
-    Shadow,
-    angiograph,
-    detector,
-    device_attenuation,
-    materials,
-)
+from cathsim_dmc.imaging import angiograph, detector, materials
+from cathsim_dmc.imaging.carm import CArm
+from cathsim_dmc.imaging.device import Shadow, device_attenuation
+from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cathsim_dmc.anatomy.parts import Surface
-from cathsim_dmc.imaging import VIEWS, CArm, surface_thickness
+from cathsim_dmc.imaging.carm import VIEWS, CArm
+from cathsim_dmc.imaging.thickness import surface_thickness
 
 
 def unproject(carm, pixels, depth):

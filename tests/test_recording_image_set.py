@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from cathsim_dmc.anatomy import phantoms
-from cathsim_dmc.imaging import Fluoroscope, surface_thickness
+from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
+from cathsim_dmc.imaging.thickness import surface_thickness
 from cathsim_dmc.recording import coco, image_set, sequences
 from cathsim_dmc.recording.image_set import ImageSetOptions
 

@@ -10,7 +10,7 @@ from recording_samples import make_episode, make_tube
 from scipy.spatial.transform import Rotation
 
 from cathsim_dmc import suite
-from cathsim_dmc.imaging import FluoroscopyOptions
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.pictures.moment import Moment
 from cathsim_dmc.pictures.recorded import xray_film
 from cathsim_dmc.recording.episode import Episode

@@ -9,7 +9,8 @@ from conftest import twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
-from cathsim_dmc.imaging import Fluoroscope, FluoroscopyOptions
+from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.tasks import observations, route
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig

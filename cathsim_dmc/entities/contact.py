@@ -42,11 +42,6 @@ def device_contact(friction: float) -> dict[str, Any]:
     return {**wall_contact(friction), "contype": 0, "conaffinity": 1}
 
 
-def coaxial_contact(friction: float) -> dict[str, Any]:
-    """As `device_contact`; the friction replaces that of the wall."""
-    return {**device_contact(friction), "priority": 1}
-
-
 def sheath_contact() -> dict[str, Any]:
     """Attributes of a geom of the sheath, frictionless for every device."""
     # Overrides the device: one constraint row a contact instead of three.

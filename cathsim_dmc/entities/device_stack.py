@@ -8,7 +8,7 @@ from cathsim_dmc.entities import devices as library
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
 from cathsim_dmc.entities.coaxial import Stack, carried_mass, weight_density
-from cathsim_dmc.entities.contact import FRICTION, coaxial_contact
+from cathsim_dmc.entities.contact import FRICTION, device_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.hinge_loops import unloaded_hinges
 from cathsim_dmc.entities.torsion import Rods
@@ -93,7 +93,7 @@ class DeviceStack(Chain):
                 axial_stiffness=sum(device.axial_stiffness for device in self.devices),
                 tip=int(tip.argmax()),
             ),
-            coaxial_contact(friction),
+            {**device_contact(friction), "priority": 1},  # in place of the wall's
             stroke=stroke,
             rotation=False,
             timestep=timestep,

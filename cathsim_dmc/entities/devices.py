@@ -52,9 +52,7 @@ _FIVE_FRENCH = (
 
 # The device of the registered tasks: the published discretisation of the tip (ten links
 # over 7 cm, 20 motors) on a 5F body. The published stiffness is that of a rod stiffer
-# than any metal; the stiffness of real devices replaces it: a shaft between the body of
-# a steerable 4F tube (22.7 N·mm²) and an Amplatz wire (291 N·mm²), and that body's own
-# stiffness for the tip.
+# than any metal; that of real devices replaces it.
 STEERABLE_5F = Device(
     name="steerable_5f",
     outer_radius=5 * FRENCH / 2,
@@ -66,7 +64,6 @@ STEERABLE_5F = Device(
     source=_FIVE_FRENCH,
 )
 
-# A 1.33 mm / 0.8 mm steerable tube: 22.7 N·mm² body, 2.8 N·mm² tip.
 STEERABLE_4F = Device(
     name="steerable_4f",
     outer_radius=1.33e-3 / 2,
@@ -156,7 +153,6 @@ def _guidewire(name: str, shaft: float) -> Device:
     )
 
 
-# Flexural moduli of 0.035 inch shafts: Harrison et al. 2011.
 WIRE_035_AMPLATZ = _guidewire("wire_035_amplatz", 291e-6)
 WIRE_035_HEAVY_DUTY = _guidewire("wire_035_heavy_duty", 400e-6)
 WIRE_035_EXTRA_STIFF = _guidewire("wire_035_extra_stiff", 895e-6)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.imaging import FluoroscopyOptions
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.pictures.moment import Moment, xray
 from cathsim_dmc.pictures.readout import ForceReadout, forces
 from cathsim_dmc.pictures.recorded import record, write
@@ -62,7 +62,7 @@ def fluoroscopy(env: Any, seed: int = 0, **options: Any) -> np.ndarray:
     Args:
         env: What `cathsim_dmc.suite.load` returns, after a reset.
         seed: Seed of the quantum noise, if `noise=True` is asked for.
-        **options: Fields of `imaging.FluoroscopyOptions` that differ from the task's,
+        **options: Fields of `FluoroscopyOptions` that differ from the task's,
             such as `view="LAO45"`, `size=512`, `contrast=False`.
 
     Returns:

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import arc_lengths
-from cathsim_dmc.imaging import FluoroscopyOptions
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.pictures.moment import Moment, fluoroscope_of, xray
 from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.recording.geometry import force_colours, force_text

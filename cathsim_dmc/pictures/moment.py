@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions, Shadow
+from cathsim_dmc.imaging.angiograph import Angiograph
+from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc import policies
-from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions, Shadow
+from cathsim_dmc.imaging.angiograph import Angiograph
+from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
 from cathsim_dmc.recording.records import MESH_EVERY, VesselRecord

@@ -16,10 +16,12 @@ import numpy as np
 
 from cathsim_dmc import bounds, files
 from cathsim_dmc.anatomy import Anatomy
-from cathsim_dmc.imaging import CArm, Fluoroscope, surface_thickness
+from cathsim_dmc.imaging.carm import CArm
 from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.materials import MARKER_LENGTH
 from cathsim_dmc.imaging.options import DETECTOR_SIZE
+from cathsim_dmc.imaging.thickness import surface_thickness
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.physics.vessel import PRESETS
 from cathsim_dmc.recording.geometry import along

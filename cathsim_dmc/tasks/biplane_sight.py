@@ -70,9 +70,7 @@ class BiplaneSight:
 
 
 # Episodes in the same anatomy share a machine, which holds a megabyte.
-@functools.lru_cache(maxsize=64)
-def _machine(planes: tuple) -> Biplane:
-    return Biplane(planes)
+_machine = functools.lru_cache(maxsize=64)(Biplane)
 
 
 def _along(handle: np.ndarray, line: np.ndarray, machine: Biplane) -> np.ndarray:

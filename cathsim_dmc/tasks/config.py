@@ -66,8 +66,7 @@ class NavigationConfig:
         outside_range: Whether a physics step longer than 5 ms and a device stiffer than
             5000 N·mm², with which the physics does not hold, are warned of and not
             refused.
-        fluoroscopy: `imaging.FluoroscopyOptions` of the images, or a mapping of its
-            fields.
+        fluoroscopy: `imaging.options.FluoroscopyOptions`, or a mapping of its fields.
         endoluminal_size: Pixels along a side of endoluminal views, or (rows, columns).
         randomisation: Ranges that each episode draws from: True for
             `randomisation.DEFAULT_RANGES`, False for none, a

@@ -30,8 +30,9 @@ from PIL import Image
 
 from cathsim_dmc import agents, suite  # agents before anything of dm_control
 from cathsim_dmc.agents.policies import task_and_options
-from cathsim_dmc.imaging import FluoroscopyOptions, materials
+from cathsim_dmc.imaging import materials
 from cathsim_dmc.imaging.angiograph import Angiograph
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.pictures import record

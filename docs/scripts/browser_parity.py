@@ -27,7 +27,8 @@ import mujoco
 
 from cathsim_dmc import suite
 from cathsim_dmc.agents import load_policy
-from cathsim_dmc.imaging import Angiograph, Shadow
+from cathsim_dmc.imaging.angiograph import Angiograph
+from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.pictures.figure import Picture
 from cathsim_dmc.pictures.recorded import as_function
 from cathsim_dmc.style import COLOURS, tidy

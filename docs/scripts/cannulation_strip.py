@@ -16,9 +16,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from cathsim_dmc import policies, suite
-from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
 from cathsim_dmc.imaging import angiograph as machines
+from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 
 OUTPUT = Path(__file__).parents[1] / "images" / "cannulation_strip.png"
 TASK, SEED, MOMENTS = "type1_lcca", 3, 6

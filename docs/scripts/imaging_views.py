@@ -18,8 +18,9 @@ from scipy.ndimage import gaussian_filter1d
 
 from cathsim_dmc.anatomy.arch.arch import ARCHES, arch_tree
 from cathsim_dmc.anatomy.surface import lumen_surface
-from cathsim_dmc.imaging import VIEWS, CArm, Fluoroscope
+from cathsim_dmc.imaging.carm import VIEWS, CArm
 from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.options import DETECTOR_SIZE
 
 OUTPUT = Path(__file__).parents[1] / "images" / "fluoroscopy_views.png"

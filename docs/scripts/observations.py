@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.imaging import VIEWS, FluoroscopyOptions
+from cathsim_dmc.imaging.carm import VIEWS
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.randomisation import DEFAULT_RANGES, Randomisation
 from cathsim_dmc.tasks import observation_kind, observations
 from cathsim_dmc.tasks.observation_kind import Entry
