@@ -317,10 +317,12 @@ def _ahead(ways: Ways, way: np.ndarray, toward: np.ndarray) -> bool:
 
 def _rings(ways: Ways, before: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Pairs of ways from the inlet whose ends touch, for every ring of vessels."""
-    back = _upstream(ways, before)[ways.links]
+    up = _upstream(ways, before)
+    links = ways.links[np.not_equal(*up[ways.links.T])]
+    back = up[links]
     gap = np.linalg.norm(np.diff(ways.points[back], axis=1)[:, 0], axis=1)
     near = APART * ways.depth[back].sum(axis=1) + APART_MIN
-    links = ways.links[ways.main[ways.links[:, 0]] & (gap > near)]
+    links = links[ways.main[links[:, 0]] & (gap > near)]
     depth = ways.depth[links].min(axis=1)
     label = groups(len(ways.points), links)[links[:, 0]]
     for key in np.unique(label):

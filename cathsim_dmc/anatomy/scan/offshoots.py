@@ -3,8 +3,8 @@
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
-from typing import TypeVar
+from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -26,7 +26,6 @@ STUB_RADIUS = 1.2e-3  # m
 STUB_END = 2.5  # radii from an end of the aorta
 STUB_APART = 45e-3  # m of aorta, at most, to the nearest branch
 STUB_WIDE = 30e-3  # m along the aorta: wider ones are no stub
-Key = TypeVar("Key")
 SURE = 0.95  # least probability of a name, and of the end at the heart
 EXTRA = 0.002  # probability that a branch is none of those that are looked for
 SPREAD = 0.3  # standard deviation of the logarithm of a radius
@@ -89,11 +88,15 @@ def offshoots(
                 break
         else:
             groups_.append(([number], [row], 1e-3 * near[start]))
-    found = []
+    found: list[Offshoot] = []
     for members, rows, s in groups_:
         if max((row[-1] - row[0]) @ bend.up for row in rows) > 0.0:
-            fork, place = _fork(rows), rows[0][0]
-            radius = _calibre(ways, rows[0], fork)
+            forks = [
+                arc_lengths(one)[min(common(one, other), len(one) - 1)]
+                for one, other in combinations(rows, 2)
+            ]
+            fork = float(min(forks)) if forks else None
+            place, radius = rows[0][0], _calibre(ways, rows[0], fork)
             found.append(Offshoot(place, s, radius, tuple(members), fork, tuple(rows)))
     places = np.array([one.s for one in found])
     for stub in _stubs(ways, bend, depth, curves, aorta):
@@ -106,15 +109,6 @@ def offshoots(
 def depth_of(ways: Ways, line: np.ndarray) -> np.ndarray:
     """Radius (n,) m of the lumen at nodes (n, 3) of the lattice."""
     return ways.depth[[ways.node(point) for point in line]] + CELL
-
-
-def _fork(rows: Sequence[np.ndarray]) -> float | None:
-    shares = [
-        arc_lengths(one)[min(common(one, other), len(one) - 1)]
-        for k, one in enumerate(rows)
-        for other in rows[k + 1 :]
-    ]
-    return float(min(shares)) if shares else None
 
 
 def _calibre(ways: Ways, row: np.ndarray, fork: float | None) -> float:
@@ -206,12 +200,12 @@ def leads(
     return found
 
 
-def normalised(weights: Mapping[Key, float]) -> dict[Key, float]:
+def normalised(weights: Mapping[Any, float]) -> dict[Any, float]:
     """Probabilities of hypotheses that exclude each other, from their log weights."""
     return dict(zip(weights, softmax(list(weights.values())).tolist(), strict=True))
 
 
-def summed(odds: Mapping[Key, float], of: Callable[[Key], str]) -> dict[str, float]:
+def summed(odds: Mapping[Any, float], of: Callable[[Any], str]) -> dict[str, float]:
     """Probability of each thing that hypotheses say, which `of` tells of each."""
     by: dict[str, float] = defaultdict(float)
     for key, value in odds.items():

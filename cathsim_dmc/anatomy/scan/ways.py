@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy import geodesic
 from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.scan.centring import resample
-from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 LATTICE = 1e-3  # m, spacing of the lattice on which ways are searched
@@ -44,11 +43,12 @@ class Ways:
             links.append(np.stack([found, at[found]], axis=1))
             lengths.append(np.full(len(found), LATTICE * np.linalg.norm(offset)))
         self.links, self._lengths = np.concatenate(links), np.concatenate(lengths)
-        # Sorting the links takes longer than the searches: once is enough.
-        self._order = np.lexsort(self.links.T[::-1])
-        rows, count = self.links[self._order, 0], len(self.points)
-        self._starts = np.searchsorted(rows, np.arange(count + 1))
-        label = groups(count, self.links)
+        # Of a point's links the offsets are in order; sorting them once is enough.
+        self._order = np.argsort(self.links[:, 0], kind="stable")
+        rows = self.links[self._order, 0]
+        self._starts = np.searchsorted(rows, np.arange(len(self.points) + 1))
+        self._near = self._graph(self._lengths)
+        label = connected_components(self._near, directed=False)[1]
         self.main = label == np.bincount(label).argmax()
         self.nodes = np.flatnonzero(self.main)
         self._lookup = cKDTree(self.points[self.main])
@@ -57,7 +57,6 @@ class Ways:
         # vessels it takes the artery, not the thin communicating one.
         depth = self.depth[self.links].mean(axis=1)
         deep = self._graph(self._lengths * (LATTICE / depth) ** 4)
-        self._near = self._graph(self._lengths)
         # Of a node: lengths (n,) m of the shortest ways, predecessors on the deepest.
         self.lengths_from = cache(lambda node: dijkstra(self._near, False, node))
         self.deepest_from = cache(lambda node: _before(deep, node))
