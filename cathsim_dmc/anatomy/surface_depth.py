@@ -13,7 +13,6 @@ from cathsim_dmc.anatomy.parts import End, Surface
 _SMOOTH, _BEFORE = 0.5, 0.9
 _CAP = 1e-6  # m, within which a triangle lies in the plane of an open end
 _SAME = 1e-6  # m; points nearer to each other than this are one
-_TOUCH = 1e-6  # share of an edge or a triangle that counts as its border
 
 
 class SurfaceDepth:
@@ -89,24 +88,3 @@ class SurfaceDepth:
         key = (cell[..., 0] * y + cell[..., 1]) * z + cell[..., 2]
         _, first, same = np.unique(key, return_index=True, return_inverse=True)
         return self(every.reshape(-1, 3)[first])[same].reshape(every.shape[:-1])
-
-    def crossings(self) -> tuple[np.ndarray, np.ndarray]:
-        """Faces (n,) that an edge of another face pierces, and those edges (n, 2)."""
-        import igl
-
-        sides = self._wall[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        edges = np.unique(np.sort(sides, axis=1), axis=0)
-        vertices = 1e3 * self._vertices  # its tolerances suit coordinates of order one
-        boxes = igl.AABB()
-        boxes.init(vertices, self._wall)
-        start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
-        hits = boxes.intersect_ray(vertices, self._wall, start, end - start)
-        found = [
-            (face, row)
-            for row, along in enumerate(hits)
-            for face, share, u, v in along
-            if _TOUCH < share < 1.0 - _TOUCH and min(u, v, 1.0 - u - v) > _TOUCH
-        ]
-        faces, rows = np.array(found, dtype=np.int64).reshape(-1, 2).T
-        own = (self._wall[faces][:, :, None] == edges[rows][:, None]).any(axis=(1, 2))
-        return faces[~own], edges[rows[~own]]

@@ -98,11 +98,6 @@ class Arch:
             return LumenEntry(planned.position, False, last.position)
         return planned
 
-    def wrong_side(self) -> str | None:
-        """Why the arch lies in no patient in this frame, or None."""
-        unsure = self.heart < SURE
-        return None if unsure else aorta.mirrored(self.bend.azimuth(heart_last=True))
-
     def named(self, curves: Sequence[np.ndarray]) -> Naming:
         """Names of the curves (m_i, 3) m from where the device enters."""
         start = curves[0][0]

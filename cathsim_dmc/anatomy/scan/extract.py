@@ -1,7 +1,8 @@
 """Free ends of a lumen, its inlet, and centrelines computed between them."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -236,7 +237,7 @@ def centrelines(
         known.append(entry.far)
         toward = ways.trace(before, ways.node(entry.far))
         cover.add(toward)
-    todo: list[Any] = []
+    todo = []
     for end in ends:
         way = ways.trace(before, ways.node(end.position))
         apart = min(np.linalg.norm(end.position - place) for place in known)
@@ -246,11 +247,9 @@ def centrelines(
             todo.append(way)
     todo.sort(key=lambda way: -float(ways.depth[way].sum()))
     # Rings last: what they share with a branch that has an end is that branch's.
-    todo += _rings(ways, before)
+    rings = (_round(cover, *pair) for pair in _rings(ways, before))
     found, thin = [], 0
-    for way in todo:
-        if isinstance(way, tuple):
-            way = _round(cover, *way)
+    for way in chain(todo, rings):
         own = cover.own_part(way[::-1])[::-1]
         if len(own) < 3:
             continue

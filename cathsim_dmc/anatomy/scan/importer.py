@@ -12,7 +12,8 @@ from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import extract
-from cathsim_dmc.anatomy.scan.arches import Arch
+from cathsim_dmc.anatomy.scan.aorta import mirrored
+from cathsim_dmc.anatomy.scan.arches import SURE, Arch
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.curves import inside_part, read_curves
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS, listed
@@ -169,7 +170,8 @@ def _computed(ways, ends, entry, places, root, changes, note):
     arch = Arch.of(ways, ends, places.get("heart"))
     if arch is not None:
         entry = arch.entered(places.get("inlet"), entry)
-        if (wrong := arch.wrong_side()) is not None:
+        wrong = mirrored(arch.bend.azimuth(heart_last=True))
+        if wrong and arch.heart >= SURE:
             raise ValueError(wrong)
     known = arch.found if arch is not None and entry is arch.entry else None
     found, thin = known or extract.centrelines(ways, ends, entry)

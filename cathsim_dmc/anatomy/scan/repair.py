@@ -170,7 +170,12 @@ class _Work:
                 )
             else:
                 filled.append((wide, in_mm(middle)))
-            self._fan(loop, middle)
+            fan = loop[None, ::-1]
+            if len(loop) > 3:
+                centre = np.full(len(loop), len(self.vertices))
+                self.vertices = np.concatenate([self.vertices, middle[None]])
+                fan = np.stack([np.roll(loop, -1), loop, centre], axis=1)
+            self.faces = np.concatenate([self.faces, fan])
         if filled:
             wide, where = max(filled)
             self.notes.append(
@@ -194,15 +199,6 @@ class _Work:
         size = np.linalg.norm(cross, axis=1)
         lean = np.abs(cross @ axis).sum() / max(size.sum(), 1e-30)
         return bool(lean < END)
-
-    def _fan(self, loop: np.ndarray, middle: np.ndarray) -> None:
-        if len(loop) == 3:
-            self.faces = np.concatenate([self.faces, loop[None, ::-1]])
-            return
-        centre = np.full(len(loop), len(self.vertices))
-        self.vertices = np.concatenate([self.vertices, middle[None]])
-        fan = np.stack([np.roll(loop, -1), loop, centre], axis=1)
-        self.faces = np.concatenate([self.faces, fan])
 
     def turn_outwards(self) -> None:
         """Turn the whole surface if its normals point inwards."""
@@ -240,7 +236,7 @@ class _Work:
 
     def _crossings(self, vertices: np.ndarray) -> tuple[int, str, np.ndarray]:
         """Triangles that are pierced, where, and those (F,) with an edge that does."""
-        faces, edges = SurfaceDepth(Surface(vertices, self.faces)).crossings()
+        faces, edges = topology.crossings(vertices, self.faces)
         tangled = np.isin(self.faces, np.unique(edges)).sum(axis=1) >= 2
         tangled[faces] = True
         where = in_mm(vertices[edges[0, 0]]) if len(edges) else ""

@@ -11,6 +11,7 @@ from cathsim_dmc.anatomy.parts import Surface
 
 MERGE = 1e-6  # of the mesh's size: vertices nearer than this are one
 ROUNDS = 6  # in which triangles without area are taken out, neighbours of others later
+TOUCH = 1e-6  # share of an edge or a triangle that counts as its border
 # Of the wall of a vessel with a thickness:
 RAYS = 64
 ENCLOSED = 0.75  # share of rays that hit: the place is inside a vessel
@@ -109,6 +110,27 @@ def decimated(
         target_count=count,
     )
     return merged(points.astype(np.float64) / scale, fewer.astype(np.int64))
+
+
+def crossings(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Faces (n,) that an edge of another face pierces, and those edges (n, 2)."""
+    import igl
+
+    edges, faces = edge_counts(faces)[0], np.ascontiguousarray(faces)
+    vertices = 1e3 * vertices  # its tolerances suit coordinates of order one
+    boxes = igl.AABB()
+    boxes.init(vertices, faces)
+    start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
+    hits = boxes.intersect_ray(vertices, faces, start, end - start)
+    found = [
+        (face, row)
+        for row, along in enumerate(hits)
+        for face, share, u, v in along
+        if TOUCH < share < 1.0 - TOUCH and min(u, v, 1.0 - u - v) > TOUCH
+    ]
+    pierced, rows = np.array(found, dtype=np.int64).reshape(-1, 2).T
+    own = (faces[pierced][:, :, None] == edges[rows][:, None]).any(axis=(1, 2))
+    return pierced[~own], edges[rows[~own]]
 
 
 def border_loops(faces: np.ndarray) -> Iterator[np.ndarray]:
