@@ -1,7 +1,4 @@
-"""The anatomy as the simulator sees it: lumen, inlet and goals.
-
-Lengths are metres, positions are in the patient frame LPS.
-"""
+"""The anatomy as the simulator sees it, lumen, inlet and goals: metres, frame LPS."""
 
 import json
 import os

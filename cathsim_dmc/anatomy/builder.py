@@ -16,20 +16,12 @@ ACCESSES = ("ascending", "descending")
 
 @dataclass(frozen=True, eq=False)
 class VesselPlace:
-    """A place on a vessel.
-
-    Attributes:
-        vessel: name.
-        arc_length: m along its centreline from its first point; infinite for its last.
-        past_ostium: whether the arc length counts from its ostium.
-        position: (3,) m, a point of the lumen; the place is the nearest one of the
-            centreline, whatever the arc length.
-    """
+    """A place on a vessel: an arc length, or nearest to a position in the lumen."""
 
     vessel: str
-    arc_length: float = 0.0
-    past_ostium: bool = False
-    position: Array | None = None
+    arc_length: float = 0.0  # m from the centreline's first point; inf for its last
+    past_ostium: bool = False  # whether the arc length counts from the ostium
+    position: Array | None = None  # (3,) m, whatever the arc length
 
     def arc(self, tree: VesselTree) -> float:
         """Arc length (m) of the place; ValueError if it is not on the tree."""

@@ -1,8 +1,4 @@
-"""Centrelines with radii, vessels, and the tree of vessels they form.
-
-All lengths are metres, all points are in the patient frame LPS (+x patient
-left, +y posterior, +z superior).
-"""
+"""Centrelines with radii, vessels, and their tree: metres, in the patient frame LPS."""
 
 import math
 from collections.abc import Mapping

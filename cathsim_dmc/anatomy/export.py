@@ -1,9 +1,7 @@
 """Export of an anatomy as MJCF with convex wall pieces, and their deviations.
 
-For engines that collide nothing but convex shapes. A prism stands on every triangle of
-the lumen's surface and reaches outwards along the vertex normals; neighbours share
-their side faces, so nothing can pass between two of them. The vertices are moved
-outwards by what the triangles around them stand in the lumen.
+A prism stands on every triangle of the lumen's surface, outwards along the vertex
+normals; neighbours share their side faces, so nothing can pass between two of them.
 """
 
 import os

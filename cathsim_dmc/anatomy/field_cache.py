@@ -20,15 +20,12 @@ from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End, Surface
 from cathsim_dmc.file_maps import mapped
 
-# Bytes of all fields; the ones used longest ago are dropped. A pool of 1,000 random
-# arches has 2.6 GB, and processes that share it share what they look at.
-KEPT = 4_000_000_000
+KEPT = 4_000_000_000  # bytes of all fields; a pool of 1,000 random arches has 2.6 GB
 _NAMES = ("head", "coarse", "index", "samples")
 _DIGEST = "digest"
 _SHIPPED = Path(__file__).parent / "data"
 _DIGITS = 9  # of lengths, m, that count: processors round differently
 _SUFFIX = ".npy"
-# Neighbouring depths, of two bytes, are alike.
 _FILTERS = [{"id": lzma.FILTER_DELTA, "dist": 2}, {"id": lzma.FILTER_LZMA2}]
 _MODULES = ("field", "tree_depth")  # whose code decides what a field holds
 

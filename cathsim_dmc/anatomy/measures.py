@@ -22,8 +22,7 @@ def arch_type(drop: float) -> str:
 def bca_drop(tree: VesselTree) -> float:
     """Height of the top of the arch over the BCA's ostium, in diameters of the LCCA.
 
-    NaN without these branches. With an aberrant right subclavian the right carotid
-    stands in the BCA's place.
+    NaN without these branches; a right carotid of its own stands in the BCA's place.
     """
     first, lcca = tree.vessels.get("bca", tree.vessels.get("rcca")), "lcca"
     if first is None or lcca not in tree.vessels:

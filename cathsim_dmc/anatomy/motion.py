@@ -1,8 +1,7 @@
 """How heart and breathing move an anatomy, as displacements of space.
 
 A place x in space holds what lies at X = x - u(x, t) in the anatomy at rest, with
-u = a(t) H(x) + b(t) B(x): H of the heart and B of breathing at amplitude 1. The radius
-grows by g(X) p(t - s/c), s the way from the heart. See docs/vessel_model.md.
+u = a(t) H(x) + b(t) B(x); the radius grows by g(X) p(t - s/c): docs/vessel_model.md.
 """
 
 from collections.abc import Sequence

@@ -52,10 +52,8 @@ def pulse(phase):
 
 @compiled
 def courses(parameters, time):
-    """Amplitudes of heart, breathing and radius at a time, then their rates (1/s).
-
-    Then of the pulse: its phase at the heart, the lag a metre, 1/m, and its rate, 1/s.
-    """
+    """Amplitudes of heart, breathing and radius, their rates (1/s), and the pulse."""
+    # Of the pulse: its phase at the heart, the lag a metre, 1/m, and its rate, 1/s.
     share = min(max(time / RAMP, 0.0), 1.0)
     ramp = share * share * (3.0 - 2.0 * share)
     growing = 6.0 * share * (1.0 - share) / RAMP

@@ -1,7 +1,4 @@
-"""Parts of an anatomy: its lumen's surface, inlet, free ends and goals.
-
-Lengths are metres, positions are in the patient frame LPS.
-"""
+"""Parts of an anatomy, its surface, inlet, free ends and goals: metres, frame LPS."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

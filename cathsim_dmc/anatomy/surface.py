@@ -52,12 +52,9 @@ def _depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
 
 
 def lumen_surface(tree: VesselTree, spacing: float | None = None) -> Surface:
-    """Closed triangulated surface of the lumen, normals outwards.
+    """Closed triangulated surface of the lumen, flat ends too, normals outwards.
 
-    Args:
-        tree: vessels; the flat ends of the tubes are closed by triangles.
-        spacing: grid step (m) of the marching cubes; if None one that shows the
-            narrowest lumen without gaps.
+    The grid step (m) of the marching cubes shows the narrowest lumen without gaps.
     """
     from scipy.ndimage import binary_fill_holes
     from skimage.measure import marching_cubes

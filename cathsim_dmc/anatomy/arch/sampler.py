@@ -72,13 +72,8 @@ def sample(
 ) -> ArchParameters:
     """Random arch from the anatomical distributions, measured to be of the type drawn.
 
-    Args:
-        random_state: source of randomness; the same state gives the same arch.
-        arch_type: "I", "II" or "III", or None to draw it by prevalence.
-        variant: one of `VARIANTS`.
-
-    Raises:
-        ValueError: if `arch_type` or `variant` is unknown.
+    The type is "I", "II", "III", or None to draw it by prevalence, and the variant one
+    of `VARIANTS`, else ValueError. The same random state gives the same arch.
     """
     if arch_type is None:
         arch_type = kind_at(random_state.uniform())

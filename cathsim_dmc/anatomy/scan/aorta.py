@@ -145,10 +145,7 @@ def mirrored(azimuth: float | None) -> str | None:
 
 
 def heart_odds(bend: Bend, depth: np.ndarray, places: Sequence[float]) -> float:
-    """Log odds that the heart is at the last point of the aorta, branches aside.
-
-    Its line has depths (n,) m; the branches leave at `places`, arc lengths, m.
-    """
+    """Log odds that the heart is at the last point of an aorta with depths (n,) m."""
     first, last = min(places), max(places)
     s = 1e-3 * np.arange(len(bend.line))
     legs = [

@@ -12,8 +12,7 @@ REACH = 0.5e-3  # m, to both sides of a curve, at which the depth is compared
 NARROW = 1.5e-3  # m, radius below which smoothing would cut bends
 ROUNDS = 32  # of centring; together they move a curve by up to 5 mm
 RAYS = 24  # across a vessel, by which its radius is measured
-# m: up to the first depth a radius is that of the largest ball, which tells whether a
-# device passes; from the second on it is that of the section.
+# m of depth up to which a radius is that of the ball, and from which of the section.
 BALL, SECTION = 1.5e-3, 3e-3
 SLIT = 1.25  # of the ball's radius: a section's radius is no larger
 

@@ -149,10 +149,7 @@ def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
 def _lumen_beyond(
     depth: SurfaceDepth, end: CentrelinePoint, radius: float
 ) -> np.ndarray:
-    """Lattice points (n, 3) of the passable lumen ahead of an end, within 60 mm.
-
-    The lumen has a `radius` (m) up to there: what lies behind is cut off there.
-    """
+    """Lattice points (n, 3) m of the passable lumen ahead of an end, within 60 mm."""
     reach = (FREE_RADII + 1.5) * radius
     narrow = float(end.radius) / 3.0
     spacing = float(np.clip(max(narrow, reach / 40.0), 0.5e-3, 2.0e-3))

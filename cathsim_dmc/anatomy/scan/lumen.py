@@ -70,10 +70,7 @@ def read_lumen(
 def guess_units(
     name: str, vertices: np.ndarray, faces: np.ndarray, units: str | None
 ) -> tuple[str, str]:
-    """The unit given, or in which a lumen has a plausible width, and why, as a line.
-
-    ValueError if none is given and the lumen has no plausible width in any.
-    """
+    """The unit given, or in which a lumen has a plausible width, and a line on why."""
     width = typical_radius(vertices, faces)
     fits = [u for u, s in UNITS.items() if WIDTH[0] <= width * s <= WIDTH[1]]
     if not fits and (units is None or np.isnan(width)):
@@ -102,9 +99,8 @@ def guess_units(
 def typical_radius(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Radius (file's unit) of the wide part of a tube-like surface, or nan.
 
-    The 95th percentile, by area, of the radius of the largest ball that touches the
-    surface at a place and holds no other part of it: neither holes nor turned faces
-    disturb it (Ma et al., 3D medial axis point approximation, 2012).
+    The 95th percentile, by area, of the largest ball that touches the surface at a
+    place and holds no other part of it (Ma et al., 2012).
     """
     if not areas(vertices, faces).sum() > 0.0:
         return float("nan")

@@ -10,8 +10,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.scan.units import to_lps
 
-# Endings, and the least bytes a triangle takes where no header counts them: a face
-# "f 1 2 3" and half a vertex in OBJ, binary in STL.
+# Endings, and the least bytes that a triangle takes where no header counts them.
 FORMATS = {"obj": 35, "stl": 50, "ply": 12, "vtp": 12}
 _STL_TEXT = 100  # seven lines
 MOST = 4_000_000  # triangles; reading more takes gigabytes

@@ -1,8 +1,4 @@
-"""Names of computed centrelines, by hypotheses about the arch that they leave.
-
-A branch gets its name if the hypotheses that give it sum up to `SURE`; otherwise it
-gets a neutral one, and the notes ask.
-"""
+"""Names of computed centrelines, by hypotheses about the arch that they leave."""
 
 import re
 from collections.abc import Mapping, Sequence

@@ -65,10 +65,7 @@ class Offshoot:
 def offshoots(
     ways: Ways, bend: Bend, depth: np.ndarray, curves: Sequence[np.ndarray]
 ) -> list[Offshoot]:
-    """Branches of an arch, in their order along the line of its aorta.
-
-    The line has depths (n,) m; curves (m_i, 3) m were computed from one of its ends on.
-    """
+    """Branches along an aorta of depths (n,) m, which curves (m_i, 3) m leave."""
     aorta = cKDTree(bend.line)
     groups_: list[tuple[list[int], list[np.ndarray], float]] = []
     for number, curve in enumerate(curves):

@@ -27,10 +27,7 @@ def passable_length(vessel: Vessel) -> float:
 def place_inlet(
     tree: VesselTree, at_end: bool, share: float = 1.0
 ) -> tuple[VesselTree, Inlet]:
-    """Start the root where the lumen has its width, and look along it there.
-
-    A `share` of the blind end is cut off, if the root starts `at_end`.
-    """
+    """Start the root where the lumen has its width, or a share of the way there."""
     name, line = tree.root.name, tree.root.centreline
     if at_end:
         near = line.arc_length <= min(INLET_SEARCH, 0.3 * line.length)

@@ -150,11 +150,8 @@ def border_loops(faces: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def without_slivers(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int]:
-    """Triangles of which three corners lie in line are taken out, and how many.
-
-    The corner between the other two is put into the neighbour at the long edge, so
-    that no hole is left.
-    """
+    """Triangles of which three corners lie in line are taken out, and how many."""
+    # The corner between the other two is put into the neighbour at the long edge.
     removed = 0
     for _ in range(ROUNDS):
         corners = vertices[faces]

@@ -1,8 +1,4 @@
-"""From curves in a scan to a tree of vessels that starts at an inlet.
-
-Each curve is continued to the inlet along the deepest way through the lumen, shared
-beginnings are merged, and every curve is moved to the middle of the lumen.
-"""
+"""From curves in a scan to a tree of vessels that starts at an inlet."""
 
 import re
 from collections.abc import Collection
@@ -169,11 +165,9 @@ def ostium_of(line: Centreline, trunk: Centreline) -> float:
 def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
     """Give the common trunk of right branches its name, the brachiocephalic artery.
 
-    Where curves share a trunk, the trunk is part of one of them: the right carotid
-    then leaves the right vertebral. If both are right branches, by their names or
-    because they are named in `right`, the part up to the first of them becomes a vessel
-    of its own and the parent of both, and of the left carotid of a bovine arch, which
-    leaves it before.
+    If two right branches, by their names or because they are in `right`, share a trunk,
+    it becomes a vessel of its own and the parent of both, and of the left carotid of a
+    bovine arch, which leaves it before.
     """
     root = tree.root.name
     if TRUNK in tree.vessels:
