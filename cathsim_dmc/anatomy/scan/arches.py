@@ -88,14 +88,12 @@ class Arch:
         if inlet is None:
             return self.entry
         first, last = self.ends
-        if planned.at_end:
-            for here, far in ((first, last), (last, first)):
-                if np.linalg.norm(here.position - planned.position) < 1e-6:
-                    return LumenEntry(here.position, True, far.position)
-            return planned
         off = np.linalg.norm(self.bend.line - planned.position, axis=1).min()
-        if off < first.radius + last.radius:
-            return LumenEntry(planned.position, False, last.position)
+        if not planned.at_end and off < first.radius + last.radius:
+            return planned._replace(far=last.position)
+        for here, far in ((first, last), (last, first)):
+            if planned.at_end and np.allclose(here.position, planned.position, 0, 1e-6):
+                return planned._replace(far=far.position)
         return planned
 
     def named(self, curves: Sequence[np.ndarray]) -> Naming:
