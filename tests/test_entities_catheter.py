@@ -247,6 +247,14 @@ def test_rest_shape_turns_by_the_arcs(name):
     assert rest[1::2].sum() == pytest.approx(turning - lost, rel=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("stroke", 0.0), ("friction", 2.5), ("torsion_joints", 100)]
+)
+def test_impossible_figures_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} is {value}"):
+        compiled(rotation=True, **{name: value})
+
+
 def test_an_unknown_device_lists_the_known():
     with pytest.raises(
         ValueError, match=r"device is 'amplatz'.*steerable_5f.*lunderquist"

@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
@@ -85,6 +86,7 @@ def _rest_angles(device: devices.Device, lengths: np.ndarray):
 def _twists(device: devices.Device, lengths: np.ndarray, count: int):
     """Compliance of the torsion hinges, rad/(N·m), by link: of equal parts, ∫ds/GJ."""
     last = len(lengths) - 1
+    bounds.whole("torsion_joints", count, 0, last)  # one at each joint
     if count == 0:
         return {}
     half = _half_compliances(device, lengths, "torsional_stiffness")

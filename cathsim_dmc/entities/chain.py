@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from dm_control import composer, mjcf
 
+from cathsim_dmc import bounds
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.posture import x_first
@@ -131,6 +132,7 @@ class Chain(composer.ModelWrapperEntity):
         timestep: float,
     ) -> None:
         """Builds base, links, head, motors and sensors; `devices` are there."""
+        bounds.number("stroke", stroke, unit="m", positive=True)
         self.device = self.devices[-1]
         self.stroke, self.timestep, self.link_lengths = stroke, timestep, links.lengths
         root = mjcf.RootElement(model="catheter")

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from cathsim_dmc import bounds
+
 # Lubricated silicone, Coulomb.
 FRICTION = 0.037
 # Contact law of all devices. MuJoCo keeps the impedance d of a step's beginning
@@ -27,7 +29,7 @@ def wall_contact(friction: float) -> dict[str, Any]:
         "contype": 1,
         "conaffinity": 0,
         "condim": 3,
-        "friction": (friction, 0, 0),
+        "friction": (bounds.number("friction", friction, 0.0, 2.0), 0, 0),
         "solref": CONTACT_SOLREF,
         "solimp": CONTACT_SOLIMP,
     }
