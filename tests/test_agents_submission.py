@@ -123,6 +123,7 @@ def test_recorded_actions_give_the_same_episodes(recorded, tmp_path):
         ({}, {"task": "type1_bca"}, "actions of type1_lcca, not of type1_bca"),
         ({"actions": np.full((4, 12, 21), np.nan, np.float32)}, {}, "finite numbers"),
         ({"actions": np.zeros(48)}, {}, "float64 of shape"),
+        ({"seeds": np.arange(4)}, {}, "not the 4 of the varied protocol"),
         ({"header": np.array("{}")}, {}, "holds no recorded actions"),
     ],
 )

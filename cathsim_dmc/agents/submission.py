@@ -58,11 +58,13 @@ def submit(
         player = RecordedActions(policy)
         if task not in (None, player.task):
             raise ValueError(f"{policy} holds actions of {player.task}, not of {task}")
-        bounds.choice("task", player.task, suite.SUITE)
-        count = episodes or protocols.get(PROTOCOL).episodes
-        if len(player.actions) != count:
+        own = bounds.choice("task", player.task, suite.SUITE), player.task_kwargs or {}
+        conditions, seed = protocols.get(PROTOCOL), evaluation.EVALUATION_SEED
+        count = episodes or conditions.episodes
+        parts = protocols.parts(conditions, *own, count, seed)
+        if player.seeds != [seed for part in parts for seed in part.seeds]:
             raise ValueError(
-                f"{policy} holds {len(player.actions)} episodes, not the {count} of "
+                f"{policy} holds {len(player.seeds)} episodes, not the {count} of "
                 f"the {PROTOCOL} protocol; record them with agents.record_actions"
             )
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -121,18 +123,22 @@ class RecordedActions(Policy):
 
     Attributes:
         actions: (episodes, steps, A) in [-1, 1]; zeros after the end of an episode.
+        seeds: Those of the episodes.
     """
 
     def __init__(self, path: str | Path):
         """Reads a file of `record_actions`; ValueError if it is none or damaged."""
         wrong = LookupError, TypeError, ValueError
         with files.refused(ValueError, f"{path} holds no recorded actions", *wrong):
-            header, actions = files.read_arrays(path, ("header", "actions")).values()
+            names = "header", "seeds", "actions"
+            header, seeds, actions = files.read_arrays(path, names).values()
             values = json.loads(str(header))
             self.name = f"{values['policy']}, recorded actions"
             self.task, self.task_kwargs = values["task"], dict(values["task_kwargs"])
             self.observation = values["observation"]
-            self.actions = bounds.array("actions", actions, "f", (-1, -1, -1))
+            self.seeds = bounds.array("seeds", seeds, "i", (-1,)).tolist()
+            shape = len(self.seeds), -1, -1
+            self.actions = bounds.array("actions", actions, "f", shape)
         self._rows, self._step = slice(0, 0), 0
 
     def reset(self, view: View, which: np.ndarray) -> None:
@@ -193,6 +199,7 @@ def record_actions(
             one[episode.length :] = 0.0
         own = {name: result.settings[name] for name in ("observation", "task_kwargs")}
         header = json.dumps({"policy": result.policy, "task": result.task, **own})
+        arrays = {"header": header, "seeds": result.seeds, "actions": actions}
         with open(path, "wb") as stream:
-            np.savez_compressed(stream, header=np.array(header), actions=actions)
+            np.savez_compressed(stream, **arrays)
     return result
