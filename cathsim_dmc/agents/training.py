@@ -253,7 +253,7 @@ def take_over(
 
 
 def _entries(names: str | tuple[str, ...]) -> list[str]:
-    """Entries but for the word of where they are from: "route" is as "biplane"."""
+    """Entries without their first word, alike for "route" and "biplane"."""
     rows = observations.entries(observations.resolve(names))
     return sorted(entry.key.partition("_")[2] or entry.key for entry in rows)
 

@@ -1,9 +1,9 @@
 """The C-arm: position of X-ray source and detector about the patient.
 
-Pixel coordinates are (column, row): column grows to the right, row downwards, whole
-numbers are pixel *centres*, so (0, 0) is the centre of the top left pixel. The observer
-looks from the detector towards the source: the patient's left is on the right of an AP
-image and the head is up.
+The world is the patient frame LPS, in metres. Pixel coordinates are (column, row):
+column grows to the right, row downwards, and (0, 0) is the centre of the top left
+pixel. The observer looks from the detector towards the source: the patient's left is on
+the right of an AP image and the head is up.
 """
 
 from collections.abc import Mapping

@@ -89,7 +89,7 @@ def force_map() -> LinearSegmentedColormap:
 def background(
     surface: Any, view: str, size: int, rest: Any = None
 ) -> tuple[ParallelProjection, Glass]:
-    """A vessel as glass, `size` pixels long, in a view that `rest` (or it) centres."""
+    """A vessel as glass, `size` pixels long, in a view of `VIEWS` centred on `rest`."""
     _, right, up, *_ = VIEWS[view]
     middle = (rest or surface).vertices
     projection = ParallelProjection.of(middle, right, up, size=size)

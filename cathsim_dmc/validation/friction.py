@@ -114,7 +114,7 @@ class Capstan(NamedTuple):
         return float(np.log(ratio) / (self.angle * _LEVER))
 
     def check(self) -> Check:
-        """The coefficient that acts against the one set; ratios hide small ones."""
+        """Compares coefficients: a ratio near 1 would hide the error of a small one."""
         angle = np.degrees(self.angle)
         name = f"capstan, friction {self.friction:g} over {angle:.0f}°"
         note = f"friction {self.acting:.4f} acts, ratio {self.mean:.4f}, "

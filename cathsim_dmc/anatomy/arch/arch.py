@@ -1,7 +1,8 @@
 """Parametric aortic arches: presets, sets of random ones, and their anatomies.
 
-The inlet of the ascending aorta is at the origin. The presets of types I and II are
-idealised: straight limbs in a vertical plane. Type III and bovine curve in space.
+The inlet of the ascending aorta is at the origin of the patient frame LPS. The presets
+of types I and II are idealised: straight limbs in a vertical plane. Type III and bovine
+curve in space.
 """
 
 import math

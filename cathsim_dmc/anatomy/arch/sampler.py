@@ -56,7 +56,7 @@ _ARCH_RADIUS = (34e-3, 3.4e-3)  # m
 _ARCH_ASPECT = (0.9, 1.15)
 _DESCENDING_LENGTH = (105e-3, 125e-3)  # m, below the arch
 _AORTA_CORRELATION = 0.8  # of the levels of one aorta; an assumption
-# Draws stop at so many standard deviations, and what is left has so much of one.
+# Draws stop at `_CUT` standard deviations; what is left has `_CUT_DEVIATION` of one.
 _CUT, _CUT_DEVIATION = 2.2, 0.9162
 _ATTEMPTS = 1000
 _CORRECTIONS = 5  # of drop and ascending length towards what was drawn, at most

@@ -33,7 +33,7 @@ RING = 40e-3  # m, shortest ring
 class FreeEnd(NamedTuple):
     """A blind end of the lumen: place (3,) and radius near it, m.
 
-    Of the `bottleneck` (m) is the largest sphere that reaches the widest part from it.
+    The `bottleneck` is the largest radius of a sphere that reaches the widest part, m.
     """
 
     position: np.ndarray
