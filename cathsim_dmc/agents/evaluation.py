@@ -27,8 +27,6 @@ from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
 
-# Has the arguments of `environments.make_env`; "info" in what it makes has "success",
-# "physics_error", "path_ratio" and `physics.forces.NAMES`.
 EnvFactory = Callable[..., EnvBase]
 # Called after every step with the environment and which episodes (n,) bool still run.
 Observer = Callable[[EnvBase, np.ndarray], None]
@@ -180,6 +178,9 @@ def evaluate(
         num_threads: Number of threads of the simulation; None takes one per core.
         out_dir: Directory for evaluation.json; None writes none.
         observer: Function that is called after every step, before any reset.
+        make_env: Function with the arguments of `environments.make_env`; "info" of its
+            environment has "success", "physics_error", "path_ratio" and the forces
+            `physics.forces.NAMES`.
 
     Raises:
         ValueError: no task is known, or episodes < 1.

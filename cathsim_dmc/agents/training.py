@@ -83,6 +83,7 @@ def train(
         resume: Whether to continue the run there. One that was killed before its
             first checkpoint starts anew.
         progress: Whether to show progress on standard error.
+        make_env: As for `evaluate`.
         without_replay: Whether a run that is resumed starts with an empty replay
             (SAC, DAgger), as when its files are lost.
 
