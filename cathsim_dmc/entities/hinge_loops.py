@@ -144,3 +144,25 @@ def free_hinges(shape, compliance, angles):
             free[j, axis] -= compliance[j] * moment * turn[axis]
         moment -= (shape[j].conjugate() * 1j * bends[j]).real / compliance[j]
     return free
+
+
+@compiled
+def steered(commands, angles):
+    """Commands of motors, turned out of frames that do not twist into those of links.
+
+    Args:
+        commands: (N, 2 M), about x and y of the last M joints of each of N chains.
+        angles: (N, 2 J), positions of the hinges in the order of the chains, rad.
+
+    Returns:
+        Commands (N, 2 M).
+    """
+    turned = np.empty_like(commands)
+    motors = commands.shape[1] // 2
+    for i in range(len(commands)):
+        _, twists = bent(angles[i])
+        for m in range(motors):
+            torque = complex(commands[i, 2 * m], commands[i, 2 * m + 1])
+            torque *= unit(-twists[len(twists) - motors + m])
+            turned[i, 2 * m], turned[i, 2 * m + 1] = torque.real, torque.imag
+    return turned

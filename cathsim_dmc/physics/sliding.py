@@ -10,6 +10,7 @@ import operator
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc.entities import hinge_loops
 from cathsim_dmc.entities.chain import (
     MAX_PUSH_FORCE,
     MAX_PUSH_SPEED,
@@ -24,7 +25,7 @@ from cathsim_dmc.physics import sliding_loops
 from cathsim_dmc.physics.chain_fields import FIELDS, places_of
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.physics.effects import Effect, Episode, World
-from cathsim_dmc.physics.readings import CoaxialReadings, Readings
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings, ids
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 # Length of the straight device behind its base that X-rays meet, m.
@@ -49,26 +50,55 @@ class SingleDevice(Effect):
 
     data_fields: tuple[str, ...] = ("act",)
     model_fields: tuple[str, ...] = ()
+    # Whether it writes the springs of an unloaded shape.
+    _shaped = False
 
     def __init__(self, chain: Chain):
         """Takes the entity of the device."""
         self._radius = chain.device.outer_radius
         self._behind = BEHIND / float(chain.link_lengths[0])  # links
+        self._shaped = bool(chain.device.tip_shape)
+        if self._shaped:
+            self.model_fields = ("qpos_spring",)
 
     def bind(self, world: World) -> None:
-        """Finds the drives in the model."""
+        """Finds the drives and the hinges in the model."""
         super().bind(world)
         self._drives = Drives(world.model, world.arrays)
         self.slipped = self._drives.slipped
+        model, places = world.model, world.index.bends_qpos
+        self._bends_qpos = np.sort(places, axis=None)
+        # Of the unloaded device, whose shape lies in the plane of x and z.
+        self._shape = model.qpos_spring[places[:, 1]].astype(complex)
+        hinges = ids(model, world.chain.bends[::2])
+        self._compliance = 1 / model.jnt_stiffness[hinges]
 
     def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Holds the base of one simulation where it stands."""
         self._drives.hold(index)
+        self._bend(index)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
-        """Lets clamps slip; the motors take the action as it is."""
-        self._drives.follow(action[:, len(self.world.chain.tip_motors) :])
-        return action
+        """Lets clamps slip; turns motors and shape against the twist of the links."""
+        motors = len(self.world.chain.tip_motors)
+        self._drives.follow(action[:, motors:])
+        for index in range(len(action)):
+            self._bend(index)
+        if not motors:
+            return action
+        angles = self.world.arrays.qpos[:, self._bends_qpos]
+        commands = np.ascontiguousarray(action[:, :motors])
+        steered = hinge_loops.steered(commands, angles)
+        return np.concatenate([steered, action[:, motors:]], axis=1)
+
+    def _bend(self, index: int) -> None:
+        """Writes the springs of a shaped device for the angles of its hinges."""
+        if self._shaped:
+            angles = self.world.arrays.qpos[index, self._bends_qpos]
+            free = hinge_loops.free_hinges(self._shape, self._compliance, angles)
+            free[1::2] = free[1::2, ::-1]  # as the hinges lie
+            springs = self.world.field(index, "qpos_spring")
+            springs[self._bends_qpos] = free.ravel()
 
     def follower_posture(self) -> np.ndarray:
         """Joints (N, len(JOINTS)) of the robot that holds the devices."""

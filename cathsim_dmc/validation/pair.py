@@ -36,8 +36,6 @@ SHAPE_BOUND = 1.0  # % of the displacement of the end from the straight line
 DIRECTION_BOUND = 1.5  # °, of the last link
 BEND_RADIUS = 0.04  # m, of half a circle
 TWIST_BOUND = 1.0  # °, of the last frame there
-# °, of a single device, whose shape does not take the twist out: that of one link.
-SINGLE_TWIST_BOUND = 2.0
 
 SLIDING_TASK = "femoral_type1_lcca"
 SPEED = 0.01  # m/s, of one device through the other
@@ -109,21 +107,20 @@ def turned(names: Sequence[str], gaps: Sequence[float]) -> tuple[float, float, f
 
 
 def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float, float]:
-    """Twist of the last frame of a chain of links (L,), m, in half a circle of 40 mm.
+    """Twist at the last joint of links (L,), m, in half a circle of 40 mm.
 
     It begins after `start`, m, and lies in a plane about the axis, rad.
 
     Returns:
-        Twist of the last link, and of the link before it less the twist that coaxial
-        devices take out (`hinge_loops.bent`), against frames that do not twist, rad.
+        Angles, rad, by which the command of the last motor, and the unloaded shape at
+        the last joint, are turned against a frame that does not twist.
     """
     end = [[2 * BEND_RADIUS, 0, -1.0]]
     line = np.vstack([[[0, 0, 0]], half_circle(BEND_RADIUS, start, 399), end])
     line = Rotation.from_euler("z", plane).apply(line)
     angles = posture.joints_along(link_lengths, line)
     frame = still = Rotation.identity()
-    found = []
-    for joint, (x, y) in enumerate(angles, start=1):
+    for joint, (x, y) in enumerate(angles[:-1], start=1):
         first = posture.x_first(joint)
         turn = Rotation.from_euler("XY" if first else "YX", [x, y] if first else [y, x])
         frame = frame * turn
@@ -131,11 +128,12 @@ def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float,
         sine = np.linalg.norm(across)
         across *= np.arcsin(sine) / sine if sine else 1.0
         still = Rotation.from_rotvec(across) * still
-        found.append((still.inv() * frame).as_rotvec()[2])
+    twist = (still.inv() * frame).as_rotvec()[2]
     ordered = angles.copy()  # as the hinges lie
     ordered[1::2] = angles[1::2, ::-1]
+    ((x, y),) = hinge_loops.steered(np.array([[1.0, 0.0]]), ordered.reshape(1, -1))
     _, taken = hinge_loops.bent(ordered.ravel())
-    return float(found[-1]), float(found[-2] - taken[-1])
+    return float(twist + np.arctan2(y, x)), float(twist - taken[-1])
 
 
 def smoothness() -> Check:
@@ -238,12 +236,9 @@ def _shape_checks() -> Iterator[Check]:
     starts = np.arange(0.02, 0.2, 0.0175 / 2)
     bent = [twists(lengths, start, plane) for start in starts for plane in TURNS[:7]]
     worst = np.degrees(np.abs(bent).max(axis=0))
-    for what, value, bound in (
-        ("single", worst[0], SINGLE_TWIST_BOUND),
-        ("coaxial", worst[1], TWIST_BOUND),
-    ):
-        name = f"twist of the last frame in half a circle of 40 mm, {what} devices"
-        yield Check.at_most(name, value, bound, "°")
+    for what, value in zip(("motors", "shapes"), worst, strict=True):
+        name = f"twist of the last frame in half a circle of 40 mm, {what}"
+        yield Check.at_most(name, value, TWIST_BOUND, "°")
 
 
 def _checks(data: dict[str, Any]) -> Iterator[Check]:
