@@ -137,10 +137,11 @@ def test_randomised_episodes_are_equal():
     [
         ("simple1_bca_pair", {"randomisation": True}),
         ("type1_lcca_wire", {"randomisation": True}),
+        ("type1_lcca", {"device": "berenstein_5f", "rotation": True}),
         pytest.param("arch_bca_pair", {"pool": 2}, marks=pytest.mark.slow),
     ],
 )
-def test_coaxial_devices_are_equal(name, options):
+def test_shaped_devices_are_equal(name, options):
     pair = Pair(name, observation=["internal", "tracking", "force"], **options)
     pair.reset()
     for index, action in enumerate(actions(24, count=pair.batch.num_actions)):
