@@ -98,8 +98,15 @@ def background(
 
 def anatomy_figure(anatomy: Anatomy) -> Picture:
     """Draw lumen, centrelines, goals and inlet of an anatomy from three sides."""
-    figure = Picture(figsize=(13.5, 5.6), layout="constrained")
-    for axes, view in zip(figure.subplots(1, 3), VIEWS, strict=True):
+    x, y, z = np.ptp(anatomy.surface.vertices, axis=0)
+    heights = np.array([z, z, y])
+    size, rows, ratios = (13.5, 5.6), 1, None
+    if max(x, y) > 2 * z:  # a scan that lies: wide views one above the other
+        tall = 13.5 * float(heights.sum() / max(x, y))
+        size, rows, ratios = (13.5, tall + 3 * _LETTERING_IN), 3, heights
+    figure = Picture(figsize=size, layout="constrained")
+    panels = figure.subplots(rows, 3 // rows, height_ratios=ratios)
+    for axes, view in zip(panels, VIEWS, strict=True):
         draw_anatomy(axes, anatomy, view)
     named = figure.axes[0].get_legend_handles_labels()
     figure.legend(*named, fontsize=8, loc="outside lower center", ncols=7)
