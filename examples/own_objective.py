@@ -16,17 +16,17 @@ TASK = "gentle_type1_lcca"
 
 @dataclasses.dataclass(frozen=True)
 class GentleCannulation(Cannulation):
-    """Cannulation with a penalty on the wall force above 0.1 N."""
+    """Cannulation with a penalty on the largest contact above 0.1 N."""
 
     TERMS = {
         **Cannulation.TERMS,
-        "excess_force": lambda self, m: (m.wall_force.peak_max - 0.1).clip(min=0.0),
+        "hard_contact": lambda self, m: (m.wall_force.peak_max - 0.1).clip(min=0.0),
     }
 
 
 def gentle(anatomy, goal, *, tolerance_weight: float = 1.0):
     """The objective of the task; keyword arguments become options of the task."""
-    reward = {"distance": -1.0, "success": 10.0, "excess_force": -tolerance_weight}
+    reward = {"distance": -1.0, "success": 10.0, "hard_contact": -tolerance_weight}
     return GentleCannulation.to(anatomy, goal, reward=reward)
 
 

@@ -90,15 +90,15 @@ def assert_equal_rewards(task):
 
 def test_the_subclass_of_the_example(example):
     rewards, step = assert_equal_rewards(gentle(example))
-    assert {"distance", "success", "excess_force"} == set(step.outcome.terms)
+    assert {"distance", "success", "hard_contact"} == set(step.outcome.terms)
     plain = suite.make_task("type1_lcca").objective
     assert isinstance(plain, Cannulation)
-    assert "excess_force" not in plain.weights
+    assert "hard_contact" not in plain.weights
 
 
 def test_the_option_of_the_example_reaches_the_reward(example):
     heavy = gentle(example, tolerance_weight=5.0).objective
-    assert heavy.weights["excess_force"] == -5.0
+    assert heavy.weights["hard_contact"] == -5.0
     with pytest.raises(ValueError, match="tolerance_weight"):
         gentle(example, weight=5.0)
 
