@@ -88,7 +88,7 @@ def refused(
     try:
         yield
     except errors as error:
-        line = " ".join(str(error).split())[:200] or type(error).__name__
+        line = " ".join(str(error).split())[:1000] or type(error).__name__
         raise kind(f"{text}: {line}") from error
 
 

@@ -61,10 +61,10 @@ class RandomCurl(_Scripted):
             self._action[index, catheter.translations] = 1.0
 
 
-class Idle(_Scripted):
-    """No push, tip motors at rest."""
+class _Constant(_Scripted):
+    """The same action in every control step."""
 
-    name, push, bend = "idle", 0.0, 0.0
+    push = bend = 0.0
 
     def reset(self, view: View, which: np.ndarray) -> None:
         """Look up which entries of an action push, and bend the tip about x."""
@@ -74,13 +74,21 @@ class Idle(_Scripted):
         self._action[:, 0 : len(catheter.tip_motors) : 2] = self.bend
 
 
-class Push(Idle):
+class Idle(_Constant):
+    """No push, tip motors at rest."""
+
+    name = "idle"
+
+
+class Push(_Constant):
     """Full push, tip motors at rest."""
 
-    name, push = "push", 1.0
+    name = "push"
+    push = 1.0
 
 
-class Curl(Push):
+class Curl(_Constant):
     """Full push, the tip bent as far as it goes: the device jams."""
 
-    name, bend = "curl", 1.0
+    name = "curl"
+    push = bend = 1.0

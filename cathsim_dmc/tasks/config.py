@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -89,12 +90,12 @@ class NavigationConfig:
     working_length: float | None = None
     physics_timestep: float = PHYSICS_TIMESTEP
     outside_range: bool = False
-    # With the types that they have after validation.
-    fluoroscopy: FluoroscopyOptions = FluoroscopyOptions()
-    endoluminal_size: tuple[int, int] = (128, 128)
-    randomisation: Randomisation = Randomisation()
+    # What makes an object is given; the object is here after validation.
+    fluoroscopy: Any = FluoroscopyOptions()
+    endoluminal_size: Any = (128, 128)
+    randomisation: Any = Randomisation()
     effects: Sequence[Effect] = ()
-    vessel: VesselOptions = VesselOptions()
+    vessel: Any = VesselOptions()
 
     def __post_init__(self):
         self._check_devices()
