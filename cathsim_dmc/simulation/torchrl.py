@@ -45,8 +45,14 @@ class BatchedEnv(EnvBase):
             num_threads: Number of threads of the simulation, None for one per core.
             seed: Seed of each simulation, or of the first, the others counting up.
             observation: Name or names of observations.
+            task_kwargs: Other options of the task.
+
+        Raises:
+            ValueError: an option is not allowed.
         """
         options = bounds.options("task_kwargs", task_kwargs)
+        if "observation" in options:
+            bounds.refuse("task_kwargs", options, "without observation, an argument")
         self.simulation = BatchSimulation(
             suite.make_task(task_name, **{**options, "observation": observation}),
             num_envs,
