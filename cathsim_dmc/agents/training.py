@@ -242,19 +242,19 @@ def take_over(
     (middle,) = (v for n, v in given.items() if n.endswith(("log_std", "log_std.bias")))
     if config.initial_std is not None:
         middle = torch.full_like(middle, config.initial_std).log()
-    alike = given.keys() == state.keys() and config.initial_std is None
+    kept = given.keys() == state.keys() and config.initial_std is None
     for key, value in state.items():
-        if alike or "log_std" not in key:
+        if kept or "log_std" not in key:
             state[key] = given[key]
         elif value.ndim == 1:
             state[key] = middle.clamp(*LOG_STD_RANGE)
         else:
-            state[key] = torch.zeros_like(value)  # alike in all states
+            state[key] = torch.zeros_like(value)  # equal in all states
     network.load_state_dict(state)
 
 
 def _entries(names: str | tuple[str, ...]) -> list[str]:
-    """Entries without their first word, alike for "route" and "biplane"."""
+    """Entries without their first word, which differs between "route" and "biplane"."""
     rows = observations.entries(observations.resolve(names))
     return sorted(entry.key.partition("_")[2] or entry.key for entry in rows)
 

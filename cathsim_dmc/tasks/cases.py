@@ -64,12 +64,12 @@ class Case:
 
 
 def compile_together(
-    rooms: Iterable[tuple[Scene, Objective]], config: NavigationConfig
+    scenes: Iterable[tuple[Scene, Objective]], config: NavigationConfig
 ) -> tuple[Case, ...]:
     """Compiles scenes so that any of them can be written into a model of the first.
 
     Args:
-        rooms: Scenes of one device, not compiled yet, with success and reward in each;
+        scenes: Scenes of one device, not compiled yet, with success and reward in each;
             the first one alone is drawn.
         config: Options of the task.
 
@@ -79,7 +79,7 @@ def compile_together(
     found: list[Case] = []
     sizes: dict[str, int] = {}  # of all that differs in any of them
     first, host = None, None
-    for scene, objective in rooms:
+    for scene, objective in scenes:
         root = scene.arena.mjcf_model
         root.option.timestep = config.physics_timestep
         spec = mujoco.MjSpec.from_string(root.to_xml_string(), assets=root.get_assets())

@@ -92,8 +92,8 @@ class Navigation(composer.Task):
         self.set_timesteps(CONTROL_TIMESTEP, config.physics_timestep)
         self._cases: tuple[cases.Case, ...] = ()
         if others is not None:
-            rooms = itertools.chain([(scene, objective)], others)
-            self._cases = cases.compile_together(rooms, config)
+            scenes = itertools.chain([(scene, objective)], others)
+            self._cases = cases.compile_together(scenes, config)
         self._compiled = False
         self._step: Step | None = None
 
