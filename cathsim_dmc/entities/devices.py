@@ -223,11 +223,11 @@ DEVICES: dict[str, Device] = {
 }
 
 
-def get(device: "str | Device") -> Device:
-    """Returns a device by name, or as given; ValueError if there is none."""
+def get(device: "str | Device", option: str = "device") -> Device:
+    """Returns a device by name, or as given; ValueError names the option if none."""
     if isinstance(device, Device):
         return device
-    return DEVICES[bounds.choice("device", device, DEVICES)]
+    return DEVICES[bounds.choice(option, device, DEVICES)]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -139,7 +139,7 @@ def chosen_devices(config: NavigationConfig) -> tuple[devices.Device, ...]:
     """The devices of a task, from the innermost outwards."""
     if config.devices is None:
         return (devices.get(config.device),)
-    return tuple(devices.get(device) for device in config.devices)
+    return tuple(devices.get(one, "a name in devices") for one in config.devices)
 
 
 def longest_tip(chosen: Sequence[devices.Device]) -> devices.Device:
