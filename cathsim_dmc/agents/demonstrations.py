@@ -114,6 +114,11 @@ def record_demonstrations(
         description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
         f"seeds from {seed}",
     )
+    return _summary(out, buffers)
+
+
+def _summary(out: Path, buffers: list[Any]) -> Demonstrations:
+    """What a dataset has, by the buffers that were written to it."""
     means = [np.mean(buffer.infos["wall_force_sum"][1:]) for buffer in buffers]
     largest = [np.max(buffer.infos["wall_force_max"][1:]) for buffer in buffers]
     return Demonstrations(

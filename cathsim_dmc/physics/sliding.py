@@ -76,14 +76,16 @@ class SingleDevice(Effect):
     def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Holds the base of one simulation where it stands."""
         self._drives.hold(index)
-        self._bend(index)
+        if self._shaped:
+            self._bend(index)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Lets clamps slip; turns motors and shape against the twist of the links."""
         motors = len(self.world.chain.tip_motors)
         self._drives.follow(action[:, motors:])
-        for index in range(len(action)):
-            self._bend(index)
+        if self._shaped:
+            for index in range(len(action)):
+                self._bend(index)
         if not motors:
             return action
         angles = self.world.arrays.qpos[:, self._bends_qpos]
@@ -93,12 +95,10 @@ class SingleDevice(Effect):
 
     def _bend(self, index: int) -> None:
         """Writes the springs of a shaped device for the angles of its hinges."""
-        if self._shaped:
-            angles = self.world.arrays.qpos[index, self._bends_qpos]
-            free = hinge_loops.free_hinges(self._shape, self._compliance, angles)
-            free[1::2] = free[1::2, ::-1]  # as the hinges lie
-            springs = self.world.field(index, "qpos_spring")
-            springs[self._bends_qpos] = free.ravel()
+        angles = self.world.arrays.qpos[index, self._bends_qpos]
+        free = hinge_loops.free_hinges(self._shape, self._compliance, angles)
+        springs = self.world.field(index, "qpos_spring")
+        springs[self.world.index.bends_qpos] = free
 
     def follower_posture(self) -> np.ndarray:
         """Joints (N, len(JOINTS)) of the robot that holds the devices."""
