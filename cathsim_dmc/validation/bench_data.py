@@ -112,7 +112,7 @@ def read(folder: str | Path) -> Bench:
         surface, where = _opened(vertices, faces, Inlet("entry", where, -out, radius))
         ends = {ARCH: _vector(marks, "ascending_aorta_root_mm") / 1e3}
         for name, mark in marks.items():
-            if "ostium_mm" in mark:
+            if isinstance(mark, Mapping) and "ostium_mm" in mark:
                 end = "end_mm" if "end_mm" in mark else "fork_mm"
                 ends[name] = _vector(mark, end) / 1e3
         # Directions to the patient's six sides, and none.
