@@ -160,6 +160,19 @@ def test_functions_and_trained_policies_act_on_a_composer_timestep(tmp_path):
     assert not episode.action.any()
 
 
+def test_a_function_answers_with_arrays_or_is_named():
+    seen = {"vector": np.zeros(3)}
+    for answer in ([[0.5, 0.0]], np.array([[0.5, 0.0]]), torch.tensor([[0.5, 0.0]])):
+        action = load_policy(lambda _, answer=answer: answer).act(seen)
+        assert action.dtype == np.float32 and action.tolist() == [[0.5, 0.0]]
+
+    def lost(observation):
+        return None
+
+    with pytest.raises(TypeError, match="policy lost answered with a NoneType.*action"):
+        load_policy(lost).act(seen)
+
+
 def test_what_is_no_policy_is_refused(tmp_path):
     with pytest.raises(ValueError, match="random, push, expert"):
         policies.make_policy("expret")

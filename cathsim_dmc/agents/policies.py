@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cathsim_dmc import suite
+from cathsim_dmc import files, suite
 from cathsim_dmc.agents import pretrained
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.policies import POLICIES, Policy, View, make_policy
@@ -19,7 +20,9 @@ from cathsim_dmc.simulation import environments
 
 # Gets the standard observations (N, ...), returns the actions (N, A) or the TensorDict
 # with "action" in it.
-PolicyFunction = Callable[[TensorDictBase], TensorDictBase | torch.Tensor]
+PolicyFunction = Callable[
+    [TensorDictBase], TensorDictBase | torch.Tensor | npt.ArrayLike
+]
 PolicyLike = str | Path | Checkpoint | Policy | PolicyFunction
 
 
@@ -43,8 +46,14 @@ class FunctionPolicy(Policy):
             observation = TensorDict(environments.standard(entries, 1), batch_size=[1])
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             answer = self._function(observation)
-        action = answer if isinstance(answer, torch.Tensor) else answer["action"]
-        return action.to(torch.float32).numpy()
+        action = answer["action"] if isinstance(answer, TensorDictBase) else answer
+        with files.refused(
+            TypeError,
+            f"policy {self.name} answered with a {type(answer).__name__}; it must be "
+            "actions (N, A) or a TensorDict with them as 'action'",
+            *(TypeError, ValueError, RuntimeError),
+        ):
+            return torch.as_tensor(action, dtype=torch.float32).numpy()
 
 
 class TrainedPolicy(FunctionPolicy):

@@ -63,7 +63,7 @@ class SACConfig(ActorCriticConfig):
         "published": {},
         "demo": {"num_envs": 32, "updates_per_frame": 0.25},
         "tuned": _TUNED,
-        "tuned_image": {**_TUNED, **TUNED_IMAGES},
+        "tuned_image": {**_TUNED, **TUNED_IMAGES, "batch_size": 128},
     }
 
     batch_size: int = positive(256)
