@@ -28,9 +28,9 @@ VOLUME = (0.5e-6, 2e-3)  # m^3 of a lumen
 RADII = (0.3e-3, 30e-3)  # m, allowed median of a vessel: arteriole, aneurysm
 WIDEST = 45e-3  # m
 ONE_OSTIUM = 3e-3  # m of the aorta between ostia that are one
-START = 75e-3  # m past the inlet, deepest start of a device
-START_CLEARANCE = 1e-3  # m between the device and the wall there
-START_ROOM = 10e-3  # m between the head at the start and a goal's ostium
+# The head of a device starts half the way to the first ostium deep, but 5 mm at least
+# (`tasks.placement`), and turns into ostia that are 5 mm or more ahead of it.
+OSTIUM_AHEAD = 10e-3  # m, least distance of an ostium from the inlet
 
 
 def check_tree(anatomy: Anatomy) -> dict[str, str]:
@@ -218,29 +218,42 @@ def _inlet(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
         )
 
 
-def _start(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
-    """Whether a device that starts straight begins before every goal's ostium."""
+def unreachable(anatomy: Anatomy) -> dict[str, list[str]]:
+    """Names of the goals that a device is past when it starts, by the reason.
+
+    They lie behind the inlet, or in a branch that leaves the inlet's vessel less than
+    `OSTIUM_AHEAD` past the inlet, or before it.
+    """
     inlet, tree = anatomy.inlet, anatomy.tree
-    s = np.arange(START_CLEARANCE, START, STEP)
-    depth = measure(inlet.position + s[:, None] * inlet.direction)
-    # At the inlet's cap the surface is near, but open.
-    tight = (depth < START_CLEARANCE) & (s > 2.0 * inlet.radius)
-    run = float(s[tight.argmax()] if tight.any() else START)
-    head = inlet.position + run * inlet.direction
+    line = tree.vessel(inlet.vessel).centreline
+    start = line.locate(inlet.position)
+    forward = np.sign(line.at(start).tangent @ inlet.direction)
+    found: dict[str, list[str]] = {}
     for name, goal in anatomy.goals.items():
         if goal.vessel == inlet.vessel:
-            continue
-        branch = tree.vessel(goal.vessel)
-        while branch.parent not in (inlet.vessel, None):
-            branch = tree.vessel(branch.parent)
-        ostium = branch.mouth.position
-        here, there = anatomy.route(name).project(np.stack([head, ostium])).arc_length
-        if here > there - START_ROOM:
-            yield (
-                f"the ostium of {branch.name} is {there * 1e3:.0f} mm from the inlet "
-                f"and a device starts {here * 1e3:.0f} mm deep, past it: {name} cannot "
-                "be reached; choose an inlet farther back"
-            )
+            place, least, what = goal.arc_length, 0.0, f"{name} lies"
+        else:
+            branch = tree.vessel(goal.vessel)
+            while branch.parent not in (inlet.vessel, None):
+                branch = tree.vessel(branch.parent)
+            if branch.parent is None:
+                continue  # the device enters by a branch, and leaves it at its ostium
+            place, least = line.locate(branch.mouth.position), OSTIUM_AHEAD
+            what = f"{branch.name} leaves {inlet.vessel}"
+        ahead = forward * (place - start)
+        if ahead < least:
+            side = "past" if ahead > 0.0 else "before"
+            where = f"{what} {abs(ahead) * 1e3:.0f} mm {side} the inlet"
+            found.setdefault(where, []).append(name)
+    return found
+
+
+def _start(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
+    for where, names in unreachable(anatomy).items():
+        yield (
+            f"{where}, where a device starts: {', '.join(names)} cannot be reached; "
+            "choose another inlet"
+        )
 
 
 _CHECKS = {

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import extract
 from cathsim_dmc.anatomy.scan.aorta import mirrored
 from cathsim_dmc.anatomy.scan.arches import SURE, Arch
-from cathsim_dmc.anatomy.scan.check import check_tree
+from cathsim_dmc.anatomy.scan.check import check_tree, unreachable
 from cathsim_dmc.anatomy.scan.curves import inside_part, read_curves
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS, listed
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
@@ -121,7 +122,7 @@ def import_scan(
 
 
 def _anatomy(name, tree, opening, surface, say, note) -> Anatomy:
-    """The anatomy of a tree, proved against its surface; notes what one may accept."""
+    """The anatomy of a tree, proved against its surface; notes goals left out."""
     sizes = [
         f"{key} {vessel.centreline.length * 1e3:.0f} mm"
         + (f" from {vessel.parent}" if vessel.parent else "")
@@ -130,15 +131,20 @@ def _anatomy(name, tree, opening, surface, say, note) -> Anatomy:
     say(f"tree: {', '.join(sizes)}")
     ends = flat_ends(tree, opening)
     anatomy = Anatomy(name, tree, opening, place_goals(tree), ends, surface)
+    for where, missed in unreachable(anatomy).items():
+        note(
+            f"{where}, where a device starts: {', '.join(missed)} left out of the "
+            "goals; choose another inlet (--inlet) to reach them"
+        )
+        goals = {k: goal for k, goal in anatomy.goals.items() if k not in missed}
+        anatomy = replace(anatomy, goals=goals)
     for check, wrong in check_tree(anatomy).items():
-        if wrong and check != "start of the device" and anatomy.goals:
+        if wrong:
             raise ValueError(
                 f"the tree does not agree with the surface ({check}): {wrong}. Mend "
                 "the surface or the centrelines there, or give its frame (mesh_frame, "
                 "axes), the inlet, or other centrelines."
             )
-        if wrong:
-            note(f"{check}: {wrong}")
     return anatomy
 
 
