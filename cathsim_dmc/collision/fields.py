@@ -17,6 +17,7 @@ import ctypes
 import functools
 import hashlib
 import re
+import types
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -74,18 +75,16 @@ class _Table:
         self._kept: dict[int, Any] = {}
         self._words, self._message = table.TABLE, ctypes.create_string_buffer(_MESSAGE)
         self._library = _mujoco_library()
-        functions = (ctypes.c_void_p * (_TYPES * _TYPES)).in_dll(
+        self._functions = (ctypes.c_void_p * (_TYPES * _TYPES)).in_dll(
             self._library, "mjCOLLISIONFUNC"
         )
+        for kind, place in (_CAPSULE, table.OF_CAPSULE), (_SPHERE, table.OF_SPHERE):
+            before = self._functions[kind * _TYPES + _BOX]
+            self._words[place // 8] = before or 0
         error = ctypes.cast(self._library.mju_error, ctypes.c_void_p).value
         self._words[table.ERROR // 8] = error or 0
         self._words[table.MESSAGE // 8] = ctypes.addressof(self._message)
-        for kind, place, function in (
-            (_CAPSULE, table.OF_CAPSULE, loops.of_capsule),
-            (_SPHERE, table.OF_SPHERE, loops.of_sphere),
-        ):
-            self._words[place // 8] = functions[kind * _TYPES + _BOX] or 0
-            functions[kind * _TYPES + _BOX] = function.address
+        self._collide_by(loops)
         self._rows = self._words[table.HEAD :].reshape(-1, table.ENTRY)
         self._motion = table.MOTION_ENTRY // 8
 
@@ -111,6 +110,14 @@ class _Table:
         self._kept[key].append(lattice)
         row = self._rows[np.flatnonzero(self._rows[:, 0] == key)[0]]
         row[self._motion] = lattice.ctypes.data
+        from cathsim_dmc.collision import moving
+
+        self._collide_by(moving)
+
+    def _collide_by(self, module: types.ModuleType) -> None:
+        # The functions of `moving` do what those of `loops` do, and more.
+        self._functions[_CAPSULE * _TYPES + _BOX] = module.of_capsule.address
+        self._functions[_SPHERE * _TYPES + _BOX] = module.of_sphere.address
 
 
 _get_table = functools.cache(_Table)

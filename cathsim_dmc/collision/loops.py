@@ -1,4 +1,7 @@
-"""The collider, compiled: capsules and spheres against a field; see `fields`."""
+"""The collider, compiled: capsules and spheres against a field; see `fields`.
+
+`moving` has the collider of walls that move, which takes a second more to compile.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,6 @@ import math
 import numpy as np
 
 from cathsim_dmc.anatomy.field_loops import FREE
-from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, courses, in_space, warp
 from cathsim_dmc.collision.native import (
     address_of,
     call_collision,
@@ -33,7 +35,6 @@ from cathsim_dmc.collision.table import (
     ERROR,
     LUMEN,
     MESSAGE,
-    MOTION_ENTRY,
     OF_CAPSULE,
     OF_SPHERE,
     SYMBOL,
@@ -41,9 +42,7 @@ from cathsim_dmc.collision.table import (
     entry_of,
     into,
     key_of,
-    motion_of,
     posed,
-    sheathed,
     swept,
 )
 from cathsim_dmc.compiled import compiled
@@ -70,10 +69,14 @@ SOFT, _LIGHT = 0.7, 15.0
 _TOUCH = 1e-4
 _AT_WALL = -1e-9  # m, the depth of a link so close
 # So is a link that would be so deep, m, at the end of the physics step: it hits.
-_IMPACT = 1e-4
-# In a moving vessel a capsule is looked for by its straight image at rest, which is off
-# by so much, m, and by the strain of space; its contacts are looked up exactly.
-_IMAGE = 0.2e-3
+IMPACT = 1e-4
+
+
+@compiled
+def finite(pose):
+    """Whether a place (3) and an axis (3) are numbers."""
+    local, axis = pose
+    return math.isfinite(local[0] + local[1] + local[2] + axis[0] + axis[1] + axis[2])
 
 
 @compiled
@@ -231,7 +234,7 @@ def sweep(model, data, geoms, axis, half, law):
     travel, turn = into(frame, travel), into(frame, turn)
     aside = across(turn, axis)
     ahead = length(travel) + half * length(aside)
-    return travel, aside, law[0] + ahead - _IMPACT
+    return travel, aside, law[0] + ahead - IMPACT
 
 
 @compiled
@@ -262,7 +265,7 @@ def at_rest(model, data, contacts, geoms, entry, pose, half, closed, margin, law
         else:
             hits = along(travel, aside, t)
             ahead = normal[0] * hits[0] + normal[1] * hits[1] + normal[2] * hits[2]
-            if depth + ahead > radius - _IMPACT:
+            if depth + ahead > radius - IMPACT:
                 continue
             rows[0, 0], rows[0, 1], rows[0, 2] = normal
             rows[0, 3], planes = depth, 1
@@ -272,68 +275,21 @@ def at_rest(model, data, contacts, geoms, entry, pose, half, closed, margin, law
 
 
 @compiled
-def in_motion(model, data, contacts, geoms, entry, pose, half, closed, margin, law):
-    """Number of contacts, written, with a field that moves."""
-    radius, near, soft, held, light = law
-    local, axis = pose
-    limit = radius + margin + near
-    time, lattice = data_field(data, "time"), numbers(word(entry + MOTION_ENTRY))
-    parameters = data_field(data, "userdata")[motion_of(model, data) :]
-    # The sheath lies where it does, whatever moves past it.
-    centre = data_field(data, "geom_xpos")[geoms[0]]
-    if sheathed(model, data, int(parameters[10]), centre):
-        if clearance(entry, local[0], local[1], local[2]) >= FREE:
-            return 0
-    scratch = np.empty(WARP + 4 * VALUES)
-    there, values = scratch[:WARP], scratch[WARP:].reshape(VALUES, 4)
-    course = courses(parameters, time)
-    warp(lattice, course, local[0], local[1], local[2], values, there)
-    strain = 0.0
-    for k in range(3, 12):
-        strain += (there[k] - (1.0 if k % 4 == 3 else 0.0)) ** 2
-    x = there[3] * axis[0] + there[4] * axis[1] + there[5] * axis[2]
-    y = there[6] * axis[0] + there[7] * axis[1] + there[8] * axis[2]
-    z = there[9] * axis[0] + there[10] * axis[1] + there[11] * axis[2]
-    stretch = math.sqrt(x * x + y * y + z * z)
-    way, image = (x / stretch, y / stretch, z / stretch), (there[0], there[1], there[2])
-    travel, aside, far = sweep(model, data, geoms, axis, half, law)
-    reach = (1.0 + math.sqrt(strain)) * (max(limit, far) - there[12]) + _IMAGE
-    seen = touches(entry, image, way, half * stretch, closed, reach)
-    if seen[0] == 0:
-        return 0
-    rows, written = np.empty((6, 4)), 0
-    for n in range(seen[0]):
-        t, depth, lowest, most = nth(seen, n, soft)
-        if not most:
-            continue
-        turns = 0 if half == 0.0 else 1 + int(lowest and abs(t) >= half * stretch)
-        t /= stretch
-        x, y, z = along(local, axis, t)
-        warp(lattice, course, x, y, z, values, there)
-        place = (there[0], there[1], there[2])
-        depth = clearance(entry, place[0], place[1], place[2])
-        if depth >= FREE:
-            continue
-        normal = away(entry, place[0], place[1], place[2])
-        if normal == (0.0, 0.0, 0.0):
-            continue
-        rows[0, 0], rows[0, 1], rows[0, 2] = normal
-        rows[0, 3], planes = depth, 1
-        in_space(there, rows, planes)
-        bound = limit if lowest else radius + margin
-        if rows[0, 3] <= bound:
-            # A lumen that has grown is held where it is, not where it was at rest.
-            grown = max(held - there[12], 1e-9) if held > 0.0 else 0.0
-            seen_at = place, way, normal, depth, reach
-            planes = tangents(entry, *seen_at, grown, light, turns, rows)
-            in_space(there, rows, planes)
-        else:
-            bound, hits = np.inf, along(travel, aside, t)
-            ahead = rows[0, 0] * hits[0] + rows[0, 1] * hits[1] + rows[0, 2] * hits[2]
-            if rows[0, 3] + ahead > radius - _IMPACT:
-                continue
-        written = put(data, contacts, geoms, written, most, rows, planes, t, bound, law)
-    return written
+def given(model, data, contacts, geom1, geom2, half, margin, entry):
+    """What `at_rest` takes of a capsule, or a sphere, and the geom of an entry."""
+    radius = model_field(model, "geom_size")[geom1, 0]
+    closed = ends(model, data, geom1, half)
+    pose = posed(data, entry, geom1, geom2)
+    # A straight sheath holds the shaft without any load.
+    near = 0.0 if margin > 0.0 or straight(entry) else _TOUCH
+    impedance = model_field(model, "geom_solimp")[geom1, 0]
+    soft = impedance == SOFT and word(entry + 8) == LUMEN
+    light = 0.0
+    if soft:
+        light = _LIGHT / abs(model_field(model, "geom_solref")[geom1, 0])
+    law = (radius, near, soft, radius if impedance < _SLACK or soft else 0.0, light)
+    geoms = geom1, geom2
+    return model, data, contacts, geoms, entry, pose, half, closed, margin, law
 
 
 @compiled
@@ -352,25 +308,10 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     if entry == 0:
         call_error(word(table + ERROR), word(table + MESSAGE), geom2)
         return np.int32(0)
-    size = model_field(model, "geom_size")[geom1]
-    radius, half = size[0], size[1] if before == OF_CAPSULE else 0.0
-    geoms, closed = (geom1, geom2), ends(model, data, geom1, half)
-    pose = local, axis = posed(data, entry, geom1, geom2)
+    half = model_field(model, "geom_size")[geom1, 1] if before == OF_CAPSULE else 0.0
+    taken = given(model, data, contacts, geom1, geom2, half, margin, entry)
     # What is no number has no place in a lattice; MuJoCo's checks of the state tell.
-    if not math.isfinite(local[0] + local[1] + local[2] + axis[0] + axis[1] + axis[2]):
-        return np.int32(0)
-    # A straight sheath holds the shaft without any load.
-    near = 0.0 if margin > 0.0 or straight(entry) else _TOUCH
-    impedance = model_field(model, "geom_solimp")[geom1, 0]
-    soft = impedance == SOFT and word(entry + 8) == LUMEN
-    light = 0.0
-    if soft:
-        light = _LIGHT / abs(model_field(model, "geom_solref")[geom1, 0])
-    law = (radius, near, soft, radius if impedance < _SLACK or soft else 0.0, light)
-    given = model, data, contacts, geoms, entry, pose, half, closed, margin, law
-    if word(entry + MOTION_ENTRY) != 0 and motion_of(model, data) != 0:
-        return np.int32(in_motion(*given))
-    return np.int32(at_rest(*given))
+    return np.int32(at_rest(*taken) if finite(taken[5]) else 0)
 
 
 @callback("int32(int64, int64, int64, int32, int32, float64)")
