@@ -285,7 +285,7 @@ def test_a_named_carotid_keeps_what_it_shares_with_a_nameless_branch():
     way = {k: ways.points[ways.trace(before, ways.node(p))] for k, p in ends.items()}
     for drawn, stem in ((False, "lcca"), (True, "branch_1")):
         curves = {"branch_1": way["wide"], "lcca": way["thin"]}
-        tree = grow_tree(field, ways, curves, inlet, ends["aorta"], "aorta", drawn)
+        tree = grow_tree(field, ways, curves, inlet, ends["aorta"], drawn)
         (other,) = set(curves) - {stem}
         assert (tree.vessel(stem).parent, tree.vessel(other).parent) == ("aorta", stem)
 

@@ -68,15 +68,13 @@ Random = np.random.RandomState | np.random.Generator
 
 
 def sample(
-    random_state: Random, arch_type: str | None = None, *, variant: str = "normal"
+    random_state: Random, arch_type: str, *, variant: str = "normal"
 ) -> ArchParameters:
     """Random arch from the anatomical distributions, measured to be of the type drawn.
 
-    The type is "I", "II", "III", or None to draw it by prevalence, and the variant one
-    of `VARIANTS`, else ValueError. The same random state gives the same arch.
+    The type is "I", "II" or "III", and the variant one of `VARIANTS`, else ValueError.
+    The same random state gives the same arch.
     """
-    if arch_type is None:
-        arch_type = kind_at(random_state.uniform())
     bounds.choice("arch_type", arch_type, DROP_RANGES)
     bounds.choice("variant", variant, VARIANTS)
     for _ in range(_ATTEMPTS):

@@ -17,12 +17,12 @@ BALL, SECTION = 1.5e-3, 3e-3
 SLIT = 1.25  # of the ball's radius: a section's radius is no larger
 
 
-def resample(points: np.ndarray, step: float = STEP) -> np.ndarray:
-    """Points of a polyline (n, 3) m at equal distances of about ``step``."""
+def resample(points: np.ndarray) -> np.ndarray:
+    """Points of a polyline (n, 3) m at equal distances of about `STEP`."""
     apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-9
     points = points[np.concatenate([[True], apart])]
     s = arc_lengths(points)
-    t = np.linspace(0.0, s[-1], max(2, int(round(s[-1] / step)) + 1))
+    t = np.linspace(0.0, s[-1], max(2, int(round(s[-1] / STEP)) + 1))
     return np.stack([np.interp(t, s, points[:, k]) for k in range(3)], -1)
 
 

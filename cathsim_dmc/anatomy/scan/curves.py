@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc.anatomy.scan.naming import ROOT
 from cathsim_dmc.anatomy.scan.units import to_lps, upright
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
@@ -16,16 +17,12 @@ INSIDE = 0.7  # share of a centreline's points that must lie in the lumen
 
 
 def read_curves(
-    paths: Sequence[str | Path],
-    units: str,
-    frame: str,
-    axes: str | ArrayLike | None,
-    root: str,
+    paths: Sequence[str | Path], units: str, frame: str, axes: str | ArrayLike | None
 ) -> dict[str, np.ndarray]:
     """Points (n, 3) m, LPS, of drawn centrelines, by the names of their vessels.
 
     Files are read as by `read_curve`; see `units.upright` for `axes`. ValueError if a
-    file holds no centreline, or two give one name, or the `root`'s.
+    file holds no centreline, or two give one name, or `ROOT`.
     """
     listed = isinstance(paths, Sequence) and not isinstance(paths, str | bytes)
     if not listed or not all(isinstance(path, str | Path) for path in paths):
@@ -37,10 +34,10 @@ def read_curves(
     for path in paths:
         points = read_curve(path, units, frame) @ upright(axes).T
         name = vessel_name(path)
-        if name in curves or name == root:
+        if name in curves or name == ROOT:
             raise ValueError(
                 f"{path} gives the vessel name {name!r}, which is taken (names: "
-                f"{', '.join([root, *curves])}); rename the file."
+                f"{', '.join([ROOT, *curves])}); rename the file."
             )
         curves[name] = points
     return curves

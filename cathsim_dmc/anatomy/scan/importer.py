@@ -31,7 +31,6 @@ from cathsim_dmc.anatomy.scan.units import in_mm, to_lps
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
-ROOT = "aorta"
 NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
 SHARES = (1.0, 0.6, 0.3)  # of a blind end that are tried to be cut off at the inlet
 
@@ -47,7 +46,6 @@ def import_scan(
     name: str | None = None,
     inlet: Sequence[float] | None = None,
     heart: Sequence[float] | None = None,
-    root: str = ROOT,
     rename: Mapping[str, str] | None = None,
     progress: Callable[[str], None] | None = None,
     notes: list[str] | None = None,
@@ -72,7 +70,6 @@ def import_scan(
             else the wide end farthest from their starts or from the widest end.
         heart: (x, y, z) near the end of the aorta that is at the heart; None finds it
             by width and length of both legs, their sides and their branches.
-        root: name of the vessel that starts at the inlet.
         rename: new names of computed vessels by their computed names.
         progress: called with a line for every step: its name or "note", then text.
         notes: list to which what was guessed, mended and left out is added.
@@ -104,16 +101,16 @@ def import_scan(
     if not all(VESSEL_NAME.fullmatch(str(wanted)) for wanted in changes.values()):
         bounds.refuse("rename", rename, "names of small letters, digits and '_'")
     # Refused before the long steps; read again when the unit is known.
-    read_curves(centreline_paths, units or "mm", mesh_frame, axes, root)
+    read_curves(centreline_paths, units or "mm", mesh_frame, axes)
     lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, say)
     note(*lumen.notes)
     measure = SurfaceDepth(lumen.surface)
     matrix = to_lps(lumen.units, mesh_frame, axes)
     places = {key: _placed(key, matrix @ x, measure) for key, x in given.items()}
-    curves = read_curves(centreline_paths, lumen.units, mesh_frame, axes, root)
+    curves = read_curves(centreline_paths, lumen.units, mesh_frame, axes)
     curves = {key: inside_part(key, c, measure) for key, c in curves.items()}
     say(f"tree: looking for vessels in {len(lumen.surface.faces):,} triangles")
-    grown = _tree(measure, curves, places, root, changes, note)
+    grown = _tree(measure, curves, places, changes, note)
     name = name or Path(mesh_path).name.split(".")[0]
     anatomy = _anatomy(name, *_opened(*grown, lumen.surface), say, note)
     seconds = time.monotonic() - started
@@ -148,13 +145,13 @@ def _anatomy(name, tree, opening, surface, say, note) -> Anatomy:
     return anatomy
 
 
-def _tree(field, curves, places, root, changes, note) -> tuple[VesselTree, bool]:
+def _tree(field, curves, places, changes, note) -> tuple[VesselTree, bool]:
     """The tree of given curves, or of computed ones; whether it starts at an end."""
     ways = Ways(field)
     ends, right, drawn = extract.free_ends(ways), frozenset(), bool(curves)
     entry = extract.plan_inlet(ways, ends, list(curves.values()), places.get("inlet"))
     if not drawn:
-        entry, curves, right = _computed(ways, ends, entry, places, root, changes, note)
+        entry, curves, right = _computed(ways, ends, entry, places, changes, note)
     elif changes or "heart" in places:
         raise ValueError(
             "rename and heart are for computed centrelines; with drawn ones rename the "
@@ -167,11 +164,11 @@ def _tree(field, curves, places, root, changes, note) -> tuple[VesselTree, bool]
                 f"centreline {key!r} stops {length * 1e3:.0f} mm before its vessel "
                 "ends; continued to the end"
             )
-    tree = grow_tree(field, ways, curves, entry.position, entry.far, root, drawn)
+    tree = grow_tree(field, ways, curves, entry.position, entry.far, drawn)
     return name_trunk(tree, right), entry.at_end
 
 
-def _computed(ways, ends, entry, places, root, changes, note):
+def _computed(ways, ends, entry, places, changes, note):
     """Entry, computed curves by name, and names of the right branches."""
     arch = Arch.of(ways, ends, places.get("heart"))
     if arch is not None:
@@ -189,7 +186,7 @@ def _computed(ways, ends, entry, places, root, changes, note):
         )
     names, notes, right = arch.named(found) if arch else Naming(neutral_names(found))
     note(*notes)
-    names = renamed(names, changes, root)
+    names = renamed(names, changes)
     curves = dict(zip(names, found, strict=True))
     nameless = [
         f"{key} (ends at {in_mm(curve[-1])})"

@@ -13,6 +13,7 @@ from cathsim_dmc.anatomy.scan.offshoots import EXTRA, SPREAD, SURE, Offshoot, no
 from cathsim_dmc.anatomy.scan.units import in_mm
 from cathsim_dmc.anatomy.scan.ways import Ways, common
 
+ROOT = "aorta"  # the vessel that starts at the inlet
 ARCH_BRANCHES = ("bca", "lcca", "lsa")  # in their order from the heart
 # Patterns of branches in their order from the heart, with their frequency and what they
 # are called. "bovine" is the common trunk of BCA and LCCA.
@@ -125,7 +126,7 @@ def neutral_names(curves: Sequence[np.ndarray]) -> list[str]:
     return [f"branch_{place + 1}" for place in order]
 
 
-def renamed(names: Sequence[str], changes: Mapping[str, str], root: str) -> list[str]:
+def renamed(names: Sequence[str], changes: Mapping[str, str]) -> list[str]:
     """Names after the user's changes; ValueError if one is unknown, or taken."""
     for old in changes:
         if old not in names:
@@ -134,7 +135,7 @@ def renamed(names: Sequence[str], changes: Mapping[str, str], root: str) -> list
             )
     out = [changes.get(name, name) for name in names]
     for name in out:
-        if out.count(name) > 1 or name == root:
+        if out.count(name) > 1 or name == ROOT:
             raise ValueError(f"the vessel name {name!r} is taken; choose another.")
     return out
 

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.scan.centring import STEP, centred, resample, section_radii
+from cathsim_dmc.anatomy.scan.naming import ROOT
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
@@ -30,8 +31,7 @@ def grow_tree(
     curves: dict[str, np.ndarray],
     inlet: np.ndarray,
     far: np.ndarray | None,
-    root_name: str,
-    drawn: bool = True,
+    drawn: bool,
 ) -> VesselTree:
     """Join curves (n, 3) m by name into one tree whose root starts at the inlet (3,) m.
 
@@ -51,8 +51,7 @@ def grow_tree(
     else:
         root = _shared_beginning(list(raw.values()), field)
     root = _deep_start(root, field)
-    lines = {root_name: root}
-    vessels = {root_name: Vessel(root_name, _finish(field, root, None))}
+    lines, vessels = {ROOT: root}, {ROOT: Vessel(ROOT, _finish(field, root, None))}
     first = TRUNKS if drawn else (*TRUNKS, *STEMS)
     ranks = {k: (k not in TRUNKS, k not in first, -_bulk(field, raw[k])) for k in raw}
     for name in sorted(raw, key=ranks.__getitem__):
@@ -65,7 +64,7 @@ def grow_tree(
         lines[name] = curve
         vessels[name] = Vessel(name, line, parent, ostium_of(line, trunk))
     # Report in the order in which the files were given, parents first.
-    ordered = {root_name: vessels[root_name]}
+    ordered = {ROOT: vessels[ROOT]}
     while len(ordered) < len(vessels):
         for name in curves:
             if name not in ordered and vessels[name].parent in ordered:
