@@ -45,7 +45,7 @@ class FunctionPolicy(Policy):
             entries = {k: torch.as_tensor(one)[None] for k, one in observation.items()}
             observation = TensorDict(environments.standard(entries, 1), batch_size=[1])
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            answer = self._function(observation)
+            answer: Any = self._function(observation)
         action = answer["action"] if isinstance(answer, TensorDictBase) else answer
         with files.refused(
             TypeError,
