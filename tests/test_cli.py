@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shlex
 import signal
 import subprocess
@@ -18,7 +19,7 @@ from cathsim_dmc.agents.policies import FunctionPolicy
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.cli import agents as commands
-from cathsim_dmc.cli import checks, task_options
+from cathsim_dmc.cli import checks, task_options, training
 
 # What works.
 
@@ -191,6 +192,10 @@ def test_every_setting_is_a_typed_option(cathsim, tmp_path):
 def test_the_help_explains_every_setting(cathsim, monkeypatch, algorithm):
     monkeypatch.setenv("COLUMNS", "200")
     code, out, _ = cathsim("train", "--algo", algorithm, "--help")
+    helps = task_options.field_helps(training._Run)
+    assert algorithm in re.findall(r"\w+", helps["algo"])
+    named = re.findall(r"\w+", helps["preset"])
+    assert set(LEARNERS[algorithm].config.presets) <= set(named)
     assert code == 0
     for item in dataclasses.fields(LEARNERS[algorithm].config):
         if item.name in ("task", "task_kwargs"):
