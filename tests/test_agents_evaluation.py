@@ -132,6 +132,8 @@ def test_a_policy_of_any_arch_goes_to_a_named_anatomy():
     scan = {"anatomy": "my_scan"}
     there = policies.task_and_options(policy, None, scan)
     assert there == ("navigate", {"delay": 2, **scan})
+    untrained = policies.task_and_options(policies.load_policy("expert"), None, scan)
+    assert untrained == ("navigate", scan)
     there = policies.task_and_options(policy, "type1_lcca", None)
     assert there == ("type1_lcca", {"delay": 2})
 

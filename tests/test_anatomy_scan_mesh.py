@@ -369,6 +369,13 @@ def test_a_label_map_gives_the_surface_where_it_is(y_mesh, tmp_path, kind):
     assert lumen.surface.volume == pytest.approx(truth, rel=0.03)
 
 
+def test_a_label_map_without_size_is_refused(tmp_path):
+    nrrd = pytest.importorskip("nrrd")
+    nrrd.write(str(tmp_path / "bare.nrrd"), np.ones((4, 4, 4), np.uint8))
+    with pytest.raises(ValueError, match="its header lacks 'space directions'"):
+        read_lumen(tmp_path / "bare.nrrd")
+
+
 def test_what_is_no_label_map_is_refused(y_mesh, tmp_path, monkeypatch):
     nibabel = pytest.importorskip("nibabel")
     image = np.random.default_rng(0).normal(size=(5, 5, 5)).astype(np.float32)
@@ -381,6 +388,10 @@ def test_what_is_no_label_map_is_refused(y_mesh, tmp_path, monkeypatch):
     )
     with pytest.raises(ValueError, match="three dimensions"):
         read_lumen(tmp_path / "four.nii")
+    grey = np.arange(1000, dtype=np.int16).reshape(10, 10, 10)
+    nibabel.save(nibabel.Nifti1Image(grey, np.eye(4)), tmp_path / "ct.nii")
+    with pytest.raises(ValueError, match="999 different numbers, so it is an image"):
+        read_lumen(tmp_path / "ct.nii")
     (tmp_path / "broken.nii.gz").write_bytes(b"x" * 400)
     with pytest.raises(ValueError, match="cannot be read as NII"):
         read_lumen(tmp_path / "broken.nii.gz")

@@ -1,5 +1,6 @@
 """Imports that used to go wrong in silence: each scan is made of tubes."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -113,8 +114,10 @@ def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
 
 @pytest.mark.slow
 def test_heart_unit_and_names_can_be_given(arch_scan):
-    heart, names = (-35.0, 0.0, 75.0), {"lcca": "left"}
-    anatomy = import_scan(arch_scan[0], heart=heart, units="mm", rename=names)
+    heart, names, notes = (-35.0, 0.0, 75.0), {"lcca": "left"}, []
+    given = {"heart": heart, "units": "mm", "rename": names}
+    anatomy = import_scan(arch_scan[0], notes=notes, **given)
+    assert any(re.search("lcca, which ends at .* is renamed left", n) for n in notes)
     assert "left" in anatomy.goals and anatomy.inlet.position[0] > 0.03
     with pytest.raises(ValueError, match="its heart is at the other end"):
         import_scan(arch_scan[0], heart=(35.0, 0.0, 0.0))

@@ -291,6 +291,10 @@ BAD = {
         ["phantom", "import", "OUT.obj", "--out", "OUT"],
         ["OUT.obj", "no mesh file", "STL"],
     ),
+    "an anatomy in place of a file": (
+        ["phantom", "import", "OUT.obj", "--out", __file__],
+        ["test_cli.py is a file", "directory", "--out"],
+    ),
     "no such checkpoint": (["eval", "OUT"], ["no checkpoint", "OUT"]),
     "no task to evaluate on": (["eval", "random"], ["needs a task"]),
     "arches where there are none": (

@@ -137,7 +137,7 @@ def task_and_options(
 
     Args:
         task: Name of the task; None takes the one that the policy was trained on, or
-            `navigate` where that has an anatomy of its own and `options` name another.
+            `navigate` where `options` name an anatomy that is no option of that one.
         options: Options of the task.
 
     Returns:
@@ -149,7 +149,7 @@ def task_and_options(
     """
     options, trained = dict(options or {}), dict(policy.task_kwargs or {})
     own = suite.TASKS[policy.task].own_options if policy.task in suite.TASKS else ()
-    if task is None and policy.task and "anatomy" in {*options} - {*own}:
+    if task is None and "anatomy" in {*options} - {*own}:
         task = "navigate"
     task = task or policy.task
     if task is None:

@@ -45,8 +45,9 @@ def import_phantom(
         centreline: 3D Slicer curves (.mrk.json) or CSV files, one per branch; without
             any they are computed from the surface.
         name: Name of the anatomy.
-        units: Unit of mesh, CSV centrelines and inlet; guessed if not given.
-        frame: Frame of mesh, CSV centrelines and inlet.
+        units: Unit of a surface, and of CSV centrelines, inlet and heart; guessed if
+            not given. That of a label map is mm.
+        frame: Frame of a surface, and of CSV centrelines, inlet and heart.
         axes: Of a scan that does not stand upright: where +x, +y and +z of that frame
             point in the patient, three of L, R, A, P, S, I, such as ILA; or nine
             numbers, the patient's left, back and head as directions in that frame.
@@ -61,6 +62,8 @@ def import_phantom(
             raise ValueError(
                 f"rename is {rename}; give computed=wanted, e.g. branch_1=lra"
             )
+    if out.exists() and not out.is_dir():  # now: the import would be lost
+        raise ValueError(f"{out} is a file; give a directory for the anatomy (--out)")
     notes: list[str] = []
     anatomy = import_scan(
         mesh, centreline, units=units, mesh_frame=frame, axes=axes, labels=label,

@@ -140,7 +140,7 @@ def _anatomy(name, tree, opening, surface, say, note) -> Anatomy:
             raise ValueError(
                 f"the tree does not agree with the surface ({check}): {wrong}. Mend "
                 "the surface or the centrelines there, or give its frame (mesh_frame, "
-                "axes), the inlet, or other centrelines."
+                "axes), the inlet, other names, or other centrelines."
             )
     return anatomy
 
@@ -186,8 +186,11 @@ def _computed(ways, ends, entry, places, changes, note):
         )
     names, notes, right = arch.named(found) if arch else Naming(neutral_names(found))
     note(*notes)
-    names = renamed(names, changes)
+    computed, names = names, renamed(names, changes)
     curves = dict(zip(names, found, strict=True))
+    for old, new in zip(computed, names, strict=True):
+        if old != new:
+            note(f"{old}, which ends at {in_mm(curves[new][-1])}, is renamed {new}")
     nameless = [
         f"{key} (ends at {in_mm(curve[-1])})"
         for key, curve in curves.items()

@@ -17,6 +17,7 @@ MOST = 4_000_000  # triangles; reading more takes gigabytes
 LABEL_MAPS = (".nii", ".nii.gz", ".nrrd")
 BLUR = 0.7  # voxels, standard deviation that takes the steps off a surface
 _PAD = 3  # voxels around the labels
+_MOST_LABELS = 500
 _NIFTI_UNITS = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6, "unknown": 1e-3}
 
 
@@ -165,6 +166,11 @@ def label_surface(
         )
     values, counts = np.unique(voxels, return_counts=True)
     seen = {int(k): int(n) for k, n in zip(values, counts, strict=True) if k != 0}
+    if not set(labels) & set(seen) and len(seen) > _MOST_LABELS:
+        raise ValueError(
+            f"{path} holds {len(seen):,} different numbers, so it is an image; give a "
+            "segmentation (label map) of its lumen."
+        )
     chosen = [int(k) for k in labels] or list(seen)
     if (not labels and len(seen) != 1) or not set(chosen) <= set(seen):
         listed = ", ".join(
@@ -211,6 +217,10 @@ def _nrrd(path: Path):
     space = str(header.get("space", "LPS")).upper()
     space = "".join(re.findall(r"\b\w", space)) if "-" in space else space
     to = to_lps("mm", space)
+    if "space directions" not in header:
+        raise ValueError(
+            "its header lacks 'space directions', the size and place of its voxels"
+        )
     rows = np.asarray(header["space directions"], dtype=float)
     origin = np.asarray(header.get("space origin", np.zeros(3)), dtype=float)
     names = {
