@@ -11,7 +11,7 @@ from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End, Inlet, Surface
-from cathsim_dmc.anatomy.scan import importer
+from cathsim_dmc.anatomy.scan import importer, units
 from cathsim_dmc.anatomy.scan.curves import read_curve, vessel_name
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.places import cut_open, describe
@@ -270,5 +270,15 @@ def test_names_must_differ(y_scan, tmp_path):
 
 
 def test_inlet_off_the_lumen(y_scan):
-    with pytest.raises(ValueError, match="away from the lumen"):
+    far = r"inlet \(90, 0, 0\) mm is .* away from the lumen, whose middle is \(.*\) mm"
+    with pytest.raises(ValueError, match=far):
         import_scan(*y_scan[:2], inlet=(90.0, 0.0, 0.0))
+
+
+def test_places_are_told_as_the_file_has_them():
+    place = np.array([0.012, -0.034, 0.0561])
+    with units.telling(units.to_lps("cm", "RAS"), "cm"):
+        assert units.in_mm(place) == "(-1.2, 3.4, 5.6) cm"
+    with units.telling(units.to_lps("m", "LPS", "ILA"), "m"):
+        assert units.in_mm(units.upright("ILA") @ place) == "(0.012, -0.034, 0.056) m"
+    assert units.in_mm(place) == "(12, -34, 56) mm"

@@ -104,10 +104,17 @@ def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
     vertices, faces = marched(arch_scan[1], 2.2e-3)
     lying = vertices[:, [2, 0, 1]] * (-1, 1, -1)
     mesh = write_obj(tmp_path / "lying.obj", lying, faces)
-    free = import_scan(mesh)
-    turned = import_scan(mesh, axes="ILA")
+    told, told_turned = [], []
+    free = import_scan(mesh, notes=told)
+    turned = import_scan(mesh, axes="ILA", notes=told_turned)
     names = {"aorta", "bca", "rcca", "rsa", "lcca", "lsa"}
     assert set(free.tree.vessels) == set(turned.tree.vessels) == names
+    # Places are told as the file has them, so that they can be given back.
+    first, second = (
+        np.array(re.findall(r"-?\d+", re.search("inlet chosen.*", "\n".join(notes))[0]))
+        for notes in (told, told_turned)
+    )
+    np.testing.assert_allclose(first.astype(float), second.astype(float), atol=12.0)
     assert turned.goals["lcca"].position[2] > 0.15
     assert free.goals["lcca"].position[0] < -0.15
 

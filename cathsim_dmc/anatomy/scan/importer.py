@@ -27,7 +27,7 @@ from cathsim_dmc.anatomy.scan.places import (
     place_inlet,
 )
 from cathsim_dmc.anatomy.scan.tree import grow_tree, name_trunk
-from cathsim_dmc.anatomy.scan.units import in_mm, to_lps
+from cathsim_dmc.anatomy.scan.units import in_mm, telling, to_lps
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
@@ -106,13 +106,15 @@ def import_scan(
     note(*lumen.notes)
     measure = SurfaceDepth(lumen.surface)
     matrix = to_lps(lumen.units, mesh_frame, axes)
-    places = {key: _placed(key, matrix @ x, measure) for key, x in given.items()}
     curves = read_curves(centreline_paths, lumen.units, mesh_frame, axes)
-    curves = {key: inside_part(key, c, measure) for key, c in curves.items()}
     say(f"tree: looking for vessels in {len(lumen.surface.faces):,} triangles")
-    grown = _tree(measure, curves, places, changes, note)
-    name = name or Path(mesh_path).name.split(".")[0]
-    anatomy = _anatomy(name, *_opened(*grown, lumen.surface), say, note)
+    with telling(matrix, lumen.units):
+        middle = in_mm(lumen.surface.vertices.mean(axis=0))
+        places = {k: _placed(k, matrix @ x, measure, middle) for k, x in given.items()}
+        curves = {key: inside_part(key, c, measure) for key, c in curves.items()}
+        grown = _tree(measure, curves, places, changes, note)
+        name = name or Path(mesh_path).name.split(".")[0]
+        anatomy = _anatomy(name, *_opened(*grown, lumen.surface), say, note)
     seconds = time.monotonic() - started
     say(f"done in {seconds:.0f} s, goals {', '.join(anatomy.goals) or 'none'}")
     return anatomy
@@ -229,13 +231,17 @@ def _opened(
     return opened, inlet, cut
 
 
-def _placed(key: str, place: np.ndarray, measure: SurfaceDepth) -> np.ndarray:
+def _placed(
+    key: str, place: np.ndarray, measure: SurfaceDepth, middle: str
+) -> np.ndarray:
     """A given place (3,) m, LPS, which must be near the lumen."""
     away = -float(measure(place[None])[0])
     if away > NEAR_INLET:
         raise ValueError(
-            f"{key} is {away * 1e3:.1f} mm away from the lumen; give a point in the "
-            f"lumen, or at most {NEAR_INLET * 1e3:g} mm from the end "
-            f"{'at the heart' if key == 'heart' else 'by which the device enters'}."
+            f"{key} {in_mm(place)} is {away * 1e3:.1f} mm away from the lumen, whose "
+            f"middle is {middle}; give a point in the lumen, or at most "
+            f"{NEAR_INLET * 1e3:g} mm from the end "
+            f"{'at the heart' if key == 'heart' else 'by which the device enters'}, in "
+            "the unit and frame of the mesh (units, mesh_frame)."
         )
     return place
