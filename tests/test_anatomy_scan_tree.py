@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from synthetic_scans import marched, write_markup, write_obj
 
-from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy import Anatomy, phantoms
 from cathsim_dmc.anatomy.arch.arch import ArchSeed
 from cathsim_dmc.anatomy.arch.tree import arch_tree as random_arch
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Goal, Surface
+from cathsim_dmc.anatomy.scan.aorta import unproven
 from cathsim_dmc.anatomy.scan.check import check_tree, unreachable
 from cathsim_dmc.anatomy.scan.extract import free_ends
 from cathsim_dmc.anatomy.scan.importer import import_scan
@@ -20,6 +21,7 @@ from cathsim_dmc.anatomy.scan.tree import grow_tree
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+from cathsim_dmc.pictures.figure import anatomy_figure
 
 
 def tube(points, radii):
@@ -107,6 +109,9 @@ def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
     told, told_turned = [], []
     free = import_scan(mesh, notes=told)
     turned = import_scan(mesh, axes="ILA", notes=told_turned)
+    words = "not stand upright: its arch points towards -x, so whether it is mirrored"
+    assert any(words in note for note in told)
+    assert not any("upright" in note for note in told_turned)
     names = {"aorta", "bca", "rcca", "rsa", "lcca", "lsa"}
     assert set(free.tree.vessels) == set(turned.tree.vessels) == names
     # Places are told as the file has them, so that they can be given back.
@@ -117,6 +122,30 @@ def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
     np.testing.assert_allclose(first.astype(float), second.astype(float), atol=12.0)
     assert turned.goals["lcca"].position[2] > 0.15
     assert free.goals["lcca"].position[0] < -0.15
+
+
+def test_a_scan_that_does_not_stand_upright_is_told():
+    """Its arch may be a mirrored one, and sides in the picture would be false."""
+    tree, turn = arch_tree(), np.roll(np.eye(3), 1, axis=0)
+    lying = {}
+    for name, vessel in tree.vessels.items():
+        line = vessel.centreline
+        line = Centreline(line.points @ turn, line.radii)
+        lying[name] = replace(vessel, centreline=line)
+    assert unproven(tree, None) is unproven(tree, np.eye(3)) is None
+    said = unproven(VesselTree(lying), None)
+    assert "arch points towards +y, so whether it is mirrored" in said
+    assert "give its axes (--axes)" in said
+    # Where axes that are given lay it, it is told how the file has it.
+    said = unproven(VesselTree(lying), turn.T)
+    assert "towards +z" in said and "check the axes" in said
+    trunk = {"trunk": Vessel("trunk", tube([(0, 0, 0), (0, 0, 50)], [6, 6]))}
+    assert "no arch shows" in unproven(VesselTree(trunk), None)
+    for vessels, label in ((tree.vessels, "z, mm (head ↑)"), (lying, "z, mm")):
+        anatomy = Anatomy.from_tree(VesselTree(vessels))
+        panels = anatomy_figure(replace(anatomy, scan=anatomy.surface)).axes[:3]
+        assert panels[0].get_ylabel() == panels[1].get_ylabel() == label
+        assert ("front" in panels[0].get_title()) == (vessels is not lying)
 
 
 @pytest.mark.slow

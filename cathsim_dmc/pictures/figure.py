@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import arc_lengths
+from cathsim_dmc.anatomy.scan.aorta import bend_of
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.pictures.moment import Moment, fluoroscope_of, xray
 from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
@@ -97,7 +98,10 @@ def background(
 
 
 def anatomy_figure(anatomy: Anatomy) -> Picture:
-    """Draw lumen, centrelines, goals and inlet of an anatomy from three sides."""
+    """Draw lumen, centrelines, goals and inlet of an anatomy from three sides.
+
+    Of a scan that is not seen to stand upright the sides are not named.
+    """
     x, y, z = np.ptp(anatomy.surface.vertices, axis=0)
     heights = np.array([z, z, y])
     size, rows, ratios = (13.5, 5.6), 1, None
@@ -110,14 +114,14 @@ def anatomy_figure(anatomy: Anatomy) -> Picture:
         draw_anatomy(axes, anatomy, view)
     named = figure.axes[0].get_legend_handles_labels()
     figure.legend(*named, fontsize=8, loc="outside lower center", ncols=7)
-    figure.suptitle(anatomy.name)
+    figure.suptitle(anatomy.name + ": axes of the scan" * (not _upright(anatomy)))
     return figure
 
 
 def draw_anatomy(axes: Any, anatomy: Anatomy, view: str = "front") -> None:
     """Draw an anatomy into axes whose units are millimetres."""
     projection, picture = background(anatomy.surface, view, 450)
-    _prepare(axes, projection, view)
+    _prepare(axes, projection, view, _upright(anatomy))
     axes.imshow(picture.behind, extent=projection.extent_mm, interpolation="bilinear")
     for number, (name, vessel) in enumerate(anatomy.tree.vessels.items()):
         line = projection.flat_mm(vessel.centreline.points)
@@ -134,7 +138,14 @@ def draw_anatomy(axes: Any, anatomy: Anatomy, view: str = "front") -> None:
     axes.annotate("", *projection.flat_mm(ends), arrowprops=arrow)
 
 
-def _prepare(axes: Any, projection: ParallelProjection, view: str | None) -> None:
+def _upright(anatomy: Anatomy) -> bool:
+    bend = bend_of(anatomy.tree) if anatomy.scan else None
+    return anatomy.scan is None or (bend is not None and bend.upright)
+
+
+def _prepare(
+    axes: Any, projection: ParallelProjection, view: str | None, upright: bool = True
+) -> None:
     """Give axes the limits of a projection, and the title and labels of a view."""
     axes.set_xlim(projection.extent_mm[:2])
     axes.set_ylim(projection.extent_mm[2:])
@@ -144,6 +155,9 @@ def _prepare(axes: Any, projection: ParallelProjection, view: str | None) -> Non
     axes.grid(False)
     if view is not None:
         title, _, _, xlabel, ylabel = VIEWS[view]
+        if not upright:  # sides of the patient are not known
+            xlabel, ylabel = (text.partition(" (")[0] for text in (xlabel, ylabel))
+            title = f"{xlabel[:-4]} and {ylabel[:-4]}"
         axes.set(xlabel=xlabel, ylabel=ylabel)
         axes.set_title(title, fontsize=10)
 

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from cathsim_dmc.anatomy.centreline import arc_lengths
+from cathsim_dmc.anatomy.centreline import VesselTree, arc_lengths
 from cathsim_dmc.anatomy.scan.centring import resample, tangents
 from cathsim_dmc.anatomy.scan.extract import FreeEnd
 from cathsim_dmc.anatomy.scan.ways import Ways
@@ -128,6 +128,36 @@ class Bend:
         if not self.upright or np.hypot(x, y) < 10e-3:
             return None
         return float(np.arctan2(-x, -y) if heart_last else np.arctan2(x, y))
+
+
+def bend_of(tree: VesselTree) -> Bend | None:
+    """The bend of the aorta at which a tree begins; None if it begins otherwise."""
+    line = tree.root.centreline
+    bend = Bend.of(line.points)
+    if np.median(line.radii) < RADIUS or bend.turn < TURN_OF_STUMP:
+        return None
+    near = [
+        vessel.centreline.points
+        for name, vessel in tree.vessels.items()
+        if vessel.parent == tree.root.name
+        and abs(tree.origin(name) - 1e-3 * bend.apex) < ARM
+    ]
+    return Bend.of(line.points, near)
+
+
+def unproven(tree: VesselTree, turn: np.ndarray | None) -> str | None:
+    """What is not known about the sides of a scan that was turned (3, 3), or None."""
+    bend = bend_of(tree)
+    if bend is not None and bend.upright:
+        return None
+    what, ask = "no arch shows whether the scan stands upright", ""
+    if bend is not None:
+        up = bend.up if turn is None else bend.up @ turn  # as in the file
+        way = int(np.abs(up).argmax())
+        points = f"{'-+'[int(up[way] > 0.0)]}{'xyz'[way]}"
+        what = f"the scan does not stand upright: its arch points towards {points}"
+        ask = f"; {'give its' if turn is None else 'check the'} axes (--axes)"
+    return f"{what}, so whether it is mirrored, right for left, was not checked{ask}"
 
 
 def mirrored(azimuth: float | None) -> str | None:

@@ -13,7 +13,7 @@ from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import extract
-from cathsim_dmc.anatomy.scan.aorta import mirrored
+from cathsim_dmc.anatomy.scan.aorta import mirrored, unproven
 from cathsim_dmc.anatomy.scan.arches import SURE, Arch
 from cathsim_dmc.anatomy.scan.check import check_tree, unreachable
 from cathsim_dmc.anatomy.scan.curves import inside_part, read_curves
@@ -27,7 +27,7 @@ from cathsim_dmc.anatomy.scan.places import (
     place_inlet,
 )
 from cathsim_dmc.anatomy.scan.tree import grow_tree, name_trunk
-from cathsim_dmc.anatomy.scan.units import in_mm, telling, to_lps
+from cathsim_dmc.anatomy.scan.units import in_mm, telling, to_lps, upright
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
@@ -113,6 +113,8 @@ def import_scan(
         places = {k: _placed(k, matrix @ x, measure, middle) for k, x in given.items()}
         curves = {key: inside_part(key, c, measure) for key, c in curves.items()}
         grown = _tree(measure, curves, places, changes, note)
+        turn = None if axes is None else upright(axes)
+        note(*filter(None, [unproven(grown[0], turn)]))
         name = name or Path(mesh_path).name.split(".")[0]
         anatomy = _anatomy(name, *_opened(*grown, lumen.surface), say, note)
     seconds = time.monotonic() - started
