@@ -168,6 +168,28 @@ def test_open_ends_are_capped(y_mesh, tmp_path):
     assert said(lumen, "3 open vessel ends")
 
 
+@pytest.mark.parametrize("outward", [True, False])
+def test_a_ragged_rim_is_cut_back_to_a_plane(y_mesh, outward):
+    """A fan over its teeth would fold into the lumen, which then ends in a bow tie."""
+    vertices, faces = y_mesh
+    angle = np.arctan2(vertices[:, 1], vertices[:, 0])
+    tooth = 6.0 + 5.0 * np.cos(3.0 * angle)  # mm, height of the rim
+    open_faces = faces[(vertices[:, 2] > tooth)[faces].all(axis=1)]
+    rim = vertices[np.unique(open_faces)][:, 2]
+    faces = open_faces if outward else open_faces[:, ::-1]
+    surface, notes = mend("ragged", vertices * 1e-3, faces)
+    assert any("1 open vessel ends capped, ragged rims cut" in note for note in notes)
+    low = surface.vertices[:, 2].min()
+    assert rim.min() * 1e-3 + 5e-3 < low < 16e-3
+    corners = surface.vertices[surface.faces]
+    cap = corners[(corners[..., 2] < low + 0.5e-3).all(axis=1)]
+    across = np.cross(cap[:, 1] - cap[:, 0], cap[:, 2] - cap[:, 0])
+    assert np.all(across[:, 2] < 0.0)
+    assert 0.5 * np.linalg.norm(across, axis=1).sum() == pytest.approx(
+        np.pi * 6e-3**2, rel=0.05
+    )
+
+
 def test_a_gash_in_the_side_is_refused(y_mesh, tmp_path):
     vertices, faces = y_mesh
     middle = vertices[faces].mean(axis=1)

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from cathsim_dmc.anatomy.centreline import VesselTree, arc_lengths
 from cathsim_dmc.anatomy.scan.centring import resample, tangents
 from cathsim_dmc.anatomy.scan.extract import FreeEnd
+from cathsim_dmc.anatomy.scan.units import in_mm
 from cathsim_dmc.anatomy.scan.ways import Ways
 
 RADIUS = 4.5e-3  # m, least median radius of an aorta
@@ -39,9 +40,10 @@ AZIMUTH = (np.radians(-5.0), np.radians(97.0))
 
 def find_aorta(
     ways: Ways, ends: Sequence[FreeEnd], turn: float = TURN
-) -> tuple[int, int] | None:
+) -> tuple[tuple[int, int] | None, str]:
     """The two ends (rows) between which an aorta bends by a ``turn`` (rad), or None.
 
+    Also says why there is none.
     It is the way between two free ends with the largest sum of fourth powers of the
     depth: a wide stump counts more than a long branch.
     """
@@ -57,9 +59,22 @@ def find_aorta(
                 bulk = float((ways.depth[way] ** 4).sum())
                 best = max(best, (bulk, (one, other), way), key=lambda b: b[0])
     pair, way = best[1:]
-    if pair is None or np.median(ways.depth[way]) < RADIUS:
-        return None
-    return pair if Bend.of(ways.points[way]).turn > turn else None
+    if pair is None:
+        return None, "the lumen has no two wide ends"
+    ends_of_it = " and ".join(in_mm(ends[k].position) for k in pair)
+    wide, bent = np.median(ways.depth[way]), Bend.of(ways.points[way]).turn
+    if wide < RADIUS:
+        return None, (
+            f"the widest way, from {ends_of_it}, is {wide * 2e3:.1f} mm wide; an aorta "
+            f"has {RADIUS * 2e3:g} mm or more"
+        )
+    if bent <= turn:
+        return None, (
+            f"the widest way, from {ends_of_it}, bends by {np.degrees(bent):.0f} "
+            f"degrees; an arch bends by {np.degrees(turn):.0f} or more: one of its "
+            "limbs may be cut off"
+        )
+    return pair, ""
 
 
 @dataclass(frozen=True)
@@ -155,7 +170,11 @@ def unproven(tree: VesselTree, turn: np.ndarray | None) -> str | None:
         up = bend.up if turn is None else bend.up @ turn  # as in the file
         way = int(np.abs(up).argmax())
         points = f"{'-+'[int(up[way] > 0.0)]}{'xyz'[way]}"
-        what = f"the scan does not stand upright: its arch points towards {points}"
+        off = np.degrees(np.arccos(bend.up[2]))
+        what = (
+            f"the scan does not stand upright: its arch points towards {points}, "
+            f"{off:.0f} degrees off the head"
+        )
         ask = f"; {'give its' if turn is None else 'check the'} axes (--axes)"
     return f"{what}, so whether it is mirrored, right for left, was not checked{ask}"
 

@@ -29,23 +29,23 @@ class Arch:
     @classmethod
     def of(
         cls, ways: Ways, ends: Sequence[FreeEnd], heart: np.ndarray | None
-    ) -> Self | None:
-        """The arch of a lumen with free ends, or None if it has none.
+    ) -> Self | str:
+        """The arch of a lumen with free ends, or why it has none.
 
         The `heart` (3,) m is near the end at the heart, or None to find it; ValueError
         if it is near no end of an aorta.
         """
-        pair, cut = aorta.find_aorta(ways, ends), None
+        (pair, why), cut = aorta.find_aorta(ways, ends), None
         if pair is None and (cut := extract.stump(ways, ends)) is not None:
             ends = [*ends, cut]
-            pair = aorta.find_aorta(ways, ends, aorta.TURN_OF_STUMP)
+            pair, why = aorta.find_aorta(ways, ends, aorta.TURN_OF_STUMP)
         if pair is None:
             if heart is not None:
                 raise ValueError(
                     "the lumen has no aortic arch, so no end of it is at the heart; "
                     f"give the inlet instead of the heart. Its ends are {listed(ends)}."
                 )
-            return None
+            return why
         # The wider end is more often at the heart; then all is computed once.
         first, last = sorted((ends[k] for k in pair), key=lambda end: end.radius)
         if heart is not None:

@@ -174,8 +174,17 @@ def _tree(field, curves, places, changes, note) -> tuple[VesselTree, bool]:
 
 def _computed(ways, ends, entry, places, changes, note):
     """Entry, computed curves by name, and names of the right branches."""
-    arch = Arch.of(ways, ends, places.get("heart"))
-    if arch is not None:
+    seen, end = Arch.of(ways, ends, places.get("heart")), ""
+    arch = None if isinstance(seen, str) else seen
+    if arch is None:
+        note(
+            "no aortic arch recognised, so branches get no anatomical names, and "
+            f"whether the scan is mirrored was not checked: {seen}"
+        )
+        end = ", the widest end, which may be that at the heart"
+    else:
+        if arch.entry.position is arch.ends[1].position:
+            end = ", at the heart: the descending aorta is cut off beside a branch"
         entry = arch.entered(places.get("inlet"), entry)
         wrong = mirrored(arch.bend.azimuth(heart_last=True))
         if wrong and arch.heart >= SURE:
@@ -207,7 +216,8 @@ def _computed(ways, ends, entry, places, changes, note):
         )
     if thin:
         note(f"{thin} branches too thin or short for a 5 Fr catheter left out")
-    note(f"inlet chosen at {in_mm(entry.position)}")
+    end = f"{end} (--inlet takes another)" if end and "inlet" not in places else ""
+    note(f"inlet chosen at {in_mm(entry.position)}{end}")
     return entry, curves, frozenset(names[row] for row in right)
 
 

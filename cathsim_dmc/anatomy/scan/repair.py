@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import topology
+from cathsim_dmc.anatomy.scan.places import cut_open
 from cathsim_dmc.anatomy.scan.units import in_mm
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
@@ -16,6 +17,7 @@ FOLD = 2.5e-3  # m, most that a vertex of a self-intersection is moved
 CUT = 16e-3  # m, widest hole that is filled where it was cut out
 END_AREA = 0.5e-6  # m^2, least area of an open end
 END = 0.55  # largest |cosine| between an end's axis and the normals around it
+RAGGED = 0.1  # of an end's width: rims that are less flat are cut back to a plane
 DENSE = 30_000  # triangles; more are decimated
 FEW = 12_000  # triangles that are left then
 ROUNDS = 6
@@ -48,7 +50,7 @@ class _Work:
     def __init__(self, name: str, vertices: np.ndarray, faces: np.ndarray):
         self.name, self.vertices, self.faces = name, vertices, faces
         self.notes: list[str] = []
-        self._ends = 0
+        self._ends, self._ragged = 0, 0.0
         self._cut: set[tuple[float, ...]] = set()  # corners of what was cut out
 
     def merge(self) -> None:
@@ -161,6 +163,8 @@ class _Work:
             widest = CUT if self._cut & set(map(tuple, points)) else HOLE
             if len(loop) > 3 and area > END_AREA and self._is_end(loop, axis):
                 self._ends += 1
+                if self._cut_back(loop, middle, axis):
+                    continue
             elif wide > widest:
                 raise ValueError(
                     f"{self.name} is not closed: a hole {wide * 1e3:.1f} mm wide in "
@@ -182,7 +186,10 @@ class _Work:
                 f"{len(filled)} holes filled, the widest {wide * 1e3:.1f} mm at {where}"
             )
         if self._ends:
-            self.notes.append(f"{self._ends} open vessel ends capped")
+            note = f"{self._ends} open vessel ends capped"
+            if self._ragged:
+                note += f", ragged rims cut back by up to {self._ragged * 1e3:.1f} mm"
+            self.notes.append(note)
         edges, times = topology.edge_counts(self.faces)
         if (times != 2).any():
             where = in_mm(self.vertices[edges[times != 2][0, 0]])
@@ -190,6 +197,32 @@ class _Work:
                 f"{self.name} is not closed: after mending {int((times != 2).sum())} "
                 f"edges do not have two triangles, one at {where}. {_AGAIN}"
             )
+
+    def _cut_back(self, loop: np.ndarray, middle: np.ndarray, axis: np.ndarray) -> bool:
+        """Cut a ragged rim back to a plane and cap that, whether it had to and could.
+
+        A fan over ragged triangles would fold into the lumen.
+        """
+        spokes = self.vertices[loop] - middle
+        reach, ragged = np.linalg.norm(spokes, axis=1).max(), np.ptp(spokes @ axis)
+        if ragged < 2.0 * RAGGED * reach:
+            return False
+        beside = np.setdiff1d(self.faces[np.isin(self.faces, loop).any(axis=1)], loop)
+        axis = axis * np.sign((self.vertices[beside] - middle).mean(axis=0) @ axis)
+        place = middle + ((spokes @ axis).max() + 0.02 * reach) * axis
+        try:
+            points, *kept = cut_open(
+                self.vertices, self.faces, Inlet("rim", place, axis, float(reach))
+            )
+        except ValueError:
+            return False
+        faces = np.concatenate(kept)
+        gone = self.vertices[np.setdiff1d(self.faces, faces)]
+        if np.linalg.norm(gone - middle, axis=1).max(initial=0.0) > 1.2 * reach:
+            return False  # a branch would go, too
+        self.vertices, self.faces = points, faces
+        self._ragged = max(self._ragged, float(ragged))
+        return True
 
     def _is_end(self, loop: np.ndarray, axis: np.ndarray) -> bool:
         """Whether the surface runs across the loop's plane, as a tube's does."""
