@@ -5,6 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
+from scipy.spatial.distance import pdist
+from skimage.color import rgb2lab
 from synthetic_scans import marched, write_markup, write_obj
 
 from cathsim_dmc.anatomy import Anatomy, phantoms
@@ -146,6 +149,23 @@ def test_a_scan_that_does_not_stand_upright_is_told():
         panels = anatomy_figure(replace(anatomy, scan=anatomy.surface)).axes[:3]
         assert panels[0].get_ylabel() == panels[1].get_ylabel() == label
         assert ("front" in panels[0].get_title()) == (vessels is not lying)
+
+
+def test_vessels_differ_in_colour_and_are_listed_in_order():
+    """Twelve vessels, and a legend that is filled by columns and read by rows."""
+    vessels = {"aorta": Vessel("aorta", tube([(0, 0, 0), (0, 0, 250)], [8, 8]))}
+    for k in range(11):
+        ends = [(0, 0, 20 + 20 * k), (40, 0, 20 + 20 * k)]
+        vessels[f"v{k}"] = Vessel(f"v{k}", tube(ends, [3, 3]), "aorta", 9e-3)
+    figure = anatomy_figure(Anatomy.from_tree(VesselTree(vessels)))
+    lines = figure.axes[0].lines
+    lines = [line for line in lines if not line.get_label().startswith("_")]
+    assert [line.get_label() for line in lines] == list(vessels)
+    colours = rgb2lab([to_rgb(line.get_color()) for line in lines])
+    assert pdist(colours).min() > 15.0
+    listed = [text.get_text() for text in figure.legends[0].get_texts()]
+    columns = np.array_split(listed, 7)
+    assert [c[row] for row in (0, 1) for c in columns if row < len(c)] == list(vessels)
 
 
 @pytest.mark.slow

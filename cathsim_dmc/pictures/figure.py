@@ -30,6 +30,11 @@ VIEWS = {
     "left": ("from the left", (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), _Y, _Z),
     "below": ("from below", (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), _X, _BELOW),
 }
+# Of vessels: the colours of all figures, then those of matplotlib's maps Dark2, tab10
+# and tab20b that differ most from them and from the wall.
+VESSEL_COLOURS = (*COLOURS, "#66a61e", "#e7298a", "#8c564b", "#9467bd", "#d62728")
+VESSEL_COLOURS += ("#a6761d", "#393b79")
+_COLUMNS = 7  # of the legend
 GOAL_RADIUS_MM = 8.0  # the published task's
 GOAL_COLOUR, GOAL_LIGHT = "#12805c", "#5fd7ac"
 DEVICE_COLOUR, DEVICE_LIGHT = "#173a63", "#7fb2e5"
@@ -112,8 +117,11 @@ def anatomy_figure(anatomy: Anatomy) -> Picture:
     panels = figure.subplots(rows, 3 // rows, height_ratios=ratios)
     for axes, view in zip(panels, VIEWS, strict=True):
         draw_anatomy(axes, anatomy, view)
-    named = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*named, fontsize=8, loc="outside lower center", ncols=7)
+    lines = figure.axes[0].get_legend_handles_labels()[0]
+    # It is filled by columns, and read by rows.
+    rows = [line for column in range(_COLUMNS) for line in lines[column::_COLUMNS]]
+    place = {"loc": "outside lower center", "ncols": _COLUMNS}
+    figure.legend(handles=rows, fontsize=8, **place)
     figure.suptitle(anatomy.name + ": axes of the scan" * (not _upright(anatomy)))
     return figure
 
@@ -125,7 +133,8 @@ def draw_anatomy(axes: Any, anatomy: Anatomy, view: str = "front") -> None:
     axes.imshow(picture.behind, extent=projection.extent_mm, interpolation="bilinear")
     for number, (name, vessel) in enumerate(anatomy.tree.vessels.items()):
         line = projection.flat_mm(vessel.centreline.points)
-        axes.plot(*line.T, color=COLOURS[number % len(COLOURS)], lw=1.4, label=name)
+        colour = VESSEL_COLOURS[number % len(VESSEL_COLOURS)]
+        axes.plot(*line.T, color=colour, lw=1.4, label=name)
         axes.annotate(name, line[-1], (2, 2), textcoords="offset points", fontsize=6)
     for goal in anatomy.goals.values():
         place = projection.flat_mm(goal.position).tolist()
