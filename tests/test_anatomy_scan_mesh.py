@@ -10,7 +10,7 @@ import trimesh
 from synthetic_scans import marched, write_obj, y_tree
 
 from cathsim_dmc.anatomy.parts import Surface
-from cathsim_dmc.anatomy.scan.lumen import read_lumen
+from cathsim_dmc.anatomy.scan.lumen import guess_units, read_lumen, typical_radius
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
 from cathsim_dmc.anatomy.scan.repair import mend
 from cathsim_dmc.anatomy.scan.topology import decimated, edge_counts, without_slivers
@@ -86,7 +86,9 @@ def test_formats_and_inverted_normals(y_mesh, tmp_path, kind):
     assert said(lumen, "inside out")
 
 
-@pytest.mark.parametrize(("units", "scale"), [("mm", 1.0), ("cm", 0.1), ("m", 1e-3)])
+@pytest.mark.parametrize(
+    ("units", "scale"), [("mm", 1.0), ("cm", 0.1), ("m", 1e-3), ("um", 1e3)]
+)
 def test_units_are_guessed_and_said(y_mesh, tmp_path, units, scale):
     vertices, faces = y_mesh
     path = write_obj(tmp_path / "lumen.obj", vertices * scale, faces)
@@ -95,6 +97,64 @@ def test_units_are_guessed_and_said(y_mesh, tmp_path, units, scale):
     assert np.ptp(lumen.surface.vertices, axis=0) == pytest.approx(
         np.ptp(vertices, axis=0) * 1e-3, rel=1e-2
     )
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, 0.5])
+def test_noise_does_not_change_the_unit(noise):
+    vertices, faces = marched(y_tree(), 0.6e-3)
+    radius = typical_radius(vertices, faces)
+    assert radius == pytest.approx(5.8, abs=0.3)
+    normals = Surface(vertices, faces).normals
+    steps = np.random.default_rng(0).normal(0.0, noise, (len(vertices), 1))
+    rough = vertices + normals * steps
+    assert typical_radius(rough, faces) == pytest.approx(radius, rel=0.05)
+    assert guess_units("rough", rough, faces, None)[0] == "mm"
+
+
+def test_a_cerebral_artery_is_not_taken_for_a_wide_aorta(y_mesh):
+    vertices, faces = y_mesh
+    thin = vertices * (0.33, 0.33, 1.3)  # 4 mm wide, 130 mm long; or a metre in cm
+    assert guess_units("thin", thin, faces, None)[0] == "mm"
+
+
+def test_two_likely_units_are_asked_for_with_their_sizes(y_mesh):
+    vertices, faces = y_mesh
+    with pytest.raises(ValueError) as error:
+        guess_units("siphon", vertices * 0.4, faces, None)
+    said = str(error.value)
+    assert re.search(r"mm makes the widest lumen 4\.\S* mm wide .* 4\d\.\S* mm", said)
+    assert re.search(r"cm makes the widest lumen 4\d\.\S* mm wide .* 4\d\d", said)
+    assert said.endswith("pass units='mm' or 'cm'.")
+    assert guess_units("siphon", vertices * 0.4, faces, "cm")[0] == "cm"
+
+
+def test_sizes_that_no_lumen_has_are_refused(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    path = write_obj(tmp_path / "lumen.obj", vertices, faces)
+    with pytest.raises(ValueError, match="11.* mm wide .* 11.* across .*units='mm'"):
+        read_lumen(path, units="cm")
+    path = write_obj(tmp_path / "large.obj", vertices * 7.5, faces)
+    with pytest.raises(ValueError, match="holds .* litres when its unit is 'mm'"):
+        read_lumen(path, units="mm")
+
+
+def test_the_unit_is_said_before_anything_is_mended(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    both = np.concatenate([vertices, vertices + 100.0])
+    faces = np.concatenate([faces, faces + len(vertices)])
+    lines = []
+    with pytest.raises(ValueError, match="2 separate parts"):
+        read_lumen(write_obj(tmp_path / "two.obj", both, faces), say=lines.append)
+    assert lines[-1].startswith("note: unit guessed: mm")
+
+
+def test_an_stl_that_ends_early_is_refused(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    path = tmp_path / "cut.stl"
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    path.write_bytes(path.read_bytes()[: 84 + 50 * 1234 + 20])
+    with pytest.raises(ValueError, match=rf"early, after 1,234 of {len(faces):,}"):
+        read_lumen(path)
 
 
 def test_a_given_unit_is_taken_and_the_one_that_fits_is_named(y_mesh, tmp_path):

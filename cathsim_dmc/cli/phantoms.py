@@ -28,7 +28,7 @@ def import_phantom(
     out: Path,
     centreline: tuple[Path, ...] = (),
     name: str | None = None,
-    units: Literal["mm", "cm", "m"] | None = None,
+    units: Literal["mm", "cm", "m", "um"] | None = None,
     frame: Literal["LPS", "RAS"] = "LPS",
     axes: str | None = None,
     label: tuple[int, ...] = (),

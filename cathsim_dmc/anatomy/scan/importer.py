@@ -58,8 +58,8 @@ def import_scan(
         centreline_paths: 3D Slicer markups or tables x,y,z[,radius], one per branch;
             the branch is called after the file (centreline-LCCA.mrk.json: "lcca").
             Without any they are computed, and named where the arch tells how.
-        units: of the mesh, of tables and of ``inlet``: "mm", "cm" or "m"; None
-            guesses by the width of the lumen, and says so.
+        units: of the mesh, of tables and of ``inlet``: "mm", "cm", "m" or "um";
+            None guesses by the width of the lumen and the size, and says so.
         mesh_frame: "LPS" or "RAS", of the mesh, of tables and of ``inlet``.
         axes: how that frame is turned in the patient, if the scan does not stand
             upright, such as "ILA", or nine numbers; see ``units.upright``.
@@ -103,7 +103,7 @@ def import_scan(
     # Refused before the long steps; read again when the unit is known.
     read_curves(centreline_paths, units or "mm", mesh_frame, axes)
     lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, say)
-    note(*lumen.notes)
+    notes.extend(lumen.notes)
     measure = SurfaceDepth(lumen.surface)
     matrix = to_lps(lumen.units, mesh_frame, axes)
     curves = read_curves(centreline_paths, lumen.units, mesh_frame, axes)

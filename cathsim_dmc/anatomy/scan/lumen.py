@@ -11,14 +11,24 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan import mesh
 from cathsim_dmc.anatomy.scan.repair import mend
-from cathsim_dmc.anatomy.scan.topology import areas
+from cathsim_dmc.anatomy.scan.topology import areas, merged
 from cathsim_dmc.anatomy.scan.units import UNITS, to_lps, upright
 from cathsim_dmc.anatomy.surface import sampled
 
-SIZE = (15e-3, 2.5)  # m across: an intracranial segment, an aorta with arms and legs
+SIZE = (15e-3, 2.0)  # m across: an intracranial segment, an aorta with arms and legs
 WIDTH = (1.2e-3, 35e-3)  # m, 95th percentile of radii: cerebral artery, aneurysm
-TYPICAL = 7e-3  # m, that radius where two units are possible
+NO_WIDTH = (0.5e-3, 50e-3)  # m: beyond this a unit that is given is refused
+VOLUME = 2e-3  # m^3, most that is searched for ways, at 10^9 points per m^3
+# Of scans, to tell units apart: that radius and the size, m, and deviations of their
+# logarithms; they span from cerebral arteries to aneurysms of the aorta.
+TYPICAL, SPREAD = np.array((6e-3, 200e-3)), np.array((0.6, 0.65))
+SURE = 0.95  # probability of a unit that is not asked for
 _SAMPLES = 1000
+_VERTICES = 20_000  # of the surface between those samples, about, at most
+_WIDEST = 0.2  # of the size: balls begin with this radius
+_AROUND = 0.2  # mean square of the second direction in which walls lie, least
+_SMOOTH = 1500  # triangles for each time that a surface is smoothed
+_MOST = 100  # times
 
 
 class Lumen(NamedTuple):
@@ -56,6 +66,7 @@ def read_lumen(
         say(f"mesh: {len(faces):,} triangles read")
         units, why = guess_units(str(path), vertices, faces, units)
         vertices = vertices @ to_lps(units, frame, axes).T
+    say(f"note: {why}")
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not SIZE[0] <= size <= SIZE[1]:
         raise ValueError(
@@ -64,53 +75,111 @@ def read_lumen(
             f"which the mesh was exported ({why})."
         )
     surface, changed = mend(str(path), vertices, faces)
+    for text in changed:
+        say(f"note: {text}")
+    if surface.volume > VOLUME:
+        raise ValueError(
+            f"{path} holds {surface.volume * 1e3:.3g} litres when its unit is "
+            f"{units!r}, which no lumen does (at most {VOLUME * 1e3:g}). Check the "
+            f"unit in which the mesh was exported ({why})."
+        )
     return Lumen(surface, units, (why, *changed))
 
 
 def guess_units(
     name: str, vertices: np.ndarray, faces: np.ndarray, units: str | None
 ) -> tuple[str, str]:
-    """The unit given, or in which a lumen has a plausible width, and a line on why."""
-    width = typical_radius(vertices, faces)
-    fits = [u for u, s in UNITS.items() if WIDTH[0] <= width * s <= WIDTH[1]]
-    if not fits and (units is None or np.isnan(width)):
-        raise ValueError(
-            f"{name}: the lumen's radius is {width:.3g} units of the file, which no "
-            f"vessel has in {', '.join(UNITS)} (allowed {WIDTH[0] * 1e3:g} to "
-            f"{WIDTH[1] * 1e3:g} mm; nan: it is no tube); check the export."
-        )
-    best = units or min(fits, key=lambda u: abs(np.log(width * UNITS[u] / TYPICAL)))
-    wide = width * UNITS[best] * 2e3
-    if units in fits:
-        return best, f"unit: {best}, as given"
-    if units is None:
-        others = [u for u in fits if u != best]
-        doubt = f"; {others[0]} is possible too: pass units" if others else ""
-        said = f"unit guessed: {best}, which makes the widest lumen {wide:.1f} mm wide"
-        return best, said + doubt
-    better = f"pass units={' or '.join(map(repr, fits))}" if fits else "check it"
-    return best, (
-        f"unit: {best}, as given, which makes the widest lumen {wide:.3g} mm wide "
-        f"({WIDTH[0] * 2e3:g} to {WIDTH[1] * 2e3:g} mm are usual); if that is wrong, "
-        + better
+    """The unit given, or the one in which width and size are likely; a line on why.
+
+    ValueError if the width is implausible in the unit, or two units are likely.
+    """
+    found = typical_radius(vertices, faces), np.linalg.norm(np.ptp(vertices, axis=0))
+    scaled = {unit: scale * np.array(found) for unit, scale in UNITS.items()}
+    limits = np.transpose((WIDTH, SIZE))
+    odds = {
+        unit: float(np.exp(-0.5 * ((np.log(x / TYPICAL) / SPREAD) ** 2).sum()))
+        for unit, x in scaled.items()
+        if (limits[0] <= x).all() and (x <= limits[1]).all()
+    }
+    makes = {
+        unit: f"the widest lumen {2e3 * radius:.3g} mm wide and the scan "
+        f"{1e3 * size:.4g} mm across"
+        for unit, (radius, size) in scaled.items()
+    }
+    better = (
+        f"pass units={' or '.join(map(repr, odds))}" if odds else "check the export"
     )
+    if np.isnan(found[0]):
+        raise ValueError(f"{name} is no tube: too few walls face others; {better}.")
+    if units in odds:
+        return units, f"unit: {units}, as given"
+    if units is not None:
+        why = (
+            f"unit: {units}, as given, which makes {makes[units]} (lumens "
+            f"{WIDTH[0] * 2e3:g} to {WIDTH[1] * 2e3:g} mm wide are usual); if that is "
+            f"wrong, {better}"
+        )
+        if not NO_WIDTH[0] <= scaled[units][0] <= NO_WIDTH[1]:
+            raise ValueError(f"{name}: {why}.")
+        return units, why
+    if not odds:
+        listed = "; ".join(f"{unit} makes {text}" for unit, text in makes.items())
+        raise ValueError(f"{name} has the size of a vessel tree in no unit: {listed}.")
+    best = max(odds, key=lambda unit: odds[unit])
+    sure = odds[best] / sum(odds.values())
+    if sure < SURE:
+        listed = "; ".join(f"{unit} makes {makes[unit]}" for unit in odds)
+        raise ValueError(f"{name} may be in several units: {listed}; {better}.")
+    said = f"unit guessed: {best}, which makes {makes[best]}"
+    others = " or ".join(repr(unit) for unit in odds if unit != best)
+    doubt = f" ({sure:.0%} sure; else pass units={others})" if sure < 0.995 else ""
+    return best, said + doubt
 
 
 def typical_radius(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Radius (file's unit) of the wide part of a tube-like surface, or nan.
 
-    The 95th percentile, by area, of the largest ball that touches the surface at a
-    place and holds no other part of it (Ma et al., 2012).
+    The 95th percentile, by area, of the largest ball that touches the smoothed surface
+    at a place and holds no other part of it (Ma et al., 2012).
     """
     if not areas(vertices, faces).sum() > 0.0:
         return float("nan")
+    vertices, faces = _smoothed(vertices, faces)
     points, normals = sampled(Surface(vertices, faces), _SAMPLES)
-    tree = cKDTree(np.concatenate([points, vertices[np.unique(faces)]]))
-    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    radii = np.minimum(*(_ball(tree, points, s * normals, size) for s in (1.0, -1.0)))
-    found = radii[radii < 0.4 * size]
+    some = vertices[:: 1 + len(vertices) // _VERTICES]
+    tree = cKDTree(np.concatenate([points, some]))
+    most = _WIDEST * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    sides = np.concatenate([normals, -normals])
+    points = np.concatenate([points, points])
+    radii = _ball(tree, points, sides, most)
+    around = tree.query_ball_point(points + radii[:, None] * sides, 1.25 * radii)
+    points += radii[:, None] * sides
+    enclosed = [
+        radius < most and _enclosed(tree.data[near] - middle)
+        for radius, middle, near in zip(radii, points, around, strict=True)
+    ]
+    radii = np.where(enclosed, radii, most).reshape(2, -1).min(axis=0)
+    found = radii[radii < most]
     enough = len(found) >= 0.2 * _SAMPLES  # else hardly any place faces another one
     return float(np.percentile(found, 95)) if enough else float("nan")
+
+
+def _enclosed(away: np.ndarray) -> bool:
+    """Whether places (n, 3) lie around a middle, as in a tube and not in its wall."""
+    away = away / np.linalg.norm(away, axis=1, keepdims=True)
+    return np.linalg.eigvalsh(away.T @ away)[1] > _AROUND * len(away)
+
+
+def _smoothed(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The surface without noise, which shrinks balls: the finer, the more smoothed."""
+    import igl
+
+    vertices, faces = merged(vertices, faces)
+    beside = igl.adjacency_matrix(faces)
+    beside = beside.multiply(1.0 / beside.sum(axis=1)).tocsr()
+    for _ in range(min(len(faces) // _SMOOTH, _MOST)):
+        vertices = 0.5 * (vertices + beside @ vertices)
+    return vertices, faces
 
 
 def _ball(

@@ -88,8 +88,15 @@ def _announced(path: Path) -> int:
     if said:
         return int(said[1] or said[2])
     kind = path.suffix.lower().lstrip(".")
-    text = kind == "stl" and head.lstrip().startswith(b"solid") and b"\0" not in head
-    return path.stat().st_size // (_STL_TEXT if text else FORMATS[kind])
+    size = path.stat().st_size
+    if kind != "stl":
+        return size // FORMATS[kind]
+    if head.lstrip().startswith(b"solid") and b"\0" not in head:
+        return size // _STL_TEXT
+    whole, held = int.from_bytes(head[80:84], "little"), max(size - 84, 0) // 50
+    if b"\0" in head and held < whole <= MOST:
+        raise ValueError(f"it ends early, after {held:,} of {whole:,} triangles")
+    return held
 
 
 def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:

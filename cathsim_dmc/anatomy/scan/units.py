@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from cathsim_dmc import bounds
 
-UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}  # metres per unit
+UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6}  # metres per unit
 _SYSTEMS = {"LPS": 1.0, "RAS": -1.0}
 _AXES = dict(zip("LPSRAI", np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
 # How `in_mm` gives places: matrix (3, 3) from a file's numbers to m, LPS, and its unit.
