@@ -1,7 +1,8 @@
 """A user's own objective: reach the branch with little force on the wall.
 
 `python examples/own_objective.py` registers a task with this objective and trains PPO
-on it for 20,000 frames. The task works like every other task of `cathsim_dmc.suite`.
+on it for 20,000 frames. In this process the task works like every other task of
+`cathsim_dmc.suite`; the command line does not know it.
 """
 
 import argparse

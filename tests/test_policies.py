@@ -22,11 +22,7 @@ def assert_same_in_composer(outcome, name, task, seed, options):
     """An episode of an evaluation is that of a composer environment, bit for bit."""
     env = suite.load("cathsim", task, options)
     act = in_environment(make_policy(name, seed), env)
-
-    def single(timestep):
-        return act(timestep).astype(np.float32)
-
-    episode = EpisodeRecorder(env).record_episode(single, seed)
+    episode = EpisodeRecorder(env).record_episode(act, seed)
     assert outcome.length == episode.steps
     assert outcome.reward == sum(episode.reward.astype(np.float32).astype(float))
     largest = np.float32(episode.wall_force_max).max()
@@ -178,6 +174,8 @@ def test_what_is_no_policy_is_refused(tmp_path):
         policies.make_policy("expret")
     with pytest.raises(RuntimeError, match="no checkpoint in"):
         load_policy(tmp_path / "expret")
+    with pytest.raises(TypeError, match="policy is 3; it must be a name"):
+        load_policy(3)
     with pytest.raises(ValueError, match="'push' was not trained.*type1_bca"):
         evaluate("push")
     with pytest.raises(AttributeError, match="'task'"):

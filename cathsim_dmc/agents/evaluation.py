@@ -270,8 +270,10 @@ class ContactLog:
         return positions, magnitudes
 
     def draw(self, result: EvaluationResult, path: Path) -> None:
-        """Writes the heatmap of an evaluation as PNG."""
+        """Writes the heatmap of an evaluation in one anatomy as PNG."""
         task = suite.make_task(result.task, **result.settings["task_kwargs"])
+        if task.num_anatomies > 1:  # whose contacts lie in different places
+            return
         title = f"{result.task}, {result.policy}: {len(result.episodes)} episodes"
         surface = task.scene.anatomy.surface
         heatmap.heatmap(*self.contacts(), surface, path, title)

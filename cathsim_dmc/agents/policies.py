@@ -116,14 +116,20 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
         seed: Seed of a named policy's own randomness.
 
     Raises:
-        CheckpointError: it is none of these, or damaged.
+        CheckpointError: there is none of that name, or it is damaged.
+        TypeError: it is none of these.
     """
     if isinstance(policy, Policy):
         return policy
     if isinstance(policy, Checkpoint):
         return TrainedPolicy(policy)
-    if not isinstance(policy, str | Path):
+    if callable(policy):
         return FunctionPolicy(policy)
+    if not isinstance(policy, str | Path):
+        raise TypeError(
+            f"policy is {policy!r}; it must be a name, a path, a Checkpoint, a Policy "
+            "or a function"
+        )
     if policy in POLICIES:
         return make_policy(str(policy), seed)
     path = pretrained.pretrained_path(policy)

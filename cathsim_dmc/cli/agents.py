@@ -80,7 +80,7 @@ def evaluate(
         protocol: Conditions: "published", where episodes differ by 1 mm of the start,
             or "varied", where start, roll, friction, stiffness, damping, delay, device
             and noise differ from episode to episode.
-        out: Directory for evaluation.json and heatmap.png.
+        out: Directory for evaluation.json and, of one anatomy, heatmap.png.
         baseline: Whether to compare with the random policy on the same seeds.
         report: Whether to print each episode too: seed, anatomy, device, end, time,
             path and forces (docs/start.md).
@@ -181,7 +181,7 @@ def _outcome(
     return {
         "seed": str(seed),
         "arch": str(conditions.get("arch", "–")),
-        "device": str(conditions.get("device", "–")),
+        "device": str(conditions.get("device") or "–"),
         "end": "physics error" if episode.physics_error else end,
         "time, s": f"{episode.length * CONTROL_TIMESTEP:.1f}",
         "path ratio": f"{episode.path_ratio:.2f}",

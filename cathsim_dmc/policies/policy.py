@@ -81,6 +81,8 @@ def in_environment(
     def act(timestep: dm_env.TimeStep) -> np.ndarray:
         if timestep.first():
             policy.reset(view, np.ones(1, dtype=bool))
-        return np.asarray(policy.act(timestep.observation), dtype=np.float64)[0]
+        # As TorchRL rounds them.
+        action = np.asarray(policy.act(timestep.observation), dtype=np.float32)[0]
+        return action.astype(np.float64)
 
     return act
