@@ -3,13 +3,7 @@
 import numpy as np
 
 from cathsim_dmc.anatomy.motion_loops import MARK as MOTION
-from cathsim_dmc.collision.native import (
-    data_field,
-    model_field,
-    numbers,
-    symbol,
-    word,
-)
+from cathsim_dmc.collision.native import data_field, model_field, numbers, symbol, word
 from cathsim_dmc.compiled import compiled
 
 # Words in the head of the table: the functions that stood in MuJoCo's collision table,

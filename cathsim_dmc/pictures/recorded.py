@@ -94,10 +94,7 @@ def as_function(
 
 
 def write(
-    episode: Episode,
-    env: Any,
-    path: str | os.PathLike[str],
-    fluoroscopy: bool = True,
+    episode: Episode, env: Any, path: str | os.PathLike[str], fluoroscopy: bool = True
 ) -> Path:
     """Write an episode in the format that the file's name asks for.
 
