@@ -164,7 +164,9 @@ def test_what_a_kill_leaves_behind_does_not_count(tmp_path):
         columns = len(file_header(tmp_path)) - 1
         file.write(f"{saved.frames + 64}" + ",0" * columns + "\n")
         file.write(f"{saved.frames - 1},0.")
-    (tmp_path / "checkpoints" / ".unfinished-9").mkdir()
+    for name in (".0000000009.0123456789ab.partial", "0000000009", "best"):
+        (tmp_path / "checkpoints" / name).mkdir()
+    (tmp_path / "checkpoints" / ".DS_Store").touch()
 
     goal = saved.frames + 512
     result = run(small_sac(total_frames=goal), tmp_path, resume=True)
@@ -174,7 +176,9 @@ def test_what_a_kill_leaves_behind_does_not_count(tmp_path):
     assert saved.frames + 64 not in frames
     assert frames[-1] == goal
     assert result.metrics["replay_frames"] == min(goal, 4_096)
-    assert not list((tmp_path / "checkpoints").glob(".*"))
+    names = {path.name for path in (tmp_path / "checkpoints").iterdir()}
+    kept = {path.name for path in checkpoints_in(tmp_path)}
+    assert names - kept == {"best", ".DS_Store"}  # the user's own
 
 
 def test_running_figures_go_on_where_a_run_is_resumed(tmp_path):

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ _DIRECTORY = "checkpoints"
 _DESCRIPTION = "checkpoint.json"
 _POLICY = "policy.pt"
 _LEARNING = "learning.pt"
+# Directories that a killed process leaves: half written, or half removed.
+_LEFTOVER = re.compile(r"\.\d{10,}\.[0-9a-f]{12}\.partial|\d{10,}")
 
 
 class CheckpointError(RuntimeError):
@@ -142,7 +145,8 @@ def save_checkpoint(
     directory = Path(run) / _DIRECTORY
     directory.mkdir(parents=True, exist_ok=True)
     for leftover in set(directory.iterdir()) - set(checkpoints_in(run)):
-        shutil.rmtree(leftover)  # of a process that was killed
+        if _LEFTOVER.fullmatch(leftover.name) and leftover.is_dir():
+            shutil.rmtree(leftover)
     target = directory / f"{frames:010d}"
     if target.exists():
         # No frame was added since, as when a run is interrupted right after saving.
