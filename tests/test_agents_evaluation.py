@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 import synthetic_env
 import torch
 
+from cathsim_dmc import suite
 from cathsim_dmc.agents import evaluate, policies, protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.evaluation import EvaluationResult
@@ -120,6 +122,36 @@ def test_the_varied_protocol_has_distinct_conditions():
     assert "device" not in pair.task_kwargs
     with pytest.raises(ValueError, match="protocol is 'hard'; .*published, varied"):
         play(policy="random", protocol="hard")
+
+
+@pytest.fixture
+def own_task(monkeypatch):
+    """Registers a task of these options over those of another one; returns its name."""
+
+    def register(base, **options):
+        own = {**suite.TASKS[base].options, **options}
+        definition = dataclasses.replace(suite.TASKS[base], options=own)
+        monkeypatch.setitem(suite.TASKS, "own", definition)
+        return "own"
+
+    return register
+
+
+def test_a_task_is_played_with_its_own_options(own_task):
+    varied, published = map(protocols.get, ("varied", "published"))
+    task = own_task("type1_bca", device="diagnostic_5f_simmons")
+    (part,) = protocols.parts(varied, task, {}, 4, 0)
+    assert {one["device"] for one in part.conditions} == {"diagnostic_5f_simmons"}
+    task = own_task("arch_bca", pool=2, first=3)
+    parts = protocols.parts(varied, task, {}, 8, 0)
+    arches = [one["arch"] for part in parts for one in part.conditions]
+    assert sorted(arches) == [3] * 4 + [4] * 4
+    task = own_task("type1_bca", randomisation={"friction": (0.1, 0.2)})
+    (part,) = protocols.parts(published, task, {}, 4, 0)
+    assert all(0.1 <= one["friction"] <= 0.2 for one in part.conditions)
+    assert protocols.distinct(task, part.task_kwargs) and len(part.conditions) == 4
+    (part,) = protocols.parts(published, task, {"randomisation": False}, 4, 0)
+    assert not part.conditions
 
 
 def test_a_policy_of_any_arch_goes_to_a_named_anatomy():

@@ -25,7 +25,7 @@ class Protocol(NamedTuple):
     Attributes:
         episodes: Number of episodes, unless another one is asked for.
         task_kwargs: Options of the task, over all others.
-        devices: Steerable devices that episodes take in turn, in place of the task's.
+        devices: Devices that episodes take in turn where the options name none.
     """
 
     episodes: int
@@ -77,17 +77,17 @@ def parts(
     """The episodes of an evaluation, those of each device together.
 
     Args:
-        task_kwargs: Options of the task, which the protocol changes.
+        task_kwargs: Options over the task's own; those of the protocol go over both.
         seed: The seeds lie at or above it: one after the other without variation, and
             otherwise those that fill every tenth of each range alike and take the
             arches of a pool in turn.
     """
-    options = {**task_kwargs, **protocol.task_kwargs}
-    ranges = Randomisation.make(options.get("randomisation", False))
     definition = suite.TASKS.get(task)
-    coaxial = options.get("devices", definition and definition.options.get("devices"))
+    own = {} if definition is None else definition.options
+    options = {**own, **task_kwargs, **protocol.task_kwargs}
+    ranges = Randomisation.make(options.get("randomisation", False))
     pools = [options]
-    if not coaxial and options.get("device", "steerable_5f") in protocol.devices:
+    if protocol.devices and not (options.get("devices") or options.get("device")):
         pools = [{**options, "device": name} for name in protocol.devices]
     random_arch = definition is not None and definition.random_arch
     arches = options.get("pool", POOL) if random_arch else 1
