@@ -277,8 +277,8 @@ def test_inlet_off_the_lumen(y_scan):
 
 def test_places_are_told_as_the_file_has_them():
     place = np.array([0.012, -0.034, 0.0561])
-    with units.telling(units.to_lps("cm", "RAS"), "cm"):
-        assert units.in_mm(place) == "(-1.2, 3.4, 5.6) cm"
-    with units.telling(units.to_lps("m", "LPS", "ILA"), "m"):
-        assert units.in_mm(units.upright("ILA") @ place) == "(0.012, -0.034, 0.056) m"
-    assert units.in_mm(place) == "(12, -34, 56) mm"
+    with units.file_frame(units.to_lps("cm", "RAS"), "cm"):
+        assert units.shown(place) == "(-1.2, 3.4, 5.6) cm"
+    with units.file_frame(units.to_lps("m", "LPS", "ILA"), "m"):
+        assert units.shown(units.upright("ILA") @ place) == "(0.012, -0.034, 0.056) m"
+    assert units.shown(place) == "(12, -34, 56) mm"

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from cathsim_dmc.anatomy.centreline import VesselTree, arc_lengths
 from cathsim_dmc.anatomy.scan.centring import resample, tangents
 from cathsim_dmc.anatomy.scan.extract import FreeEnd
-from cathsim_dmc.anatomy.scan.units import in_mm
+from cathsim_dmc.anatomy.scan.units import shown
 from cathsim_dmc.anatomy.scan.ways import Ways
 
 RADIUS = 4.5e-3  # m, least median radius of an aorta
@@ -61,7 +61,7 @@ def find_aorta(
     pair, way = best[1:]
     if pair is None:
         return None, "the lumen has no two wide ends"
-    ends_of_it = " and ".join(in_mm(ends[k].position) for k in pair)
+    ends_of_it = " and ".join(shown(ends[k].position) for k in pair)
     wide, bent = np.median(ways.depth[way]), Bend.of(ways.points[way]).turn
     if wide < RADIUS:
         return None, (

@@ -13,7 +13,7 @@ from cathsim_dmc.anatomy.scan.aorta import TURN, Bend, mirrored
 from cathsim_dmc.anatomy.scan.naming import ARCH_BRANCHES
 from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.tree import END_TRIM, TAIL, TAIL_RADIUS
-from cathsim_dmc.anatomy.scan.units import in_mm
+from cathsim_dmc.anatomy.scan.units import shown
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 SLACK = 0.3e-3  # m, by which a triangulated surface may cut into a tube
@@ -57,7 +57,7 @@ def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
         if depth[worst] < min(floor[worst], 0.1e-3) - SLACK * 0.5:
             yield (
                 f"{key} leaves the lumen {s[worst] * 1e3:.0f} mm from its start, at "
-                f"{in_mm(place.position[worst])}, by {-depth[worst] * 1e3:.1f} mm"
+                f"{shown(place.position[worst])}, by {-depth[worst] * 1e3:.1f} mm"
             )
 
 
@@ -76,7 +76,7 @@ def _own_lumen(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
             if (length := STEP * int(beside.sum())) > BESIDE:
                 yield (
                     f"{vessel.name} runs {length * 1e3:.0f} mm in the lumen of "
-                    f"{other.name}, around {in_mm(own.position[beside.argmax()])}"
+                    f"{other.name}, around {shown(own.position[beside.argmax()])}"
                 )
 
 
@@ -141,7 +141,7 @@ def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
         places = [other.project(near) for other in others]
         if not any((place.distance < 0.7 * place.radius).any() for place in places):
             yield (
-                f"{key} ends at {in_mm(end.position)}, but its lumen goes on for "
+                f"{key} ends at {shown(end.position)}, but its lumen goes on for "
                 f"{beyond * 1e3:.0f} mm or more"
             )
 

@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 
 from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.scan.topology import groups
-from cathsim_dmc.anatomy.scan.units import in_mm
+from cathsim_dmc.anatomy.scan.units import shown
 from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common
 
 END_SEARCH = 15e-3  # m from a blind end in which its width is looked for
@@ -215,7 +215,7 @@ def listed(ends: Sequence[FreeEnd]) -> str:
     """Ends with their places and widths, widest first, for a message."""
     ordered = sorted(ends, key=lambda end: -end.radius)
     return ", ".join(
-        f"{in_mm(end.position)}, {end.radius * 2e3:.1f} mm wide" for end in ordered[:8]
+        f"{shown(end.position)}, {end.radius * 2e3:.1f} mm wide" for end in ordered[:8]
     )
 
 

@@ -27,7 +27,7 @@ from cathsim_dmc.anatomy.scan.places import (
     place_inlet,
 )
 from cathsim_dmc.anatomy.scan.tree import grow_tree, name_trunk
-from cathsim_dmc.anatomy.scan.units import in_mm, telling, to_lps, upright
+from cathsim_dmc.anatomy.scan.units import file_frame, shown, to_lps, upright
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
@@ -108,8 +108,8 @@ def import_scan(
     matrix = to_lps(lumen.units, mesh_frame, axes)
     curves = read_curves(centreline_paths, lumen.units, mesh_frame, axes)
     say(f"tree: looking for vessels in {len(lumen.surface.faces):,} triangles")
-    with telling(matrix, lumen.units):
-        middle = in_mm(lumen.surface.vertices.mean(axis=0))
+    with file_frame(matrix, lumen.units):
+        middle = shown(lumen.surface.vertices.mean(axis=0))
         places = {k: _placed(k, matrix @ x, measure, middle) for k, x in given.items()}
         curves = {key: inside_part(key, c, measure) for key, c in curves.items()}
         grown = _tree(measure, curves, places, changes, note)
@@ -203,9 +203,9 @@ def _computed(ways, ends, entry, places, changes, note):
     curves = dict(zip(names, found, strict=True))
     for old, new in zip(computed, names, strict=True):
         if old != new:
-            note(f"{old}, which ends at {in_mm(curves[new][-1])}, is renamed {new}")
+            note(f"{old}, which ends at {shown(curves[new][-1])}, is renamed {new}")
     nameless = [
-        f"{key} (ends at {in_mm(curve[-1])})"
+        f"{key} (ends at {shown(curve[-1])})"
         for key, curve in curves.items()
         if key.startswith("branch_")
     ]
@@ -217,7 +217,7 @@ def _computed(ways, ends, entry, places, changes, note):
     if thin:
         note(f"{thin} branches too thin or short for a 5 Fr catheter left out")
     end = f"{end} (--inlet takes another)" if end and "inlet" not in places else ""
-    note(f"inlet chosen at {in_mm(entry.position)}{end}")
+    note(f"inlet chosen at {shown(entry.position)}{end}")
     return entry, curves, frozenset(names[row] for row in right)
 
 
@@ -250,7 +250,7 @@ def _placed(
     away = -float(measure(place[None])[0])
     if away > NEAR_INLET:
         raise ValueError(
-            f"{key} {in_mm(place)} is {away * 1e3:.1f} mm away from the lumen, whose "
+            f"{key} {shown(place)} is {away * 1e3:.1f} mm away from the lumen, whose "
             f"middle is {middle}; give a point in the lumen, or at most "
             f"{NEAR_INLET * 1e3:g} mm from the end "
             f"{'at the heart' if key == 'heart' else 'by which the device enters'}, in "

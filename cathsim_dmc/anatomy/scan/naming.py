@@ -10,7 +10,7 @@ import numpy as np
 from cathsim_dmc.anatomy.scan import offshoots
 from cathsim_dmc.anatomy.scan.aorta import Bend, chord
 from cathsim_dmc.anatomy.scan.offshoots import EXTRA, SPREAD, SURE, Offshoot, normal
-from cathsim_dmc.anatomy.scan.units import in_mm
+from cathsim_dmc.anatomy.scan.units import shown
 from cathsim_dmc.anatomy.scan.ways import Ways, common
 
 ROOT = "aorta"  # the vessel that starts at the inlet
@@ -113,7 +113,7 @@ def name_branches(
         own = " and ".join(sorted(names[i] for i in one.curves))
         label = "trunk of bca and lcca" if label == "bovine" else label
         notes.append(
-            f"question: the {label} that leaves the arch at {in_mm(one.place)} leads "
+            f"question: the {label} that leaves the arch at {shown(one.place)} leads "
             f"to {own}: which is which? Name them (--rename)"
         )
     return Naming([names[i] for i in range(len(curves))], notes, tuple(right))
@@ -255,7 +255,7 @@ def question(
     places = []
     for one in seen:
         own = ", ".join(names[i] for i in one.curves) or "a branch that is cut short"
-        places.append(f"{own} at {in_mm(one.place)}")
+        places.append(f"{own} at {shown(one.place)}")
     few = ("one branch leaves", "two branches leave")
     count = few[len(seen) - 1] if len(seen) < 3 else f"{len(seen)} branches leave"
     return (

@@ -9,7 +9,7 @@ from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS
 from cathsim_dmc.anatomy.scan.topology import adjacent, groups
-from cathsim_dmc.anatomy.scan.units import in_mm
+from cathsim_dmc.anatomy.scan.units import shown
 
 GOAL_PAST_OSTIUM = 30e-3  # m along a branch, its first goal
 GOAL_DISTAL = 0.8  # of the passable part of a branch, its second goal
@@ -73,7 +73,7 @@ def cut_open(
     stay = np.unique(label[beside[front[beside, 0]]])
     if np.intersect1d(gone, stay).size or not stay.size:
         raise ValueError(
-            f"the lumen cannot be cut at {in_mm(inlet.position)}: both sides stay "
+            f"the lumen cannot be cut at {shown(inlet.position)}: both sides stay "
             "connected. Choose an inlet on a single vessel."
         )
     # Of each triangle that is cut, p is the corner that is alone on its side, x and y

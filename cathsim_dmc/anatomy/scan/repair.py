@@ -5,7 +5,7 @@ import numpy as np
 from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import topology
 from cathsim_dmc.anatomy.scan.places import cut_open
-from cathsim_dmc.anatomy.scan.units import in_mm
+from cathsim_dmc.anatomy.scan.units import shown
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 PART_AREA = 0.03  # of the surface's area: smaller separate parts are dropped
@@ -117,7 +117,7 @@ class _Work:
             bad = np.asarray(np.isin(self.faces, shared).any(axis=1))
             first = first or (
                 f"{len(shared)} edges shared by more than two triangles, one at "
-                f"{in_mm(self.vertices[shared[0, 0]])}"
+                f"{shown(self.vertices[shared[0, 0]])}"
             )
             if bad.sum() > max(NON_MANIFOLD * len(self.faces), 40):
                 raise ValueError(
@@ -168,12 +168,12 @@ class _Work:
             elif wide > widest:
                 raise ValueError(
                     f"{self.name} is not closed: a hole {wide * 1e3:.1f} mm wide in "
-                    f"the side of a vessel at {in_mm(middle)} (at most "
+                    f"the side of a vessel at {shown(middle)} (at most "
                     f"{widest * 1e3:g} mm are filled). Fill holes (3D Slicer: Surface "
                     "Toolbox, Fill holes), then export again."
                 )
             else:
-                filled.append((wide, in_mm(middle)))
+                filled.append((wide, shown(middle)))
             fan = loop[None, ::-1]
             if len(loop) > 3:
                 centre = np.full(len(loop), len(self.vertices))
@@ -192,7 +192,7 @@ class _Work:
             self.notes.append(note)
         edges, times = topology.edge_counts(self.faces)
         if (times != 2).any():
-            where = in_mm(self.vertices[edges[times != 2][0, 0]])
+            where = shown(self.vertices[edges[times != 2][0, 0]])
             raise ValueError(
                 f"{self.name} is not closed: after mending {int((times != 2).sum())} "
                 f"edges do not have two triangles, one at {where}. {_AGAIN}"
@@ -272,7 +272,7 @@ class _Work:
         faces, edges = topology.crossings(vertices, self.faces)
         tangled = np.isin(self.faces, np.unique(edges)).sum(axis=1) >= 2
         tangled[faces] = True
-        where = in_mm(vertices[edges[0, 0]]) if len(edges) else ""
+        where = shown(vertices[edges[0, 0]]) if len(edges) else ""
         return len(np.unique(faces)), where, tangled
 
     def _smooth_folds(self) -> bool:

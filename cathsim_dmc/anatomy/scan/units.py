@@ -13,29 +13,29 @@ from cathsim_dmc import bounds
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6}  # metres per unit
 _SYSTEMS = {"LPS": 1.0, "RAS": -1.0}
 _AXES = dict(zip("LPSRAI", np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
-# How `in_mm` gives places: matrix (3, 3) from a file's numbers to m, LPS, and its unit.
-_TOLD: contextvars.ContextVar[tuple[np.ndarray, str]] = contextvars.ContextVar(
-    "told", default=(1e-3 * np.eye(3), "mm")
+# Frame in which places are shown: matrix (3, 3) from there to m, LPS, and its unit.
+_FILE: contextvars.ContextVar[tuple[np.ndarray, str]] = contextvars.ContextVar(
+    "file", default=(1e-3 * np.eye(3), "mm")
 )
 _OFF = 0.05  # most by which directions given by numbers may differ from a rotation
 
 
-def in_mm(point: np.ndarray) -> str:
-    """A place (3,) m, LPS, as text: in mm, or as the file of `telling` has it."""
-    matrix, unit = _TOLD.get()
+def shown(point: np.ndarray) -> str:
+    """A place (3,) m, LPS, as text: in mm, or in the frame of a `file_frame`."""
+    matrix, unit = _FILE.get()
     decimals = max(round(np.log10(UNITS[unit] / UNITS["mm"])), 0)
     numbers = np.linalg.solve(matrix, point)
     return "(" + ", ".join(f"{x:.{decimals}f}" for x in numbers) + f") {unit}"
 
 
 @contextlib.contextmanager
-def telling(matrix: np.ndarray, unit: str) -> Iterator[None]:
-    """Has `in_mm` give places in the unit and frame of a file, by its `to_lps`."""
-    before = _TOLD.set((matrix, unit))
+def file_frame(matrix: np.ndarray, unit: str) -> Iterator[None]:
+    """Has places `shown` in the unit and frame of a file; see `to_lps`."""
+    before = _FILE.set((matrix, unit))
     try:
         yield
     finally:
-        _TOLD.reset(before)
+        _FILE.reset(before)
 
 
 def to_lps(
