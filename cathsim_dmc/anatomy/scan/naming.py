@@ -171,10 +171,10 @@ def _labellings(seen: Sequence[Offshoot], right: Sequence[np.ndarray], scale: fl
     count = len(seen)
     for pattern, (frequency, _) in PATTERNS.items():
         for kept in range(min(count, len(pattern)) + 1):
-            for shown in combinations(range(len(pattern)), kept):
+            for whole in combinations(range(len(pattern)), kept):
                 for at in combinations(range(count), kept):
                     labels = ["extra"] * count
-                    for place, which in zip(at, shown, strict=True):
+                    for place, which in zip(at, whole, strict=True):
                         labels[place] = pattern[which]
                     weight = np.log(frequency)
                     weight += np.log(CUT) * (len(pattern) - kept)
@@ -182,7 +182,7 @@ def _labellings(seen: Sequence[Offshoot], right: Sequence[np.ndarray], scale: fl
                         _fit(one, label, scale, side)
                         for one, label, side in zip(seen, labels, right, strict=True)
                     )
-                    weight += _spacings(seen, pattern, shown, at, scale)
+                    weight += _spacings(seen, pattern, whole, at, scale)
                     weight += np.log(BETWEEN) * _between(seen, labels)
                     yield pattern, tuple(labels), float(weight)
 
