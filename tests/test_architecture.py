@@ -50,10 +50,7 @@ ALLOWED = {
     | {"recording", "analysis", "validation", "policies", "agents"}
     | {"play", "pictures"},
 }
-_TORCHRL_FACE = (
-    "simulation/torchrl.py",
-    "simulation/environments.py",
-)
+_TORCHRL_FACE = ("simulation/torchrl.py", "simulation/environments.py")
 # Package -> files that may import it, wherever in the file the import stands.
 CONFINED = {
     "torch": {*_TORCHRL_FACE, "agents/"},
@@ -69,16 +66,7 @@ CONFINED = {
     "tyro": {"cli/"},
 }
 # Slow to import: only within functions, unless a module is itself loaded late.
-LATE = (
-    "trimesh",
-    "skimage",
-    "matplotlib",
-    "rerun",
-    "torch",
-    "torchrl",
-    "numba",
-    "igl",
-)
+LATE = ("trimesh", "skimage", "matplotlib", "rerun", "torch", "torchrl", "numba", "igl")
 
 
 def modules():

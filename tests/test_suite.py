@@ -178,9 +178,7 @@ def test_dm_control_loads_the_task(shared_environment, reseed):
     new.close()
 
 
-def test_a_model_is_compiled_once_unless_a_hook_may_have_changed_it(
-    shared_environment,
-):
+def test_a_model_is_compiled_once_unless_a_hook_may_have_changed_it(shared_environment):
     task = shared_environment("type1_lcca").task
     environment, hooked = (suite.environment(twin(task)) for _ in range(2))
     called = []
