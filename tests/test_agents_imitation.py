@@ -1,6 +1,8 @@
 """Cloning, DAgger, demonstrations in SAC's replay, and runs that start from another."""
 
 import copy
+import json
+import shutil
 
 import numpy as np
 import pytest
@@ -88,6 +90,22 @@ def test_a_clone_does_what_the_expert_did(cloned, dataset, shapes):
 def test_cloning_needs_a_dataset(tmp_path):
     with pytest.raises(ConfigError, match="cathsim demos"):
         train(small("bc"), tmp_path, progress=False)
+
+
+def test_a_run_is_resumed_after_its_dataset_has_moved(
+    cloned, dataset, tmp_path, cathsim
+):
+    run = shutil.copytree(cloned, tmp_path / "run")
+    config = json.loads((run / "config.json").read_text())
+    moved = shutil.move(shutil.copytree(dataset, tmp_path / "a"), tmp_path / "b")
+    lost = {**config, "demonstrations": str(tmp_path / "a")}
+    (run / "config.json").write_text(json.dumps(lost))
+    again = ["train", "--out", run, "--resume", "--quiet"]
+    code, _, err = cathsim(*again)
+    assert code == 2 and "no dataset in" in err and "--demonstrations" in err
+    assert cathsim(*again, "--demonstrations", moved)[0] == 0
+    assert json.loads((run / "config.json").read_text())["demonstrations"] == str(moved)
+    assert "demonstrations" in make_config("sac").resumable
 
 
 def test_a_clone_that_is_continued_learns_the_same(dataset, shapes, tmp_path):

@@ -107,7 +107,10 @@ class BCConfig(TrainingConfig):
     """
 
     algorithm: ClassVar[str] = "bc"
-    resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable - {"total_frames"}
+    # The dataset of a run may be moved.
+    resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable - {
+        "total_frames"
+    } | {"demonstrations"}
 
     demonstrations: str | None = None
     gradient_steps: int = positive(10_000)

@@ -84,7 +84,8 @@ def read_episodes(path: str | os.PathLike[str]) -> Iterator[Any]:
     data = next(Path(path).glob("data"), Path(path)) / "metadata.json"
     if not data.is_file():
         raise DatasetError(
-            f"no dataset in {path}: give a directory that `cathsim demos` has written"
+            f"no dataset in {path}: give a directory that `cathsim demos` has written; "
+            "a run that is resumed takes a new one too (--demonstrations)"
         )
     try:
         # Without its spaces Minari would make the environment that the file names.
