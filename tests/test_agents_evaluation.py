@@ -13,6 +13,7 @@ from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.analysis.force_statistics import FIGURES, EpisodeForces, Statistics
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.cli import agents as commands
+from cathsim_dmc.cli import task_options
 
 SORTED = sorted(synthetic_env.SIZES)
 # Where "position" begins in the concatenated observation.
@@ -152,6 +153,45 @@ def test_a_task_is_played_with_its_own_options(own_task):
     assert protocols.distinct(task, part.task_kwargs) and len(part.conditions) == 4
     (part,) = protocols.parts(published, task, {"randomisation": False}, 4, 0)
     assert not part.conditions
+
+
+def test_what_is_given_is_played_or_refused():
+    """A device is played in all episodes; two randomisations are one too many."""
+    varied = protocols.get("varied")
+    for device in varied.devices:
+        (part,) = protocols.parts(varied, "type1_bca", {"device": device}, 6, 0)
+        assert [one["device"] for one in part.conditions] == [device] * 6
+    options = task_options.task_kind()(randomisation={"friction": [0.1, 0.2]})
+    message = "randomisation is given, .*'varied' has its own: leave randomisation out"
+    with pytest.raises(ValueError, match=message):
+        commands.evaluate("push", "type1_bca", protocol="varied", options=options)
+    with pytest.raises(ValueError, match=message):
+        play(policy="push", protocol="varied", task_kwargs=options.given)
+
+
+def test_the_randomisation_of_a_training_is_no_option_of_the_protocol(monkeypatch):
+    """The leaderboard lists no evaluation with options of its own."""
+    policy, seen = policies.FunctionPolicy(expert), []
+    policy.task, policy.task_kwargs = "type1_bca", {"randomisation": True}
+
+    def play(task, *, observation, num_envs, num_threads, task_kwargs, seed):
+        seen.append(task_kwargs["randomisation"])
+        return synthetic_env.make_env(task, num_envs=num_envs)
+
+    done = evaluate(policy, episodes=2, protocol="varied", make_env=play)
+    assert done.settings["task_kwargs"] == {} and seen == [protocols.VARIED_RANGES] * 2
+    done = evaluate(policy, episodes=2, make_env=play)
+    assert done.settings["task_kwargs"] == policy.task_kwargs and seen[2:] == [True]
+    given = []
+    monkeypatch.setattr(commands.agents, "load_policy", lambda *_: policy)
+    monkeypatch.setattr(
+        commands.agents,
+        "evaluate",
+        lambda *_, task_kwargs, **__: given.append(task_kwargs) or done,
+    )
+    options = task_options.task_kind()(device="steerable_4f")
+    commands.evaluate("run", protocol="varied", json=True, options=options)
+    assert given == [{"device": "steerable_4f"}] * 2
 
 
 def test_a_policy_of_any_arch_goes_to_a_named_anatomy():

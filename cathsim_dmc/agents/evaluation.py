@@ -46,7 +46,8 @@ class EvaluationResult:
         policy: Name of the policy.
         seeds: Seed of each episode.
         episodes: Episodes in the order of their seeds.
-        settings: Protocol, observation, task_kwargs and, for a checkpoint, its frames.
+        settings: Protocol, observation, task_kwargs but those that the protocol sets,
+            and, for a checkpoint, its frames.
         distinct: Whether episodes differ by more than the jitter of the start. If not,
             no interval over them is given.
         conditions: What was drawn for each episode; empty without randomisation.
@@ -174,7 +175,7 @@ def evaluate(
         name: Name of the policy for the reports.
         observation: Name or names of observations; None takes the policy's own.
         task_kwargs: Further options of the task; None takes those that the policy was
-            trained with.
+            trained with. A device among them is played in all episodes.
         num_threads: Number of threads of the simulation; None takes one per core.
         out_dir: Directory for evaluation.json; None writes none.
         observer: Function that is called after every step, before any reset.
@@ -183,7 +184,7 @@ def evaluate(
             `physics.forces.NAMES`.
 
     Raises:
-        ValueError: no task is known, or episodes < 1.
+        ValueError: no task is known, episodes < 1, or the protocol sets a given option.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     conditions = protocols.get(protocol)
@@ -194,7 +195,8 @@ def evaluate(
         bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
     player = load_policy(policy, seed)
     task, options = task_and_options(player, task, task_kwargs)
-    options = options if task_kwargs is None else dict(task_kwargs)
+    options = options if task_kwargs is None else task_kwargs
+    options = protocols.beside(protocol, options, task_kwargs or ())
     observed = observation or player.observation or "internal"
     parts = protocols.parts(conditions, task, options, episodes, seed)
     if out_dir is not None:

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,6 +65,19 @@ class Part(NamedTuple):
 def get(name: str) -> Protocol:
     """The protocol of a name; ValueError lists those that there are."""
     return PROTOCOLS[bounds.choice("protocol", name, PROTOCOLS)]
+
+
+def beside(
+    protocol: str, options: Mapping[str, Any], given: Collection[str]
+) -> dict[str, Any]:
+    """Options of a task less those that a protocol sets; ValueError if one is given."""
+    own = get(protocol).task_kwargs
+    for name in own.keys() & {*given}:
+        raise ValueError(
+            f"{name} is given, and the protocol {protocol!r} has its own: leave {name} "
+            "out, or play the protocol 'published'"
+        )
+    return {name: value for name, value in options.items() if name not in own}
 
 
 def parts(

@@ -16,7 +16,7 @@ from cathsim_dmc import agents  # isort: skip
 
 from cathsim_dmc import __version__, bounds, files, suite
 from cathsim_dmc import play as by_hand
-from cathsim_dmc.agents import evaluation, submission
+from cathsim_dmc.agents import evaluation, protocols, submission
 from cathsim_dmc.agents.demonstrations import DEMONSTRATION_SEED
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.evaluation import EvaluationResult
@@ -90,6 +90,7 @@ def evaluate(
     player = agents.load_policy(policy, seed)
     task, task_kwargs = task_and_options(player, task, options.given)
     bounds.choice("task", task, suite.SUITE)
+    task_kwargs = protocols.beside(protocol, task_kwargs, options.given)
     contacts = evaluation.ContactLog()
 
     def play(who: Any, out_dir: Path | None = None) -> EvaluationResult:
