@@ -133,6 +133,12 @@ def test_nothing_is_left_of_a_dataset_that_fails(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_full_disk_is_told_before_hdf5_meets_it(tmp_path, small_disk):
+    with small_disk(50_000), pytest.raises(OSError, match="too large.*full-v0"):
+        record_demonstrations(TASK, tmp_path / "full-v0", 1, task_kwargs=OPTIONS)
+    assert not list(tmp_path.iterdir())
+
+
 def test_reading_a_dataset_runs_nothing_that_it_names(copied, shapes):
     """Minari makes the environment of a dataset without spaces."""
     file = copied / "data" / "metadata.json"

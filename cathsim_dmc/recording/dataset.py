@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.files import atomic_directory
+from cathsim_dmc.files import atomic_directory, naming
 
 
 def write(
@@ -41,6 +41,7 @@ def write(
     Raises:
         FileExistsError: the directory exists.
         FileNotFoundError: the directory around it does not.
+        OSError: the disk is full.
         ModuleNotFoundError: minari is not installed.
     """
     path = Path(path)
@@ -56,13 +57,28 @@ def write(
         "description": description,
         "minari_version": minari.__version__,
     }
-    with atomic_directory(path) as temporary:
+    with atomic_directory(path) as temporary, naming(path):
+        _check_space(temporary / "space", buffers)
         # Minari looks for the files of a relative path beneath that path again.
         data = temporary.absolute() / "data"
         storage = MinariStorage.new(data, *spaces, env_spec, jpeg_encoding=False)
         storage.update_metadata(about)
         storage.update_episodes(buffers)
     return path
+
+
+def _check_space(path: Path, buffers: Sequence[Any]) -> None:
+    """Raises OSError unless the disk, or a quota, holds the arrays of episodes."""
+    # Where HDF5 meets a full disk, it ends the process with a segmentation fault.
+    size = 2**20
+    for one in buffers:
+        arrays = *one.observations.values(), *one.infos.values(), one.actions
+        size += 2**18 + sum(array.nbytes for array in arrays) * 5 // 4  # with chunks
+    noise = os.urandom(2**20)  # which no file system compresses
+    with open(path, "wb") as file:
+        for _ in range(size >> 20):
+            file.write(noise)
+    path.unlink()
 
 
 class DatasetError(ValueError):
