@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import synthetic_env
 import torch
+from dm_control.composer.variation import distributions
 
 from cathsim_dmc import suite
 from cathsim_dmc.agents import evaluate, policies, protocols
@@ -14,6 +15,7 @@ from cathsim_dmc.analysis.force_statistics import FIGURES, EpisodeForces, Statis
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.cli import agents as commands
 from cathsim_dmc.cli import task_options
+from cathsim_dmc.physics.randomisation import Randomisation
 
 SORTED = sorted(synthetic_env.SIZES)
 # Where "position" begins in the concatenated observation.
@@ -150,7 +152,7 @@ def test_a_task_is_played_with_its_own_options(own_task):
     task = own_task("type1_bca", randomisation={"friction": (0.1, 0.2)})
     (part,) = protocols.parts(published, task, {}, 4, 0)
     assert all(0.1 <= one["friction"] <= 0.2 for one in part.conditions)
-    assert protocols.distinct(task, part.task_kwargs) and len(part.conditions) == 4
+    assert protocols.distinct(task, part.task_kwargs, 4) and len(part.conditions) == 4
     (part,) = protocols.parts(published, task, {"randomisation": False}, 4, 0)
     assert not part.conditions
 
@@ -162,7 +164,7 @@ def test_what_is_given_is_played_or_refused():
         (part,) = protocols.parts(varied, "type1_bca", {"device": device}, 6, 0)
         assert [one["device"] for one in part.conditions] == [device] * 6
     options = task_options.task_kind()(randomisation={"friction": [0.1, 0.2]})
-    message = "randomisation is given, .*'varied' has its own: leave randomisation out"
+    message = "the protocol has its own; leave randomisation out"
     with pytest.raises(ValueError, match=message):
         commands.evaluate("push", "type1_bca", protocol="varied", options=options)
     with pytest.raises(ValueError, match=message):
@@ -221,6 +223,36 @@ def test_one_condition_has_no_interval_over_its_episodes():
     assert [e["conditions"]["device"] for e in many.to_dict()["episodes"]] == [
         "steerable_5f", "steerable_5f", "steerable_4f",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "task, options, episodes, expected",
+    [
+        ("type1_bca", {"start_along_route": [0.5, 0.5]}, 5, False),
+        ("type1_bca", {"start_along_route": [0.2, 0.5]}, 16, True),
+        ("type1_bca", {"start_along_route": [0.2, 0.5]}, 17, False),
+        ("arch_any", {"pool": 1}, 5, False),
+        ("arch_any", {"pool": 7}, 7, True),
+        ("arch_any", {"pool": 7}, 100, False),
+        ("type1_bca", {"friction": [0.1, 0.1]}, 5, False),
+        ("type1_bca", {"friction": [0.1, 0.2]}, 100, True),
+        ("type1_bca", {"friction": distributions.Normal(0.1, 0.01)}, 100, True),
+        ("type1_bca", {"delay": [3, 3]}, 5, False),
+        ("type1_bca", {"delay": [0, 3]}, 4, True),
+        ("type1_bca", {"delay": [0, 3]}, 5, False),
+        ("type1_bca", {"start_insertion": [0.0, 0.06]}, 14, False),
+        ("type1_bca", {"start_radius": 0.01}, 100, True),
+        ("type1_bca", {"tracking_noise": 5e-4, "view": [-5, 5]}, 5, False),
+        ("type1_bca", {"gain": [0.9, 1.1], "kerma": [0.5, 2.0]}, 5, False),
+        ("type1_bca", {}, 1, False),
+    ],
+)
+def test_episodes_are_distinct_where_all_draws_can_differ(
+    task, options, episodes, expected
+):
+    if options.keys() & {field.name for field in dataclasses.fields(Randomisation)}:
+        options = {"randomisation": options}
+    assert protocols.distinct(task, options, episodes) == expected
 
 
 def test_safe_success_counts_the_force_in_every_physics_step():

@@ -48,8 +48,8 @@ class EvaluationResult:
         episodes: Episodes in the order of their seeds.
         settings: Protocol, observation, task_kwargs but those that the protocol sets,
             and, for a checkpoint, its frames.
-        distinct: Whether episodes differ by more than the jitter of the start. If not,
-            no interval over them is given.
+        distinct: Whether all episodes can differ by more than the jitter of the start.
+            If not, no interval over them is given.
         conditions: What was drawn for each episode; empty without randomisation.
     """
 
@@ -196,7 +196,7 @@ def evaluate(
     player = load_policy(policy, seed)
     task, options = task_and_options(player, task, task_kwargs)
     options = options if task_kwargs is None else task_kwargs
-    options = protocols.beside(protocol, options, task_kwargs or ())
+    options = conditions.beside(options, task_kwargs or {})
     observed = observation or player.observation or "internal"
     parts = protocols.parts(conditions, task, options, episodes, seed)
     if out_dir is not None:
@@ -221,7 +221,7 @@ def evaluate(
             "protocol": protocol, "observation": observed, "task_kwargs": options,
             "frames": trained and trained.frames,
         },
-        protocols.distinct(task, parts[0].task_kwargs),
+        protocols.distinct(task, parts[0].task_kwargs, episodes),
         tuple(drawn for part in parts for drawn in part.conditions),
     )  # fmt: skip
     if out_dir is not None:

@@ -3,20 +3,22 @@
 import dataclasses
 import itertools
 import types
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from cathsim_dmc import bounds, suite
-from cathsim_dmc.physics.randomisation import START_JITTER, Episode, Randomisation
+from cathsim_dmc.physics.randomisation import Episode, Randomisation
 from cathsim_dmc.tasks.anatomies import POOL
+from cathsim_dmc.tasks.start import START_SPACING, STARTS_ALONG_ROUTE
 
 # Strata of each quantity, and candidates for each episode to fill them from.
 _STRATA, _CANDIDATES = 10, 20
-_STRATIFIED = (
-    "friction", "stiffness", "loss", "viscosity", "roll", "delay", "start_insertion",
-)  # fmt: skip
+# What makes episodes distinct, and the step between its values.
+_STEPS = dict.fromkeys(
+    ("friction", "stiffness", "loss", "viscosity", "goal_shift", "roll"), 1e-9
+) | {"delay": 1, "start_insertion": START_SPACING}
 
 
 class Protocol(NamedTuple):
@@ -31,6 +33,12 @@ class Protocol(NamedTuple):
     episodes: int
     task_kwargs: Mapping[str, Any] = types.MappingProxyType({})
     devices: tuple[str, ...] = ()
+
+    def beside(self, options: Mapping[str, Any], given: Mapping[str, Any]) -> dict:
+        """Options but those of the protocol; ValueError if one of these is given."""
+        for name in self.task_kwargs.keys() & given:
+            raise ValueError(f"{name}: the protocol has its own; leave {name} out")
+        return {k: v for k, v in options.items() if k not in self.task_kwargs}
 
 
 VARIED_RANGES = Randomisation(
@@ -65,19 +73,6 @@ class Part(NamedTuple):
 def get(name: str) -> Protocol:
     """The protocol of a name; ValueError lists those that there are."""
     return PROTOCOLS[bounds.choice("protocol", name, PROTOCOLS)]
-
-
-def beside(
-    protocol: str, options: Mapping[str, Any], given: Collection[str]
-) -> dict[str, Any]:
-    """Options of a task less those that a protocol sets; ValueError if one is given."""
-    own = get(protocol).task_kwargs
-    for name in own.keys() & {*given}:
-        raise ValueError(
-            f"{name} is given, and the protocol {protocol!r} has its own: leave {name} "
-            "out, or play the protocol 'published'"
-        )
-    return {name: value for name, value in options.items() if name not in own}
 
 
 def parts(
@@ -157,7 +152,7 @@ def stratified(
         if short.get(arch):
             left[arch][candidate] = _bins(ranges, episode)
             short[arch] -= 1
-    filled, chosen = np.zeros((len(_STRATIFIED), _STRATA), dtype=int), []
+    filled, chosen = np.zeros((len(_STEPS), _STRATA), dtype=int), []
     for arch in wanted:
         crowd = {
             candidate: (filled[range(len(bins)), bins] ** 2).sum()
@@ -172,7 +167,7 @@ def stratified(
 def _bins(ranges: Randomisation, episode: Episode) -> np.ndarray:
     """Which tenths of their ranges the draws lie in."""
     shares = []
-    for name in _STRATIFIED:
+    for name in _STEPS:
         chosen = getattr(ranges, name)
         if isinstance(chosen, Sequence) and chosen[1] > chosen[0]:
             drawn = getattr(episode, name.removeprefix("start_"))
@@ -180,15 +175,20 @@ def _bins(ranges: Randomisation, episode: Episode) -> np.ndarray:
     return np.minimum((np.array(shares) * _STRATA).astype(int), _STRATA - 1)
 
 
-def distinct(task: str, task_kwargs: Mapping[str, Any]) -> bool:
-    """Whether episodes differ by more than the published jitter of the start.
+def distinct(task: str, task_kwargs: Mapping[str, Any], episodes: int) -> bool:
+    """Whether so many episodes can all differ by more than the jitter of the start.
 
-    Tasks outside the suite are taken to.
+    Noise and the C-arm do not count. Tasks outside the suite are taken to.
     """
     definition = suite.TASKS.get(task)
     if definition is None:
         return True
     ranges = Randomisation.make(task_kwargs.get("randomisation", False))
-    wide = dataclasses.replace(ranges, start_radius=START_JITTER) != Randomisation()
-    along = task_kwargs.get("start_along_route") is not None
-    return wide or along or definition.random_arch or ranges.start_radius > 2e-3
+    values = task_kwargs.get("pool", POOL) if definition.random_arch else 1
+    for name, step in _STEPS.items():
+        if (chosen := getattr(ranges, name)) is not None:
+            low, high = chosen if isinstance(chosen, Sequence) else (0.0, 1.0)
+            values *= 1 + (high - low) // step
+    if along := task_kwargs.get("start_along_route"):
+        values *= STARTS_ALONG_ROUTE if along[1] > along[0] else 1
+    return values >= max(episodes, 2) or (not along and ranges.start_radius > 2e-3)

@@ -51,7 +51,7 @@ _CAPTION = (
     "contacts stays at or below a limit in every physics step."
 )
 _NEARLY_ONE = (
-    " Success without interval: the episodes differ only by 1 mm of the start; "
+    " Success without interval: episodes differ only by 1 mm of the start, or recur; "
     "`--protocol varied` plays distinct conditions."
 )
 
@@ -90,7 +90,7 @@ def evaluate(
     player = agents.load_policy(policy, seed)
     task, task_kwargs = task_and_options(player, task, options.given)
     bounds.choice("task", task, suite.SUITE)
-    task_kwargs = protocols.beside(protocol, task_kwargs, options.given)
+    task_kwargs = protocols.get(protocol).beside(task_kwargs, options.given)
     contacts = evaluation.ContactLog()
 
     def play(who: Any, out_dir: Path | None = None) -> EvaluationResult:

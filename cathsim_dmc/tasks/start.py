@@ -17,7 +17,7 @@ from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.scene import Scene
 
 _SETTLING_TIME = 2.0  # s, after which the device rests
-_STARTS_ALONG_ROUTE = 16
+STARTS_ALONG_ROUTE = 16
 # How much deeper a displacement may put the links behind the head into the wall, m.
 _PRESSED = 2e-4
 # MuJoCo starts anew where a state is no number, and only these tell.
@@ -27,7 +27,7 @@ _DIVERGED = [
     int(mujoco.mjtWarning.mjWARN_BADQACC),
 ]
 _LARGEST_START = 0.5  # share of the way to the goal
-_START_SPACING = 5e-3  # m, between the postures that a start farther in chooses from
+START_SPACING = 5e-3  # m, between the postures that a start farther in chooses from
 # Displacements that are tried where the whole one presses on the wall.
 _SMALLER = tuple(sign * 0.5**half for half in range(1, 6) for sign in (1.0, -1.0))
 # By how much the axis of a settled device may stand out of the lumen, m: the pieces of
@@ -70,7 +70,7 @@ class StartPosture:
         self._ahead: list[_Posture] = []
         if (along_route := config.start_along_route) is not None:
             low, high = (share * way for share in along_route)
-            advances = np.linspace(low, high, _STARTS_ALONG_ROUTE)
+            advances = np.linspace(low, high, STARTS_ALONG_ROUTE)
             self._ahead = _settled(settle, advances)
             if not self._ahead:
                 raise ValueError(
@@ -82,7 +82,7 @@ class StartPosture:
         self._scale = 1.0
         if farthest := config.randomisation.farthest_insertion:
             reach = min(farthest, _LARGEST_START * way)
-            count = math.ceil(reach / _START_SPACING)
+            count = math.ceil(reach / START_SPACING)
             self._starts += _settled(settle, np.linspace(reach / count, reach, count))
             self._scale = reach / farthest
 
