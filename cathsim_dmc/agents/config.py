@@ -117,9 +117,9 @@ class TrainingConfig:
         observation: Name or names of the task's observations, such as "internal",
             "image", "sequential" or "tracking".
         task_kwargs: Further options of the task; must be JSON-able.
-        training_reward: Weights of the reward terms to learn from, such as
-            {"path": -1, "success": 10}, or path -1 success 10 on the command line;
-            None takes the task's. Evaluation and recordings always take the task's.
+        training_reward: Weights of the reward terms to learn from: path -1 success 10
+            on the command line (no JSON), {"path": -1, "success": 10} in Python; None
+            takes the task's. Evaluation and recordings always take the task's.
         training_max_steps: Largest number of control steps of an episode of the
             training, at whose end the value is carried on; None takes the task's.
             Evaluation and recordings always take the task's.
@@ -150,7 +150,7 @@ class TrainingConfig:
         initial_policy: Directory of the run or checkpoint, or "pretrained:NAME", whose
             policy the networks start from, with its observation statistics; None
             starts afresh.
-        initial_std: Deviation before the tanh that every action of such a policy
+        initial_std: Deviation before the tanh that every action of an initial_policy
             starts with; None keeps the policy's own.
         checkpoint_frames: Number of frames between two checkpoints.
         checkpoint_seconds: Longest time between two checkpoints in seconds of wall
@@ -170,10 +170,11 @@ class TrainingConfig:
     # Settings by the name of a preset; what a preset leaves out has its default.
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"published": {}}
     # What may differ between a run and its continuation: nothing that learning
-    # depends on, apart from how long it lasts.
+    # depends on, apart from how long it lasts and where its dataset is.
     resumable: ClassVar[frozenset[str]] = frozenset(
         {"total_frames", "checkpoint_frames", "checkpoint_seconds", "keep_checkpoints"}
         | {"metrics_frames", "num_threads", "torch_threads", "torch_device"}
+        | {"demonstrations"}
     )
 
     task: str = "type1_bca"

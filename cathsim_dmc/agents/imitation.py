@@ -107,10 +107,7 @@ class BCConfig(TrainingConfig):
     """
 
     algorithm: ClassVar[str] = "bc"
-    # The dataset of a run may be moved.
-    resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable - {
-        "total_frames"
-    } | {"demonstrations"}
+    resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable - {"total_frames"}
 
     demonstrations: str | None = None
     gradient_steps: int = positive(10_000)

@@ -59,9 +59,6 @@ class SACConfig(ActorCriticConfig):
 
     algorithm: ClassVar[str] = "sac"
     state_dependent_std: ClassVar[bool] = True
-    resumable: ClassVar[frozenset[str]] = ActorCriticConfig.resumable | {
-        "demonstrations"
-    }
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
         "demo": {"num_envs": 32, "updates_per_frame": 0.25},

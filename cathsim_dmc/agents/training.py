@@ -32,7 +32,12 @@ from cathsim_dmc.agents.learner import Learner, make_collector
 from cathsim_dmc.agents.learners import LEARNERS
 from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
-from cathsim_dmc.agents.training_log import TrainingLog, crossed
+from cathsim_dmc.agents.training_log import (
+    METRICS_FILE,
+    TrainingLog,
+    crossed,
+    read_metrics,
+)
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.tasks import observations
 
@@ -153,7 +158,11 @@ def _only_process(run: Path) -> Iterator[None]:
 
 def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | None:
     """Check the directory against the request; return where to continue from."""
-    existing = checkpoints_in(run)
+    existing, alone = checkpoints_in(run), config.initial_policy is None
+    if config.initial_std is not None and alone and not existing:
+        raise ConfigError("initial_std is of use with initial_policy alone: add it")
+    if (run / METRICS_FILE).exists():
+        read_metrics(run / METRICS_FILE)  # before any work
     if existing and not resume:
         raise ConfigError(
             f"{run} already holds a run: resume it, or choose another directory."
@@ -170,7 +179,7 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
         raise ConfigError(
             f"{run} cannot be resumed with other settings ({_differing(changed)}). "
             "Resume with the run's own, or start a new run in another directory. These "
-            f"may change: {sorted(config.resumable)}."
+            f"may change: {sorted(config.resumable & set(vars(config)))}."
         )
     return checkpoint
 

@@ -14,12 +14,13 @@ import numpy as np
 from tqdm import tqdm
 
 from cathsim_dmc import files
-from cathsim_dmc.agents.config import TrainingConfig
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.learner import Learner
 
 # Seconds between two lines of progress in a log file, where no terminal redraws them.
 LINE_INTERVAL = 15.0
+METRICS_FILE = "metrics.csv"
 _LINE = "{desc}: {n_fmt}{unit} [{elapsed}, {rate_fmt}{postfix}]\n"
 # Number of finished episodes over which the running figures are taken.
 EPISODE_WINDOW = 100
@@ -65,10 +66,10 @@ class TrainingLog:
         self.window = deque(map(list, state["window"]), maxlen=EPISODE_WINDOW)
         self.row: dict[str, float | None] = {}
         self._interval = config.metrics_frames
-        self._path, self._columns = run / "metrics.csv", [*COLUMNS, *learner.metrics]
+        self._path, self._columns = run / METRICS_FILE, [*COLUMNS, *learner.metrics]
         # A killed run has rows beyond its checkpoint.
-        rows = _texts(self._path) if self._path.exists() else []
-        self._rows: list[dict] = [r for r in rows if int(r["frames"]) <= self.frames]
+        rows = read_metrics(self._path) if self._path.exists() else []
+        self._rows = [r for r in rows if (r["frames"] or 0) <= self.frames]
         self._write()
         label, total = f"{config.algorithm} {config.task}", config.total_frames
         done = {"initial": self.frames, "disable": not progress}
@@ -110,9 +111,7 @@ class TrainingLog:
                 **means,
                 **losses,
             }
-            cells = self.row.items()
-            texts = {n: f"{v:.9g}" if isinstance(v, float) else v for n, v in cells}
-            self._rows.append(texts)
+            self._rows.append(self.row)
             self._write()
         known = {name: value for name, value in means.items() if value is not None}
         self.bar.set_postfix(known, refresh=False)
@@ -125,7 +124,8 @@ class TrainingLog:
             text, self._columns, extrasaction="ignore", lineterminator="\n"
         )
         writer.writeheader()
-        writer.writerows(self._rows)
+        for cells in map(dict.items, self._rows):
+            writer.writerow({n: v if v is None else f"{v:.9g}" for n, v in cells})
         files.write_text(self._path, text.getvalue())
 
 
@@ -139,17 +139,18 @@ def progress_bar(label: str, unit: str, **options: Any) -> tqdm:
     )  # fmt: skip
 
 
-def _texts(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="") as file:
-        return [row for row in csv.DictReader(file) if None not in row.values()]
-
-
 def read_metrics(path: Path) -> list[dict[str, float | None]]:
-    """The rows of a metrics.csv; empty fields become None."""
-    return [
-        {name: float(cell) if cell else None for name, cell in row.items()}
-        for row in _texts(path)
-    ]
+    """The complete rows of a metrics.csv, None where empty; or ConfigError."""
+    text, wrong = f"{path} holds no metrics; mend or remove it", (ValueError, csv.Error)
+    with files.refused(ConfigError, text, *wrong), open(path, newline="") as file:
+        rows = csv.DictReader(file)
+        if "frames" not in (rows.fieldnames or ()):
+            raise ValueError("it has no column frames")
+        return [
+            {name: float(cell) if cell else None for name, cell in row.items()}
+            for row in rows
+            if None not in row.values() and None not in row
+        ]
 
 
 def crossed(before: int, after: int, interval: int) -> bool:

@@ -12,7 +12,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import Cannulation
 
-_OWN = " Text or JSON; by default the task's own."
+_OWN = " Text or JSON; by default, and with null, as the task or policy has it."
 _CONSTANTS = {"True": "true", "False": "false", "None": "null"}  # Python's, of JSON
 
 
