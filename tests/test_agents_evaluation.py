@@ -104,7 +104,11 @@ def test_the_varied_protocol_has_distinct_conditions():
     drawn = [one for part in parts for one in part.conditions]
     seeds = [seed for part in parts for seed in part.seeds]
     assert len(set(seeds)) == len(drawn) == 100
-    for name in ("friction", "stiffness", "loss", "viscosity", "roll", "insertion"):
+    # What an episode begins with may be less than what was drawn.
+    assert not {"insertion", "displacement"} & drawn[0].keys()
+    assert np.linalg.norm(drawn[0]["displacement_drawn"]) <= 0.01
+    names = "friction", "stiffness", "loss", "viscosity", "roll", "insertion_drawn"
+    for name in names:
         low, high = getattr(protocols.VARIED_RANGES, name, None) or (0.0, 0.06)
         values = [one[name] for one in drawn]
         counts, _ = np.histogram(values, 10, (low, high))

@@ -46,8 +46,7 @@ class EvaluationResult:
         policy: Name of the policy.
         seeds: Seed of each episode.
         episodes: Episodes in the order of their seeds.
-        settings: Protocol, observation, task_kwargs but those that the protocol sets,
-            and, for a checkpoint, its frames.
+        settings: Protocol, its further task_kwargs, observation, frames of a checkpoint.
         distinct: Whether all episodes can differ by more than the jitter of the start.
             If not, no interval over them is given.
         conditions: What was drawn for each episode; empty without randomisation.

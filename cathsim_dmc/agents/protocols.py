@@ -19,6 +19,7 @@ _STRATA, _CANDIDATES = 10, 20
 _STEPS = dict.fromkeys(
     ("friction", "stiffness", "loss", "viscosity", "goal_shift", "roll"), 1e-9
 ) | {"delay": 1, "start_insertion": START_SPACING}
+_REDUCED = "displacement", "insertion"  # what a start may have less of than drawn
 
 
 class Protocol(NamedTuple):
@@ -97,8 +98,7 @@ def parts(
     pools = [options]
     if protocol.devices and not (options.get("devices") or options.get("device")):
         pools = [{**options, "device": name} for name in protocol.devices]
-    random_arch = definition is not None and definition.random_arch
-    arches = options.get("pool", POOL) if random_arch else 1
+    arches = options.get("pool", POOL) if definition and definition.random_arch else 1
     found, played = [], 0
     for number, own in enumerate(pools[:episodes]):
         count = len(range(number, episodes, len(pools)))
@@ -119,7 +119,7 @@ def _conditions(
     arch, episode = ranges.draw_in(np.random.RandomState(seed), arches)
     where = {"arch": options.get("first", 0) + arch} if arches > 1 else {}
     values = {
-        name: value.tolist() if isinstance(value, np.ndarray) else value
+        name + "_drawn" * (name in _REDUCED): np.asarray(value).tolist()
         for name, value in dataclasses.asdict(episode).items()
         if value is not None
     }
