@@ -46,7 +46,7 @@ class EvaluationResult:
         policy: Name of the policy.
         seeds: Seed of each episode.
         episodes: Episodes in the order of their seeds.
-        settings: Protocol, its further task_kwargs, observation, frames of a checkpoint.
+        settings: Protocol, observation, further task_kwargs, frames of a checkpoint.
         distinct: Whether all episodes can differ by more than the jitter of the start.
             If not, no interval over them is given.
         conditions: What was drawn for each episode; empty without randomisation.
