@@ -162,7 +162,7 @@ def replace(group, name, value):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda g: replace(g, "actions", np.array([b"text"])), "cannot be read"),
+        (lambda g: replace(g, "actions", np.array([b"text"])), "cannot be used"),
         (lambda g: replace(g, "actions", np.zeros((3, 21))), "finite rows"),
         (lambda g: g["actions"].__setitem__((0, 0), np.nan), "finite rows"),
         (lambda g: g.__delitem__("rewards"), "rewards"),

@@ -1,7 +1,6 @@
 """Cloning, DAgger, demonstrations in SAC's replay, and runs that start from another."""
 
 import copy
-import json
 import shutil
 
 import numpy as np
@@ -26,6 +25,7 @@ from cathsim_dmc.agents.networks import NetworkShapes, network_of
 from cathsim_dmc.agents.sac import SAC
 from cathsim_dmc.agents.training import take_over
 from cathsim_dmc.agents.training_log import read_metrics
+from cathsim_dmc.recording.dataset import DatasetError
 
 SHARED = {
     "task": "simple1_bca",
@@ -92,20 +92,14 @@ def test_cloning_needs_a_dataset(tmp_path):
         train(small("bc"), tmp_path, progress=False)
 
 
-def test_a_run_is_resumed_after_its_dataset_has_moved(
-    cloned, dataset, tmp_path, cathsim
-):
+def test_a_run_is_resumed_after_its_dataset_has_moved(cloned, dataset, tmp_path):
     run = shutil.copytree(cloned, tmp_path / "run")
-    config = json.loads((run / "config.json").read_text())
-    moved = shutil.move(shutil.copytree(dataset, tmp_path / "a"), tmp_path / "b")
-    lost = {**config, "demonstrations": str(tmp_path / "a")}
-    (run / "config.json").write_text(json.dumps(lost))
-    again = ["train", "--out", run, "--resume", "--quiet"]
-    code, _, err = cathsim(*again)
-    assert code == 2 and "no dataset in" in err and "--demonstrations" in err
-    assert cathsim(*again, "--demonstrations", moved)[0] == 0
-    assert json.loads((run / "config.json").read_text())["demonstrations"] == str(moved)
-    assert "demonstrations" in make_config("sac").resumable
+    config = Checkpoint.open(run).config.replace(demonstrations="gone")
+    with pytest.raises(DatasetError, match="no dataset in gone.*--demonstrations"):
+        train(config, run, resume=True, progress=False)
+    moved = shutil.copytree(dataset, tmp_path / "moved")
+    config = config.replace(demonstrations=str(moved))
+    assert train(config, run, resume=True, progress=False).frames == 64
 
 
 def test_a_clone_that_is_continued_learns_the_same(dataset, shapes, tmp_path):
@@ -227,6 +221,17 @@ def test_a_policy_that_does_not_fit_is_refused(cloned, tmp_path):
         train(config, tmp_path, progress=False)
     with pytest.raises(ConfigError, match="initial_std is 0"):
         small("ppo", initial_std=0.0)
+    with pytest.raises(ConfigError, match="initial_std .* initial_policy alone"):
+        train(small("ppo", initial_std=0.1), tmp_path, progress=False)
+
+
+def test_demonstrations_of_another_task_are_refused(dataset, shapes, tmp_path):
+    shown = {"demonstrations": dataset, "training_reward": {"path": -1.0}}
+    BC(small("bc", **shown), shapes, tmp_path)  # which reads no reward
+    with pytest.raises(DatasetError, match="its reward is None, not .*path"):
+        SAC(small("sac", **shown), shapes, tmp_path)
+    with pytest.raises(DatasetError, match="its task is '.*_bca', not '.*_lcca'"):
+        BC(small("bc", task="simple1_lcca", **shown), shapes, tmp_path)
 
 
 def test_half_of_sacs_minibatch_is_shown(dataset, shapes, tmp_path):

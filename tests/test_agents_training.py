@@ -176,9 +176,8 @@ def test_what_a_kill_leaves_behind_does_not_count(tmp_path):
     assert saved.frames + 64 not in frames
     assert frames[-1] == goal
     assert result.metrics["replay_frames"] == min(goal, 4_096)
-    names = {path.name for path in (tmp_path / "checkpoints").iterdir()}
-    kept = {path.name for path in checkpoints_in(tmp_path)}
-    assert names - kept == {"best", ".DS_Store"}  # the user's own
+    left = set((tmp_path / "checkpoints").iterdir()) - set(checkpoints_in(tmp_path))
+    assert {path.name for path in left} == {"best", ".DS_Store"}  # the user's own
 
 
 def test_running_figures_go_on_where_a_run_is_resumed(tmp_path):

@@ -25,8 +25,6 @@ _DIRECTORY = "checkpoints"
 _DESCRIPTION = "checkpoint.json"
 _POLICY = "policy.pt"
 _LEARNING = "learning.pt"
-# Directories that a killed process leaves: half written, or half removed.
-_LEFTOVER = re.compile(r"\.\d{10,}\.[0-9a-f]{12}\.partial|\d{10,}")
 
 
 class CheckpointError(RuntimeError):
@@ -144,9 +142,9 @@ def save_checkpoint(
     """
     directory = Path(run) / _DIRECTORY
     directory.mkdir(parents=True, exist_ok=True)
-    for leftover in set(directory.iterdir()) - set(checkpoints_in(run)):
-        if _LEFTOVER.fullmatch(leftover.name) and leftover.is_dir():
-            shutil.rmtree(leftover)
+    for one in set(directory.iterdir()) - set(checkpoints_in(run)):
+        if one.is_dir() and re.fullmatch(r"\d{10,}|\.\d{10,}\..*partial", one.name):
+            shutil.rmtree(one)  # of a process that was killed
     target = directory / f"{frames:010d}"
     if target.exists():
         # No frame was added since, as when a run is interrupted right after saving.

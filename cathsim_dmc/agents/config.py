@@ -264,11 +264,9 @@ class TrainingConfig:
     def changed_for_resume(self, other: "TrainingConfig") -> dict[str, tuple]:
         """Fields (name: (here, other)) that differ and may not on resuming."""
         here, there = self.to_dict(), other.to_dict()
-        return {
-            name: (here.get(name), there.get(name))
-            for name in sorted(set(here) | set(there))
-            if name not in self.resumable and here.get(name) != there.get(name)
-        }
+        names = sorted((here.keys() | there.keys()) - self.resumable)
+        pairs = {name: (here.get(name), there.get(name)) for name in names}
+        return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -114,11 +114,6 @@ def record_demonstrations(
         description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
         f"seeds from {seed}",
     )
-    return _summary(out, buffers)
-
-
-def _summary(out: Path, buffers: list[Any]) -> Demonstrations:
-    """What a dataset has, by the buffers that were written to it."""
     means = [np.mean(buffer.infos["wall_force_sum"][1:]) for buffer in buffers]
     largest = [np.max(buffer.infos["wall_force_max"][1:]) for buffer in buffers]
     return Demonstrations(
@@ -188,13 +183,17 @@ def _buffer(seed: int, row: int, columns: Mapping[str, Any]) -> Any:
 
 
 def load_transitions(
-    path: str | Path, observation: str | Sequence[str], shapes: NetworkShapes
+    path: str | Path,
+    observation: str | Sequence[str],
+    shapes: NetworkShapes,
+    **options: Any,
 ) -> TensorDictBase:
     """Transitions of a dataset's successful episodes, as a collector gives them.
 
     Args:
         observation: Name or names of the observations that the networks read; the
             dataset may hold others beside them.
+        **options: As for `read_episodes`.
 
     Returns:
         A TensorDict (n,) on the CPU with VECTOR and/or PIXELS, "action",
@@ -207,7 +206,7 @@ def load_transitions(
         ModuleNotFoundError: h5py is not installed.
     """
     names = observations.resolve(observation)
-    episodes = [_tensors(path, e, names) for e in read_episodes(path)]
+    episodes = [_tensors(path, e, names) for e in read_episodes(path, **options)]
     succeeded = [one for one in episodes if one is not None]
     if not succeeded:
         raise DatasetError(f"none of the {len(episodes)} episodes in {path} succeeds")

@@ -134,7 +134,7 @@ class BC(CloningLearner):
                 "`cathsim demos` writes one."
             )
         self.states = load_transitions(
-            config.demonstrations, config.observation, shapes
+            config.demonstrations, config.observation, shapes, task=config.task
         ).exclude("next")
         super().__init__(config, shapes, directory)
         self.observe(self.states)

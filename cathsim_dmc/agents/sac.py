@@ -125,9 +125,9 @@ class SAC(Learner):
         self.replay = ReplayMemory(directory / "replay", self.replay_keys, *limits)
         self.demonstrations: TensorDictBase | None = None
         if config.demonstrations is not None:
-            shown = load_transitions(
-                config.demonstrations, config.collected_observation, shapes
-            )
+            names, options = config.collected_observation, config.training_kwargs
+            alike = {"task": config.task, "reward": options.get("reward")}
+            shown = load_transitions(config.demonstrations, names, shapes, **alike)
             self.demonstrations = shown.select(*self.replay_keys)
             self.observe(shown)
         self.owed_steps = 0.0

@@ -32,12 +32,7 @@ from cathsim_dmc.agents.learner import Learner, make_collector
 from cathsim_dmc.agents.learners import LEARNERS
 from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
-from cathsim_dmc.agents.training_log import (
-    METRICS_FILE,
-    TrainingLog,
-    crossed,
-    read_metrics,
-)
+from cathsim_dmc.agents.training_log import TrainingLog, crossed, read_metrics
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.tasks import observations
 
@@ -161,8 +156,7 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
     existing, alone = checkpoints_in(run), config.initial_policy is None
     if config.initial_std is not None and alone and not existing:
         raise ConfigError("initial_std is of use with initial_policy alone: add it")
-    if (run / METRICS_FILE).exists():
-        read_metrics(run / METRICS_FILE)  # before any work
+    read_metrics(run / "metrics.csv")  # or an error before any work
     if existing and not resume:
         raise ConfigError(
             f"{run} already holds a run: resume it, or choose another directory."

@@ -20,7 +20,6 @@ from cathsim_dmc.agents.learner import Learner
 
 # Seconds between two lines of progress in a log file, where no terminal redraws them.
 LINE_INTERVAL = 15.0
-METRICS_FILE = "metrics.csv"
 _LINE = "{desc}: {n_fmt}{unit} [{elapsed}, {rate_fmt}{postfix}]\n"
 # Number of finished episodes over which the running figures are taken.
 EPISODE_WINDOW = 100
@@ -66,9 +65,9 @@ class TrainingLog:
         self.window = deque(map(list, state["window"]), maxlen=EPISODE_WINDOW)
         self.row: dict[str, float | None] = {}
         self._interval = config.metrics_frames
-        self._path, self._columns = run / METRICS_FILE, [*COLUMNS, *learner.metrics]
+        self._path, self._columns = run / "metrics.csv", [*COLUMNS, *learner.metrics]
         # A killed run has rows beyond its checkpoint.
-        rows = read_metrics(self._path) if self._path.exists() else []
+        rows = read_metrics(self._path)
         self._rows = [r for r in rows if (r["frames"] or 0) <= self.frames]
         self._write()
         label, total = f"{config.algorithm} {config.task}", config.total_frames
@@ -140,7 +139,9 @@ def progress_bar(label: str, unit: str, **options: Any) -> tqdm:
 
 
 def read_metrics(path: Path) -> list[dict[str, float | None]]:
-    """The complete rows of a metrics.csv, None where empty; or ConfigError."""
+    """The complete rows of a metrics.csv if there is one; or ConfigError."""
+    if not path.exists():
+        return []
     text, wrong = f"{path} holds no metrics; mend or remove it", (ValueError, csv.Error)
     with files.refused(ConfigError, text, *wrong), open(path, newline="") as file:
         rows = csv.DictReader(file)

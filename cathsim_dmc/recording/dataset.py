@@ -70,14 +70,11 @@ def write(
 def _check_space(path: Path, buffers: Sequence[Any]) -> None:
     """Raises OSError unless the disk, or a quota, holds the arrays of episodes."""
     # Where HDF5 meets a full disk, it ends the process with a segmentation fault.
-    size = 2**20
-    for one in buffers:
-        arrays = *one.observations.values(), *one.infos.values(), one.actions
-        size += 2**18 + sum(array.nbytes for array in arrays) * 5 // 4  # with chunks
-    noise = os.urandom(2**20)  # which no file system compresses
     with open(path, "wb") as file:
-        for _ in range(size >> 20):
-            file.write(noise)
+        for one in buffers:
+            arrays = *one.observations.values(), *one.infos.values(), one.actions
+            size = 2**19 + sum(array.nbytes for array in arrays) * 5 // 4  # with chunks
+            file.write(os.urandom(size))  # which no file system compresses
     path.unlink()
 
 
@@ -85,14 +82,15 @@ class DatasetError(ValueError):
     """A dataset is missing, damaged or of another kind."""
 
 
-def read_episodes(path: str | os.PathLike[str]) -> Iterator[Any]:
+def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]:
     """Episodes of a dataset, one after the other, as `minari.EpisodeData`.
 
     Args:
         path: Directory of the dataset, or the directory `data` in it.
+        **options: Task and options that it must have been recorded with.
 
     Raises:
-        DatasetError: there is none, or it is damaged.
+        DatasetError: there is none, or it is damaged, or recorded with other options.
         ModuleNotFoundError: minari is not installed.
     """
     import minari
@@ -100,14 +98,18 @@ def read_episodes(path: str | os.PathLike[str]) -> Iterator[Any]:
     data = next(Path(path).glob("data"), Path(path)) / "metadata.json"
     if not data.is_file():
         raise DatasetError(
-            f"no dataset in {path}: give a directory that `cathsim demos` has written; "
-            "a run that is resumed takes a new one too (--demonstrations)"
+            f"no dataset in {path}: give one of `cathsim demos`, also to a run that is "
+            "resumed (--demonstrations)"
         )
     try:
         # Without its spaces Minari would make the environment that the file names.
         named = json.loads(data.read_text())
         if not {"observation_space", "action_space"} <= set(named):
             raise ValueError("metadata.json lacks the spaces")
+        own = json.loads(named.get("env_spec") or "{}").get("kwargs", {})
+        for name, value in options.items():
+            if own and own.get(name) != value:
+                raise ValueError(f"its {name} is {own.get(name)!r}, not {value!r}")
         for number, episode in enumerate(minari.MinariDataset(data.parent)):
             _check_episode(episode, number)
             yield episode
@@ -115,7 +117,7 @@ def read_episodes(path: str | os.PathLike[str]) -> Iterator[Any]:
     except (AssertionError, AttributeError, LookupError, OSError, RuntimeError,
             TypeError, ValueError) as error:  # fmt: skip
         line = " ".join(str(error).split()) or type(error).__name__
-        raise DatasetError(f"{data.parent} cannot be read: {line}") from error
+        raise DatasetError(f"{data.parent} cannot be used: {line}") from error
 
 
 def _check_episode(episode: Any, number: int) -> None:
