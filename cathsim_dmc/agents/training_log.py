@@ -97,8 +97,7 @@ class TrainingLog:
         before, self.frames = self.frames, self.frames + frames
         self.episodes += len(finished)
         for episode in finished:
-            values = _VALUES(episode)
-            self.window.append([v if v is None else float(v) for v in values])
+            self.window.append([v if v is None else float(v) for v in _VALUES(episode)])
         means = {**_episode_means(self.window), "step_reward": step_reward}
         if last or crossed(before, self.frames, self._interval):
             new, seconds = self.frames - self._before["frames"], self.seconds

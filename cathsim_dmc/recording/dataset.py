@@ -73,7 +73,7 @@ def _check_space(path: Path, buffers: Sequence[Any]) -> None:
     with open(path, "wb") as file:
         for one in buffers:
             arrays = *one.observations.values(), *one.infos.values(), one.actions
-            size = 2**19 + sum(array.nbytes for array in arrays) * 5 // 4  # with chunks
+            size = 2**18 + sum(array.nbytes for array in arrays) * 5 // 4  # with chunks
             file.write(os.urandom(size))  # which no file system compresses
     path.unlink()
 
