@@ -59,13 +59,20 @@ def learning_curves(by_task, looks, path):
                 )
         axes.set_title(task, fontsize=10)
         axes.set_ylim(-3, 103)
-        axes.set_xlim(left=0)
+        axes.set_xscale("log")
+        axes.set_xticks([1e4, 2e4, 5e4, 1e5, 2e5, 5e5])
+        axes.minorticks_off()
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_xlabel("frames")
         axes.set_ylabel("success in training episodes, %")
         axes.grid(alpha=0.3)
-        if axes.lines:
-            axes.legend(fontsize=7, loc="best", framealpha=0.7)
+    named = {
+        label: line
+        for axes in figure.axes
+        for line, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    lines, labels = named.values(), named.keys()
+    figure.legend(lines, labels, fontsize=8, loc="outside lower center", ncols=3)
     return _save(figure, path)
 
 
