@@ -148,8 +148,10 @@ def draw_anatomy(axes: Any, anatomy: Anatomy, view: str = "front") -> None:
 
 
 def _upright(anatomy: Anatomy) -> bool:
-    bend = bend_of(anatomy.tree) if anatomy.scan else None
-    return anatomy.scan is None or (bend is not None and bend.upright)
+    if anatomy.scan is None:
+        return True
+    bend = bend_of(anatomy.tree)
+    return bend is not None and bend.upright
 
 
 def _prepare(
