@@ -46,7 +46,7 @@ class Cell:
     """Episodes that are counted together."""
 
     part: str
-    labels: dict[str, str]
+    labels: dict[str, str | None]
     task: str
     options: dict
     episodes: int
@@ -76,13 +76,14 @@ def variants(episodes=4):
 
 
 def anatomies(names, episodes=20):
-    """Phantoms and imported anatomies, each branch from each access."""
+    """Each branch of phantoms, from each access, and of imported anatomies."""
     for name in names:
         goals = load_anatomy(name).goals
         for goal in (goal for goal in GOALS if goal in goals):
-            for access in ACCESSES:
+            for access in ACCESSES if name in PHANTOMS else (None,):
                 where = {"anatomy": name, "goal": goal, "access": access}
-                yield Cell("anatomies", where, "navigate", where, episodes)
+                options = {key: value for key, value in where.items() if value}
+                yield Cell("anatomies", where, "navigate", options, episodes)
 
 
 def changes(episodes=20):

@@ -41,7 +41,7 @@ class TaskDefinition:
         description: one line.
         anatomy: anatomy or its name; None where the user chooses.
         goal: name of a goal; None where the user chooses.
-        access: where the device enters, see `anatomy.phantoms.load`.
+        access: where the device enters a phantom or arch, see `load_anatomy`.
         objective: function of an anatomy, a goal and keyword options, which become
             options of the task. An option `farthest_shift` receives the largest shift
             of the goal by randomisation, m.
@@ -54,7 +54,7 @@ class TaskDefinition:
     description: str
     anatomy: str | Anatomy | None
     goal: str | None
-    access: str = "ascending"
+    access: str | None = None
     objective: Callable[..., Objective] = Cannulation.to
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     random_arch: bool = False
@@ -137,7 +137,7 @@ def make_task(
     access = own.pop("access", definition.access)
     if definition.random_arch:
         bounds.choice("goal", goal, ("any", *BRANCHES))
-        anatomies = load_arches(access=access, **own)
+        anatomies = load_arches(**({} if access is None else {"access": access}), **own)
         named = [
             goal_of(anatomy, goal, number)
             for number, anatomy in enumerate(anatomies, own.get("first", 0))

@@ -226,6 +226,15 @@ def test_curves_that_start_12_mm_from_an_end_start_there(arch_scan, tmp_path):
 
 
 @pytest.mark.slow
+def test_branches_keep_their_names_when_the_descending_aorta_is_cut(arch_scan):
+    """Nearer to the heart, across the gap, than to the end that is dropped."""
+    cut = import_scan(arch_scan[0], inlet=(35.0, 0.0, 100.0))
+    assert {"bca", "rcca", "rsa", "lcca", "lsa"} <= set(cut.tree.vessels)
+    assert abs(cut.inlet.position[2] - 100e-3) < 3e-3
+    assert failed(cut) == {}
+
+
+@pytest.mark.slow
 def test_an_inlet_at_a_bulge_is_not_its_end(tmp_path):
     """A sinus beside the aorta: the lumen is cut there, across the aorta."""
     tree = arch_tree()

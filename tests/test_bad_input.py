@@ -49,7 +49,7 @@ TASK = {
 # Whether these name anything is known where the scene is built.
 CONFIG = TASK.keys() - {"observation", "device", "devices", "goal_radius", "reward"}
 CONFIG -= {"random"}
-NAVIGATE = {"anatomy": word(), "goal": word(), "access": word()}
+NAVIGATE = {"anatomy": word(), "goal": word(), "access": word(optional=True)}
 ARCHES = {"arches": word(), "pool": whole(1, 1000), "first": whole(0, 10_000)}
 FLUOROSCOPY = {
     "view": word().filter(lambda value: value != (1, 2))

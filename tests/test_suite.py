@@ -225,6 +225,12 @@ def test_wrong_options_are_refused_before_an_anatomy_is_made(monkeypatch, option
             suite.make_task(task, **options)
 
 
+def test_only_a_phantom_has_an_access():
+    own = suite.load_anatomy("simple1")
+    with pytest.raises(ValueError, match="access 'descending' is given, but only"):
+        suite.make_task("navigate", anatomy=own, access="descending")
+
+
 def test_environment_kwargs_reach_composer():
     environment = suite.load(
         "cathsim", "simple1_bca", environment_kwargs={"time_limit": 0.1}

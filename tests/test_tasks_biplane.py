@@ -52,6 +52,13 @@ def test_one_plane_is_not_enough():
         suite.load("cathsim", TASK, {"observation": "biplane"}).reset()
 
 
+@pytest.mark.parametrize(("height", "unseen"), [(0.2, "inlet"), (-0.1, "goal 'lcca'")])
+def test_planes_that_miss_inlet_or_goal_are_refused(height, unseen):
+    options = {"view": (60, 0), "biplane": (-30, 0), "centre": (0, 0, height)}
+    with pytest.raises(ValueError, match=f"needs the {unseen} at .* in both planes"):
+        suite.load("cathsim", TASK, {"observation": "biplane", "fluoroscopy": options})
+
+
 def test_a_frame_is_carried_without_turning_about_the_line():
     angle = np.linspace(2.0, 0.0, 200)
     line = np.stack([np.sin(angle), 0 * angle, 1 - np.cos(angle)], axis=1)

@@ -139,6 +139,12 @@ class CArm:
         inner[:2, 2] = 0.5 * (columns - 1), 0.5 * (rows - 1)
         return inner @ np.column_stack([self.axes, -self.axes @ self.source])
 
+    def shows(self, points: ArrayLike) -> np.ndarray:
+        """Whether points (..., 3), m, lie within the image, (...) bool."""
+        pixels, _ = self.project(points)
+        last = np.subtract(self.resolution[::-1], 1)
+        return np.all((pixels >= 0.0) & (pixels <= last), axis=-1)
+
     def project(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Pixel coordinates of world points.
 

@@ -1,8 +1,8 @@
 """Options of the fluoroscopy that a task shows, in a form that JSON can hold."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -40,7 +40,8 @@ class FluoroscopyOptions:
         biplane: the same for a second C-arm, or None for a single plane.
         size: pixels along a side of the image, or (rows, columns).
         magnification: electronic zoom.
-        centre: isocentre (3,), world frame, m; None for the middle of the lumen.
+        centre: isocentre (3,), world frame, m; None for the middle of the lumen, or, of
+            a scan so large that this misses inlet or goal, for the middle of these.
         contrast: iodine in the lumen, kg/m³ (mg/ml); True for the usual concentration,
             False for none.
         noise: whether quanta are counted. The noise comes from the environment's
@@ -121,6 +122,19 @@ class FluoroscopyOptions:
             arm = CArm(*angles, resolution=self.resolution, **fields)
             arms.append(arm.centred_on(points) if self.centre is None else arm)
         return tuple(arms)
+
+    def aimed(self, points: np.ndarray, places: np.ndarray) -> Self:
+        """With a centre amid places (n, 3) if that amid points (m, 3), m, misses some.
+
+        A given centre stays, and none is given where neither shows all places.
+        """
+
+        def shown(amid: np.ndarray) -> bool:
+            return all(arm.shows(places).all() for arm in self.carms(amid))
+
+        if self.centre is not None or shown(points) or not shown(places):
+            return self
+        return replace(self, centre=self.carms(places)[0].isocentre)
 
 
 def _angles(name: str, view: View) -> tuple[float, float]:

@@ -11,24 +11,32 @@ BRANCHES = ("bca", "rcca", "lcca", "lsa", "rsa")
 POOL = 16  # arches that an episode draws from, unless one says otherwise
 
 
-def load_anatomy(anatomy: str | Path | Anatomy, access: str = "ascending") -> Anatomy:
+def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> Anatomy:
     """Returns an anatomy: itself, a phantom by name, or one saved in a directory.
 
     Args:
-        access: Where the device enters a phantom, "ascending" or "descending"; an
-            anatomy or a directory has its own inlet.
+        access: Where the device enters a phantom, "ascending" (also with None) or
+            "descending"; an anatomy or a directory has its own inlet.
 
     Raises:
-        ValueError: if there is none; lists the names.
+        ValueError: if there is none, or an access is given that it has not.
     """
-    if isinstance(anatomy, Anatomy):
-        return anatomy
-    if not isinstance(anatomy, str | Path):
+    if not isinstance(anatomy, str | Path | Anatomy):
         bounds.refuse("anatomy", anatomy, "an Anatomy, a name or a directory")
     from cathsim_dmc.anatomy import phantoms  # late: what builds them is slow to import
 
-    if str(anatomy) in phantoms.PHANTOMS:
-        return phantoms.load(str(anatomy), access=access)
+    if not isinstance(anatomy, Anatomy) and str(anatomy) in phantoms.PHANTOMS:
+        return phantoms.load(
+            str(anatomy), **({} if access is None else {"access": access})
+        )
+    if access is not None:
+        raise ValueError(
+            f"access {access!r} is given, but only a phantom "
+            f"({', '.join(phantoms.PHANTOMS)}) has several; leave it out, or import "
+            "the scan with another inlet (--inlet)"
+        )
+    if isinstance(anatomy, Anatomy):
+        return anatomy
     if not Path(anatomy).is_dir():
         raise ValueError(
             f"no anatomy at {str(anatomy)!r}; give a directory written by `cathsim "

@@ -32,11 +32,13 @@ class ImageSensors:
             options = case.angiograph.options
             self.planes = [case.angiograph.planes()] * num_simulations
             self._noise = options.noise
-            if observations.needs(names, BIPLANE) and options.planes < 2:
-                raise ValueError(
-                    "the observation 'biplane' needs two planes: give fluoroscopy a "
-                    "biplane, such as {'view': [60, 0], 'biplane': [-30, 0]}"
-                )
+            if observations.needs(names, BIPLANE):
+                if options.planes < 2:
+                    raise ValueError(
+                        "the observation 'biplane' needs two planes: give fluoroscopy "
+                        "a biplane, such as {'view': [60, 0], 'biplane': [-30, 0]}"
+                    )
+                _check_in_view(case)
         self.images: dict[str, np.ndarray] = {}
 
     def capture(
@@ -99,3 +101,24 @@ class ImageSensors:
 
     def _wants(self, *names: str) -> bool:
         return any(name in self._names for name in names)
+
+
+def _check_in_view(case: Case) -> None:
+    """Refuse planes that do not show where the device enters, or the goal."""
+    scene, planes = case.scene, case.angiograph.planes()
+    for what, place in {
+        "inlet": scene.anatomy.inlet.position,
+        f"goal {scene.goal.name!r}": scene.goal.position,
+    }.items():
+        if not all(plane.carm.shows(place) for plane in planes):
+            at, centre = (
+                f"({', '.join(f'{1e3 * x:.0f}' for x in point)}) mm"
+                for point in (place, planes[0].carm.isocentre)
+            )
+            raise ValueError(
+                f"the observation 'biplane' needs the {what} at {at} in both planes, "
+                f"which turn about {centre} and do not show it: give fluoroscopy a "
+                "centre between inlet and goal, less magnification or a larger "
+                "detector_size, or import the scan with an inlet nearer to the goal "
+                "(--inlet)"
+            )

@@ -1,5 +1,6 @@
 """Navigation of a catheter through an anatomy, as a composer task."""
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Iterable, Mapping
@@ -76,7 +77,12 @@ class Navigation(composer.Task):
         self.name = name or type(self).__name__
         self._scene = scene
         self._objective = objective
-        self.config = config = config or NavigationConfig()
+        config = config or NavigationConfig()
+        if others is None and (scan := scene.anatomy.scan) is not None:
+            places = np.array([scene.anatomy.inlet.position, scene.goal.position])
+            aimed = config.fluoroscopy.aimed(scan.vertices, places)
+            config = dataclasses.replace(config, fluoroscopy=aimed)
+        self.config = config
         self._random_state = bounds.random_state("random", random)
         if config.randomisation.goal_shift and not isinstance(objective, Shiftable):
             raise ValueError(

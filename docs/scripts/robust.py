@@ -126,7 +126,7 @@ def weakest(rows):
                 f"{one['success']} of {one['episodes']}" if one else "–"
                 for one in (row, beside)
             ]
-            place = cell[0], cell[1].upper(), cell[2]
+            place = cell[0], cell[1].upper(), cell[2] or "inlet"
             lines.append(f"| `{policy}` | {' | '.join((*place, *counts))} |")
     return lines if len(lines) > 2 else ["None."]
 

@@ -96,13 +96,17 @@ class Arch:
                 return planned._replace(far=far.position)
         return planned
 
-    def named(self, curves: Sequence[np.ndarray]) -> Naming:
-        """Names of the curves (m_i, 3) m from where the device enters."""
-        start = curves[0][0]
-        gaps = [np.linalg.norm(start - end.position) for end in self.ends]
+    def named(self, curves: Sequence[np.ndarray], root: np.ndarray | None) -> Naming:
+        """Names of curves (m_i, 3) m that leave a root, which leads to (3,) m.
+
+        A root that leads to no end of the aorta is seen towards the farther end.
+        """
+        start, ends = curves[0][0], [end.position for end in self.ends]
+        gaps = [np.linalg.norm(end - start) for end in ends]
+        if root is not None and min(np.linalg.norm(ends - root, axis=1)) < 1e-6:
+            gaps = -np.linalg.norm(ends - root, axis=1)
         toward = bool(gaps[1] >= gaps[0])
-        far = self.ends[toward].position
-        bend, width, found = _branches(self.ways, start, far, curves)
+        bend, width, found = _branches(self.ways, start, ends[toward], curves)
         if not found:
             return Naming([f"branch_{k + 1}" for k in range(len(curves))])
         if self.heart < SURE:

@@ -197,7 +197,10 @@ def _computed(ways, ends, entry, places, changes, note):
             f"({DEVICE_RADIUS * 2e3:.2f} mm) in for 15 mm, so there is no goal; its "
             f"ends are {listed(ends)}."
         )
-    names, notes, right = arch.named(found) if arch else Naming(neutral_names(found))
+    if arch is None:
+        names, notes, right = Naming(neutral_names(found))
+    else:
+        names, notes, right = arch.named(found, entry.far)
     note(*notes)
     computed, names = names, renamed(names, changes)
     curves = dict(zip(names, found, strict=True))
