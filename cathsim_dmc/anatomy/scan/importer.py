@@ -177,10 +177,7 @@ def _computed(ways, ends, entry, places, changes, note):
     seen, end = Arch.of(ways, ends, places.get("heart")), ""
     arch = None if isinstance(seen, str) else seen
     if arch is None:
-        note(
-            "no aortic arch recognised, so branches get no anatomical names, and "
-            f"whether the scan is mirrored was not checked: {seen}"
-        )
+        note(f"no aortic arch recognised, so branches get no anatomical names: {seen}")
         end = ", the widest end, which may be that at the heart"
     else:
         if arch.entry.position is arch.ends[1].position:
