@@ -6,6 +6,7 @@
 The two sides of a ratio take turns, so that a machine whose speed drifts bends neither.
 """
 
+import argparse
 import contextlib
 import statistics
 import subprocess
@@ -395,6 +396,10 @@ def peak_memory() -> float:
 
 
 if __name__ == "__main__":
-    measure = speed if "--short" in sys.argv[1:] else everything
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--short", action="store_true", help="factors, overhead alone")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    options = parser.parse_args()
+    measure = speed if options.short else everything
     report = measure(lambda text: print(text, file=sys.stderr, flush=True))
-    sys.exit(show(report, "--json" in sys.argv[1:]))
+    sys.exit(show(report, options.json))

@@ -227,7 +227,15 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
     Args:
         task: Task that no other environment owns.
         **environment_kwargs: Arguments of `composer.Environment`.
+
+    Raises:
+        ValueError: if another environment owns the task, or it has no such argument.
     """
+    if hasattr(task, "rollout"):
+        raise ValueError(f"{task!r} has an environment already; make another task")
+    known = [*inspect.signature(composer.Environment).parameters][1:]
+    known.remove("random_state")  # the task's
+    bounds.mapping("environment_kwargs", environment_kwargs, known)
     settings = {
         "strip_singleton_obs_buffer_dim": True,
         "recompile_mjcf_every_episode": False,

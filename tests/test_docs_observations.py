@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import OBSERVATIONS
+from conftest import OBSERVATIONS, twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.tasks import observations
-from cathsim_dmc.tasks.observation_kind import Sizes
+from cathsim_dmc.tasks.observation_kind import Entry, Sizes
 
 SCRIPT = Path(__file__).parents[1] / "docs" / "scripts" / "observations.py"
 
@@ -44,6 +44,27 @@ def test_the_table_names_what_the_functions_return(environment, monkeypatch):
         returned = observations.OBSERVATIONS[name].observe(frame)
         listed = observations.entry_specs([name], Sizes())
         assert list(returned) == list(listed)
+
+
+def test_an_own_row_returns_what_it_declares(environment):
+    table, entry = observations.OBSERVATIONS, Entry("own", 2, "m", "two numbers")
+    for given in ({"own": np.zeros((1, 3))}, {}):
+
+        def own(frame, given=given):
+            return given
+
+        table.row(entry)(own)
+        try:
+            task = twin(environment.task, observation="own")
+            with pytest.raises(ValueError, match=r"'own' .* declares \(2,\)"):
+                suite.environment(task).reset()
+        finally:
+            del table["own"]
+    with pytest.raises(ValueError, match="entries goal_position of observation 'own'"):
+        table.row(Entry("goal_position", 2, "m", "another"))(own)
+    own.__name__ = "goal"
+    with pytest.raises(ValueError, match="the name of observation 'goal'"):
+        table.row(entry)(own)
 
 
 def test_the_page_is_what_the_specs_say(script):

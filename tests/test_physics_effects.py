@@ -141,5 +141,9 @@ def test_what_stood_in_mujoco_before_is_still_called(kind):
 def test_what_is_no_effect_is_refused(windy):
     with pytest.raises(ValueError, match=r"effects.*physics\.effects\.Effect"):
         suite.make_task("simple1_bca", effects=[3])
+    idle = SideWind(WIND)
+    idle.num_parameters = lambda chain: 0
+    with pytest.raises(ValueError, match="SideWind has forces.*would not be called"):
+        suite.load("cathsim", "simple1_bca", {"effects": [idle]})
     with pytest.raises(ValueError, match="build it with the same configuration"):
         suite.environment(twin(windy("simple1_bca"), effects=()))

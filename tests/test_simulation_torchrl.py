@@ -51,6 +51,12 @@ def test_seed_of_dm_control_env_is_that_of_the_suite():
     expected.close()
 
 
+@pytest.mark.parametrize("option", ["observation", "random"])
+def test_what_is_an_argument_is_no_option(option):
+    with pytest.raises(ValueError, match=f"without {option}, for which there is"):
+        BatchedEnv("simple1_bca", 2, task_kwargs={option: 3})
+
+
 def test_batched_env(batched):
     check_env_specs(batched)
     assert batched.batch_size == (ENVS,)

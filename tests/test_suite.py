@@ -15,6 +15,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.physics import forces
+from cathsim_dmc.simulation.batch import BatchSimulation
 
 # The goal does not move within an anatomy, unless it is randomised.
 CONSTANT = {"tracking_goal", "tracking_goal_pixels", "goal_position"}
@@ -229,6 +230,27 @@ def test_only_a_phantom_has_an_access():
     own = suite.load_anatomy("simple1")
     with pytest.raises(ValueError, match="access 'descending' is given, but only"):
         suite.make_task("navigate", anatomy=own, access="descending")
+
+
+def test_a_task_has_one_environment_with_known_settings(shared_environment):
+    task = shared_environment("type1_lcca").task
+    with pytest.raises(ValueError, match="has an environment already"):
+        suite.environment(task)
+    with pytest.raises(ValueError, match="environment_kwargs.*time_limit"):
+        suite.environment(twin(task), flat_observation=True)
+    with pytest.raises(ValueError, match="lead is 0.2, which only coaxial devices"):
+        suite.make_task("type1_lcca", lead=0.2)
+    with pytest.raises(ValueError, match="task is 'type1_bca'"):
+        BatchSimulation("type1_bca", 2)
+
+
+def test_a_step_keeps_the_axis_of_the_buffer(shared_environment):
+    task = shared_environment("type1_lcca").task
+    environment = suite.environment(twin(task), strip_singleton_obs_buffer_dim=False)
+    spec = environment.observation_spec()
+    for timestep in (environment.reset(), environment.step(np.zeros(21))):
+        for name, value in timestep.observation.items():
+            assert value.shape == spec[name].shape
 
 
 def test_environment_kwargs_reach_composer():

@@ -1,6 +1,7 @@
 """Domain randomisation: what is drawn, and what it does to the model."""
 
 import types
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc import suite
+from cathsim_dmc.entities.devices import get
 from cathsim_dmc.physics.randomisation import (
     DEFAULT_RANGES,
     ActionDelay,
@@ -103,6 +105,21 @@ def test_a_composer_variation_is_a_range_too():
 def test_impossible_ranges_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         Randomisation.make(options)
+
+
+def test_a_single_device_has_its_own_coating_and_absorption():
+    device = replace(get("wire_035_glide"), attenuation=500.0)
+    options = {"device": device, "friction": 0.06, "random": 0}
+    for drawn, coulomb in ((False, 0.02), ({"friction": (0.3, 0.3)}, 0.1)):
+        options |= {"randomisation": drawn, "observation": "image"}
+        env = suite.load("cathsim", "simple1_bca", options)
+        env.reset()
+        at = elements(env)
+        friction = env.physics.model.ptr.geom_friction
+        for places in (at["device"], at["wall"]):
+            np.testing.assert_allclose(friction[places, 0], coulomb)
+        (shadow,) = env.task.rollout.shadows
+        assert (shadow.mu, shadow.marker_length) == (500.0, device.marker_length)
 
 
 def test_the_model_takes_what_was_drawn_and_gives_it_back(make):

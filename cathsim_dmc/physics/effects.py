@@ -164,6 +164,11 @@ def bind(effects: Sequence[Effect], world: World) -> dict[int, float]:
     start = 0
     for effect in effects:
         count, mark = effect.num_parameters(world.chain), 0
+        if effect.forces is not None and not count:
+            raise ValueError(
+                f"{type(effect).__name__} has forces, but num_parameters is 0, so they "
+                "would not be called; return 1 or more"
+            )
         first = start + _HEADER if count else start
         if count and effect.forces is not None:
             from cathsim_dmc.physics import callbacks  # late, as numba takes long

@@ -235,13 +235,16 @@ class RandomisedModel(Effect):
         self._dofs = model.jnt_dofadr[self._hinges]
         self._motors = ids(model, chain.tip_motors)
         self._base = world.index.links.start
+        # In a stack, it is written for each link.
+        self._ratio = 1.0 if chain.coaxial else chain.device.friction_ratio
         self._stiffness = model.jnt_stiffness[self._hinges].copy()
 
     def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Writes what was drawn into the model of one simulation."""
         field, stiffness, loss = self.world.field, episode.stiffness, episode.loss
         if episode.friction is not None:
-            field(index, "geom_friction")[self._geoms, 0] = episode.friction
+            friction = episode.friction * self._ratio
+            field(index, "geom_friction")[self._geoms, 0] = friction
         if loss is not None or stiffness is not None:
             device, timestep = self.world.chain.device, self.world.chain.timestep
             factor = 1.0 if stiffness is None else stiffness

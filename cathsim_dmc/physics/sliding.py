@@ -38,6 +38,11 @@ _PRESLIDING = 40e-6
 # axial force of a stiff wire in a tight bend changes by 0.8 N/mm at most.
 _GIVE = 1e-3
 
+# What a shadow takes of a device, beside its points.
+_X_RAYS = operator.attrgetter(
+    "outer_radius", "attenuation", "marker_attenuation", "marker_length"
+)
+
 
 class SingleDevice(Effect):
     """One device, whose own motors move it.
@@ -55,7 +60,7 @@ class SingleDevice(Effect):
 
     def __init__(self, chain: Chain):
         """Takes the entity of the device."""
-        self._radius = chain.device.outer_radius
+        self._device = chain.device
         self._behind = BEHIND / float(chain.link_lengths[0])  # links
         self._shaped = bool(chain.device.tip_shape)
         if self._shaped:
@@ -112,7 +117,8 @@ class SingleDevice(Effect):
     def shadows(self, line: np.ndarray) -> list[Shadow]:
         """The devices as X-rays meet them, from the innermost outwards, on a line."""
         first = line[:, :1] + self._behind * (line[:, :1] - line[:, 1:2])
-        return [Shadow(np.concatenate([first, line], axis=1), self._radius)]
+        points = np.concatenate([first, line], axis=1)
+        return [Shadow(points, *_X_RAYS(self._device))]
 
     def read(self, readings: Readings) -> CoaxialReadings | None:
         """State of coaxial devices at some readings; None for one alone."""
@@ -298,10 +304,8 @@ class SlidingDevices(SingleDevice):
         behind = np.full((*places.shape[:2], 1), nodes[0] + BEHIND)
         places = np.concatenate([behind, places], axis=-1)
         points = sliding_loops.points(line, places, nodes)
-        x_rays = "outer_radius", "attenuation", "marker_attenuation", "marker_length"
-        of = operator.attrgetter(*x_rays)
         return [
-            Shadow(points[:, k], *of(each))
+            Shadow(points[:, k], *_X_RAYS(each))
             for k, each in enumerate(self._entity.devices)
         ]
 

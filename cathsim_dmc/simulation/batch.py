@@ -83,6 +83,8 @@ class BatchSimulation:
             "num_simulations", num_simulations, 1, bounds.MOST_SIMULATIONS
         )
         num_threads = bounds.whole("num_threads", num_threads, 0, bounds.MOST_THREADS)
+        if not isinstance(task, Navigation):
+            bounds.refuse("task", task, "a task of suite.make_task")
         _refuse_overrides(type(task))
         self.task = task
         physics = mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model)

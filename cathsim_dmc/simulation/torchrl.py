@@ -51,8 +51,10 @@ class BatchedEnv(EnvBase):
             ValueError: an option is not allowed.
         """
         options = bounds.options("task_kwargs", task_kwargs)
-        if "observation" in options:
-            bounds.refuse("task_kwargs", options, "without observation, an argument")
+        for given, argument in {"observation": "observation", "random": "seed"}.items():
+            if given in options:
+                own = f"without {given}, for which there is the argument {argument}"
+                bounds.refuse("task_kwargs", options, own)
         self.simulation = BatchSimulation(
             suite.make_task(task_name, **{**options, "observation": observation}),
             num_envs,

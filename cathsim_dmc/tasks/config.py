@@ -56,8 +56,8 @@ class NavigationConfig:
         lead: Length by which each coaxial device starts ahead of the next outer one, m.
         lumen_friction: Coulomb coefficient between coaxial devices.
         rotation: Whether the action has a rotation of the base.
-        start_along_route: Range (low, high) of the fraction of the route at which an
-            episode starts, for curricula; None starts every episode at the inlet.
+        start_along_route: Range (low, high) of the fraction of the way from the usual
+            start to the goal at which an episode starts, for curricula.
         max_steps: Number of control steps until the episode is truncated.
         friction: Coulomb coefficient between device and wall.
         shaft_link: Length of the longest link of the shaft, m.
@@ -130,6 +130,12 @@ class NavigationConfig:
 
     def _check_devices(self):
         if self.devices is None:
+            for name in ("lead", "lumen_friction"):
+                if getattr(self, name) != getattr(type(self), name):
+                    raise ValueError(
+                        f"{name} is {getattr(self, name)!r}, which only coaxial "
+                        "devices have; give devices, or leave it out"
+                    )
             return
         named = isinstance(self.devices, Sequence) and not isinstance(self.devices, str)
         if not named or not self.devices:

@@ -36,6 +36,7 @@ class Environment(composer.Environment):
         self._enabled = tuple(seen)
         self._plain = not (
             self._legacy_step
+            or not self._strip_singleton_obs_buffer_dim
             or self._raise_exception_on_physics_error
             or _overridden(self.task, "before_substep")
             or any(not isinstance(one, FrameObservable) for one in seen.values())

@@ -107,7 +107,7 @@ class Navigation(composer.Task):
         """The course of the task's episodes; see `Rollout`."""
         own = self._scene, self._objective, model, self.config
         chosen = self._cases or [cases.Case(*own)]
-        return Rollout(chosen, self.config, model, stepper)
+        return Rollout(chosen, self.config, model, stepper, self.observation_specs)
 
     @property
     def effects(self) -> list[Effect]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -144,7 +144,16 @@ class ObservationTable(dict[str, ObservationKind]):
         """Puts the decorated function into the table under its own name."""
 
         def add(function: Callable[[Frame], Observation]):
-            self[function.__name__] = ObservationKind(function, entries, **options)
+            name = function.__name__
+            there = {entry.key: entry for entry in self.entries(self)}
+            taken = [e.key for e in entries if there.get(e.key, e) != e]
+            if name in self or taken:
+                what = f"entries {', '.join(taken)}" if taken else "name"
+                raise ValueError(
+                    f"the {what} of observation {name!r} are taken by others with "
+                    "another meaning; choose another"
+                )
+            self[name] = ObservationKind(function, entries, **options)
             return function
 
         return add
@@ -190,7 +199,20 @@ class ObservationTable(dict[str, ObservationKind]):
         rows = [self[name].observe(frame) for name in names]
         return {key: value for row in rows for key, value in row.items()}
 
-    def entries(self, names: Sequence[str]) -> list[Entry]:
+    def check(
+        self, observation: Observation, wanted: Mapping[str, specs.Array]
+    ) -> None:
+        """Refuse arrays (N, ...) that are not as the specs of one simulation say."""
+        for key in sorted(observation.keys() | wanted.keys()):
+            found = observation[key].shape[1:] if key in observation else None
+            spec = wanted[key].shape if key in wanted else None
+            if found != spec:
+                raise ValueError(
+                    f"entry {key!r} of an observation has the shape {found} for one "
+                    f"simulation, and its row declares {spec}; return what it declares"
+                )
+
+    def entries(self, names: Iterable[str]) -> list[Entry]:
         """Entries of the named rows."""
         return [entry for name in names for entry in self[name].entries]
 

@@ -377,4 +377,5 @@ def devices(frame: Frame) -> Observation:
 
 
 resolve, observe, needs = OBSERVATIONS.resolve, OBSERVATIONS.observe, OBSERVATIONS.needs
+check = OBSERVATIONS.check
 entries, entry_specs = OBSERVATIONS.entries, OBSERVATIONS.entry_specs

@@ -4,9 +4,10 @@ begin → (forward pass) → start → command → (physics steps) → finish �
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import cast
 
+import dm_env.specs
 import mujoco
 import numpy as np
 from numpy.random import RandomState
@@ -65,6 +66,7 @@ class Rollout:
         config: NavigationConfig,
         model: mujoco.MjModel,
         stepper: Stepper,
+        specs: Mapping[str, dm_env.specs.Array],
     ):
         """Prepares what an episode needs; no episode has begun yet.
 
@@ -72,10 +74,11 @@ class Rollout:
             cases: Anatomies with their objectives; an episode draws one of them, if
                 there are several.
             stepper: Steps the N simulations.
+            specs: Of the entries of the observation of one simulation.
         """
         self._cases, self._config, self._stepper = tuple(cases), config, stepper
         count, scene = stepper.num_simulations, cases[0].scene
-        self._case_of = np.zeros(count, dtype=int)
+        self._case_of, self._specs = np.zeros(count, dtype=int), specs
         self._state = state = stepper.arrays
         living = config.vessel.living
         self._names = observations.resolve(
@@ -195,6 +198,9 @@ class Rollout:
 
         Returns:
             All simulations as they stand; no episode ends at its start.
+
+        Raises:
+            ValueError: if an observation is not as its row declares.
         """
         # The others have not moved: what is measured of them stays.
         self._measure(self._stepper.still(indices))
@@ -204,7 +210,9 @@ class Rollout:
             shortest[rows] = objective.path_distance(self.resting.head[rows])
         self._shortest[indices] = shortest[indices]
         self._errors = (None,) * len(self.steps)
-        return self._step(indices, begins=True)
+        step = self._step(indices, begins=True)
+        observations.check(step.observation, self._specs)
+        return step
 
     def finish(self) -> Step:
         """Measures, judges and observes after the physics steps of a control step."""

@@ -79,7 +79,10 @@ class Scene:
             length,
             config.randomisation.farthest_shift,
         )
-        catheter = _chain(chosen, place, config)
+        friction = config.friction
+        if config.devices is None:  # in a stack, it differs from link to link
+            friction *= chosen[0].friction_ratio
+        catheter = _chain(chosen, place, config, friction)
         if config.vessel.wall is not None:
             soften(catheter)
         radius = catheter.device.outer_radius
@@ -89,7 +92,7 @@ class Scene:
             goal=goal,
             placement=place,
             arena=AngiographyArena(device_density=catheter.density),
-            phantom=Phantom(anatomy, config.friction, goal_radius, drawn),
+            phantom=Phantom(anatomy, friction, goal_radius, drawn),
             catheter=catheter,
             sheath=Sheath(bore, device_radius=radius),
             robot=Robot(device_radius=radius),
@@ -151,13 +154,14 @@ def _chain(
     chosen: Sequence[devices.Device],
     place: placement.Placement,
     config: NavigationConfig,
+    friction: float,
 ) -> Chain:
     torsion = _TORSION_JOINTS if config.rotation else 0
     length, link = place.working_length, config.shaft_link
     discretisation = devices.Discretisation(length, link, torsion)
     common = {
         "stroke": place.stroke,
-        "friction": config.friction,
+        "friction": friction,
         "timestep": config.physics_timestep,
     }
     if config.devices is None:

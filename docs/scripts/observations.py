@@ -29,6 +29,8 @@ INTRODUCTION = f"""# Observations
 A name or a list of names selects the observation:
 
 ```python
+from cathsim_dmc import suite
+
 env = suite.load("cathsim", "{TASK}", task_kwargs={{
     "observation": ["image", "tracking", "force"],
     "fluoroscopy": {{"view": "LAO45", "noise": True}},
@@ -42,8 +44,9 @@ physics step.
 
 A task simulates what can leave the sheath (`working_length`, 0.14 to 0.32 m).
 Observations show a device of {COMMON_LENGTH:g} m, so their shapes depend on the device
-alone: behind the simulated links the device is straight and moves with its base, its
-hinges are 0 and nothing touches it. Of a longer device they show the distal part.
+and `shaft_link` alone: behind the simulated links the device is straight and moves with
+its base, its hinges are 0 and nothing touches it. Of a longer device they show the
+distal part.
 """
 
 COAXIAL = f"""
