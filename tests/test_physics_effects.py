@@ -145,5 +145,10 @@ def test_what_is_no_effect_is_refused(windy):
     idle.num_parameters = lambda chain: 0
     with pytest.raises(ValueError, match="SideWind has forces.*would not be called"):
         suite.load("cathsim", "simple1_bca", {"effects": [idle]})
+    silent = suite.environment(windy("simple1_bca"))
+    silent.reset()
+    silent.task.rollout._effects[-2].act = lambda action, state: None
+    with pytest.raises(ValueError, match="act of SideWind returns None"):
+        silent.step(np.zeros(21))
     with pytest.raises(ValueError, match="build it with the same configuration"):
         suite.environment(twin(windy("simple1_bca"), effects=()))

@@ -188,6 +188,11 @@ class Rollout:
         self._pose_robot()
         for effect in self._effects:
             action = effect.act(action, self.readings)
+            if action is None:
+                raise ValueError(
+                    f"act of {type(effect).__name__} returns None; return the action "
+                    "that takes effect"
+                )
         self._stepper.begin(action)
 
     def start(self, indices: np.ndarray) -> Step:
