@@ -82,6 +82,9 @@ class FluoroscopyOptions:
             bounds.vector("centre", self.centre, 3, -bounds.FAR, bounds.FAR, "m")
         # Built here, so that a wrong option is refused before any simulation.
         self.carms(np.zeros((1, 3)))
+        for name in ("view", "biplane", "size", "centre"):
+            if isinstance(given := getattr(self, name), list | np.ndarray):
+                object.__setattr__(self, name, tuple(given))  # hashable
 
     @property
     def iodine(self) -> float:

@@ -296,18 +296,26 @@ class SlidingDevices(SingleDevice):
 
     def shadows(self, line: np.ndarray) -> list[Shadow]:
         """See `SingleDevice.shadows`."""
-        nodes, gaps = self._stack.nodes, sliding_loops.gaps(self._pushed())
-        # A device has one point more than the chain: behind, its own nodes, its end.
-        beyond = (nodes < gaps[..., None]).sum(axis=-1, keepdims=True)
-        own = np.arange(len(nodes)) - np.maximum(beyond - 1, 0)
-        places = np.maximum(nodes[np.maximum(own, 0)], gaps[..., None])
-        behind = np.full((*places.shape[:2], 1), nodes[0] + BEHIND)
-        places = np.concatenate([behind, places], axis=-1)
-        points = sliding_loops.points(line, places, nodes)
+        gaps = sliding_loops.gaps(self._pushed())
+        points = device_points(line, gaps, self._stack.nodes)
         return [
             Shadow(points[:, k], *_X_RAYS(each))
             for k, each in enumerate(self._entity.devices)
         ]
+
+
+def device_points(line: np.ndarray, gaps: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Points (N, K, n, 3) of devices that end at gaps (N, K) from the end of a line, m.
+
+    Nodes (L + 1,) are the distances of the points of the line (N, L + 1, 3) from it.
+    """
+    # A device has one point more than the chain: behind, its own nodes, its end.
+    beyond = (nodes < gaps[..., None]).sum(axis=-1, keepdims=True)
+    own = np.arange(len(nodes)) - np.maximum(beyond - 1, 0)
+    places = np.maximum(nodes[np.maximum(own, 0)], gaps[..., None])
+    behind = np.full((*places.shape[:2], 1), nodes[0] + BEHIND)
+    places = np.concatenate([behind, places], axis=-1)
+    return sliding_loops.points(line, places, nodes)
 
 
 def made(entity: DeviceStack, places: tuple) -> tuple:

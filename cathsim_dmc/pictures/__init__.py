@@ -6,6 +6,7 @@ Everything here takes the environment that `cathsim_dmc.suite.load` returns.
 """
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.pictures.moment import Moment, xray
 from cathsim_dmc.pictures.readout import ForceReadout, forces
-from cathsim_dmc.pictures.recorded import record, write
+from cathsim_dmc.pictures.recorded import record, surface_of, write
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import navigation_of
 
@@ -46,17 +47,19 @@ def show(
         The figure; a notebook draws it, `.savefig(path)` writes it.
 
     Raises:
-        TypeError: it is no environment of this package.
+        TypeError: it is no environment of this package, or there is no such option.
+        ValueError: the episode was recorded in an anatomy that the environment has not.
     """
-    surface = navigation_of(env).scene.anatomy.surface
     from cathsim_dmc.pictures.figure import scene_figure
 
+    _check(options, scene_figure.__kwdefaults__ or ())
     if episode is None:
         return scene_figure(Moment.of(env), **options)
-    return scene_figure(Moment.of_episode(episode, surface, step), **options)
+    moment = Moment.of_episode(episode, surface_of(episode, env), step)
+    return scene_figure(moment, **options)
 
 
-def fluoroscopy(env: Any, seed: int = 0, **options: Any) -> np.ndarray:
+def fluoroscopy(env: Any, *, seed: int = 0, **options: Any) -> np.ndarray:
     """The X-ray image of an environment's present state.
 
     Args:
@@ -73,4 +76,10 @@ def fluoroscopy(env: Any, seed: int = 0, **options: Any) -> np.ndarray:
         ValueError: an option's value is not possible.
     """
     base: FluoroscopyOptions = navigation_of(env).config.fluoroscopy
+    _check(options, vars(base))
     return xray(Moment.of(env), dataclasses.replace(base, **options), seed)
+
+
+def _check(options: Iterable[str], known: Iterable[str]) -> None:
+    if unknown := [name for name in options if name not in known]:
+        raise TypeError(f"no option {', '.join(unknown)}; there are {', '.join(known)}")

@@ -11,7 +11,7 @@ from PIL import Image
 
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.pictures import figure as drawing
-from cathsim_dmc.pictures.moment import Moment
+from cathsim_dmc.pictures.moment import Moment, on_screen
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 
@@ -25,7 +25,7 @@ _DPI = 100
 _MARGIN = 8e-3  # around the vessel, m
 _FORCE_COLOUR = "#b3202c"
 # A film shows the noise of fluoroscopy, at a multiple of the usual dose.
-FLUOROSCOPY = dataclasses.replace(drawing.FLUOROSCOPY, noise=True, kerma=4e-7)
+_NOISE = {"noise": True, "kerma": 4e-7}
 
 
 def animate(
@@ -120,7 +120,8 @@ def _frames(
             fontsize=np.clip(width / 65, 6.5, 10), fontweight="bold", zorder=10,
         )  # fmt: skip
         beside.clear()
-        window = drawing.draw_fluoroscopy(beside, moment, FLUOROSCOPY, step, window)
+        options = on_screen(moment.x_ray.options, **_NOISE)
+        window = drawing.draw_fluoroscopy(beside, moment, options, step, window)
         beside.set_title("")
         cursor.set_xdata([time, time])
         figure.agg.draw()

@@ -17,7 +17,7 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.scan.aorta import bend_of
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.pictures.moment import Moment, fluoroscope_of, xray
+from cathsim_dmc.pictures.moment import Moment, fluoroscope_of, on_screen, xray
 from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.recording.geometry import force_colours, force_text
 from cathsim_dmc.style import COLOURS, tidy
@@ -53,8 +53,6 @@ ARROW_MM, ARROW_LEAST_MM = 22.0, 5.0
 # Below this, N, a contact is drawn as a dot without an arrow.
 ARROW_LEAST_N = 1e-4
 _PIECES = 6  # of the drawn curve in each link
-# Default X-ray image of `scene_figure`; the arch fills it.
-FLUOROSCOPY = FluoroscopyOptions(size=400, magnification=1.3)
 # Percentiles of an image that are shown as black and white.
 WINDOW = (0.02, 99.5)
 _HEIGHT_IN = 6.0
@@ -294,19 +292,21 @@ def _draw_forces(axes: Any, moment: Moment, projection: ParallelProjection) -> N
 def draw_fluoroscopy(
     axes: Any,
     moment: Moment,
-    options: FluoroscopyOptions = FLUOROSCOPY,
+    options: FluoroscopyOptions | None = None,
     seed: int = 0,
     window: Any = None,
 ) -> Any:
     """Draw the X-ray image of a moment, with the goal as a ring.
 
     Args:
+        options: Set-up of the machine; None takes the task's, zoomed in.
         window: Grey levels that are black and white; percentiles of the image if None.
 
     Returns:
         The window.
     """
-    frame, carm = xray(moment, options, seed), fluoroscope_of(moment.rest, options).carm
+    options = options or on_screen(moment.x_ray.options)
+    frame, carm = xray(moment, options, seed), fluoroscope_of(moment, options).carm
     black, white = np.percentile(frame, WINDOW) if window is None else window
     axes.imshow(frame, cmap="gray", vmin=black, vmax=white, interpolation="bilinear")
     (column, row), depth = carm.project(moment.goal)

@@ -2,17 +2,19 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
-from cathsim_dmc.recording.records import CoaxialRecord, VesselRecord
+from cathsim_dmc.recording.records import CoaxialRecord, VesselRecord, XRayRecord
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -34,6 +36,8 @@ class Moment:
         force_scale: Force of the last colour of the scale.
         path: (P, 3) where the head has been, or (0, 3).
         title: Text above the picture.
+        x_ray: How X-rays show the episode.
+        shadows: The devices as X-rays meet them.
     """
 
     surface: Any
@@ -47,6 +51,8 @@ class Moment:
     force_scale: float
     path: np.ndarray
     title: str
+    x_ray: XRayRecord
+    shadows: list[Shadow]
     outermost: np.ndarray | None = None
     ends: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
 
@@ -61,9 +67,12 @@ class Moment:
         task = navigation_of(env)
         episode = EpisodeRecorder(env, task.name).present()
         distance = 1e3 * episode.meta["distance"][-1]
+        rest, moving = task.scene.anatomy.surface, task.rollout.moving
         return dataclasses.replace(
-            cls.of_episode(episode, task.scene.anatomy.surface),
+            cls.of_episode(episode, rest),
+            surface=rest if moving is None else moving.surface(0),
             path=np.zeros((0, 3)),
+            shadows=_first(task.rollout.shadows),
             title=f"{task.name}: {distance:.0f} mm to {task.scene.goal.name}",
         )
 
@@ -88,6 +97,7 @@ class Moment:
         # Contacts of state t + 1 belong to step t.
         there = episode.contact_step == step - 1
         now, own = surface, {"radius": episode.radii}
+        x_ray = XRayRecord.of(episode)
         if (record := VesselRecord.of(episode)) is not None:
             now = record.surface(surface, episode.time[step])
             goal = record.series["goal"][step]
@@ -107,20 +117,36 @@ class Moment:
             force_scale=force_scale(np.linalg.norm(episode.contact_force, axis=-1)),
             path=episode.head[: step + 1],
             title=f"{episode.task}, {episode.time[step] - episode.time[0]:.1f} s",
+            x_ray=x_ray,
+            shadows=_first(x_ray.shadows(episode, slice(step, step + 1))),
             **own,
         )
 
 
-@functools.lru_cache(maxsize=8)  # each holds some megabytes
-def fluoroscope_of(surface: Any, options: FluoroscopyOptions) -> Any:
-    """The frontal plane of an angiography machine before a surface."""
-    return Angiograph(surface, options).planes()[0]
+def _first(shadows: Sequence[Shadow]) -> list[Shadow]:
+    """Shadows of the first of some states."""
+    return [dataclasses.replace(each, points=each.points[0]) for each in shadows]
+
+
+def on_screen(options: FluoroscopyOptions, **changes: Any) -> FluoroscopyOptions:
+    """Options of a task as a picture shows them: an arch fills it."""
+    zoom = max(options.magnification, 1.0 if options.centre else 1.3)
+    looks = {"size": 400, "noise": False, "biplane": None, "magnification": zoom}
+    return dataclasses.replace(options, **(looks | changes))
+
+
+_machine = functools.lru_cache(maxsize=8)(Angiograph)  # each holds some megabytes
+
+
+def fluoroscope_of(moment: Moment, options: FluoroscopyOptions) -> Fluoroscope:
+    """The frontal plane of the episode's machine before the vessel at rest."""
+    return _machine(moment.rest, options).planes(moment.x_ray.deviation)[0]
 
 
 def xray(moment: Moment, options: FluoroscopyOptions, seed: int = 0) -> np.ndarray:
     """The X-ray image (rows, columns) uint8 of a moment; `seed` of its noise."""
     state = np.random.RandomState(seed) if options.noise else None
-    fluoroscope = fluoroscope_of(moment.rest, options)
+    fluoroscope = fluoroscope_of(moment, options)
     if moment.surface is not moment.rest:
         fluoroscope = fluoroscope.around(moment.surface)
-    return fluoroscope.render([Shadow(moment.device, moment.radius)], state)[..., 0]
+    return fluoroscope.render(moment.shadows, state)[..., 0]

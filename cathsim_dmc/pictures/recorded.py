@@ -1,6 +1,5 @@
 """An episode of any policy, recorded in one call."""
 
-import dataclasses
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -8,20 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import policies
+from cathsim_dmc import bounds, policies
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging.angiograph import Angiograph
-from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.pictures.moment import on_screen
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
-from cathsim_dmc.recording.records import MESH_EVERY, VesselRecord
+from cathsim_dmc.recording.records import MESH_EVERY, VesselRecord, XRayRecord
 
 # A name of `policies.POLICIES`, a policy, or a function from the observation (a
 # dictionary of arrays) to the action (A,).
 AnyPolicy = str | policies.Policy | Callable[[Any], np.ndarray]
 FORMATS = (".rrd", ".npz", ".gif", ".webp")
-# X-ray images of a recording: pixels along a side, and how far the view is zoomed in.
-_FILM_SIZE, _FILM_MAGNIFICATION = 512, 1.3
+_FILM_SIZE = 512  # pixels along a side of the X-ray images of a recording
 
 
 def record(
@@ -80,13 +79,15 @@ def as_function(
     policy: AnyPolicy, env: Any, seed: int | None = None
 ) -> Callable[[Any], np.ndarray]:
     """A policy as a function of the timestep; ValueError or TypeError for others."""
-    if isinstance(policy, str):
+    named = isinstance(policy, str)
+    if named and policy in policies.POLICIES:
         policy = policies.make_policy(policy, seed or 0)
     if isinstance(policy, policies.Policy):
         return policies.in_environment(policy, env)
     if not callable(policy):
-        raise TypeError(
-            f"the policy is {policy!r}; give one of {', '.join(policies.POLICIES)}, a "
+        raise (ValueError if named else TypeError)(
+            f"the policy is {policy!r}; give one of {', '.join(policies.POLICIES)}, "
+            "what cathsim_dmc.agents.load_policy returns for a trained one, another "
             "cathsim_dmc.policies.Policy, or a function from the observation to the "
             "action"
         )
@@ -102,27 +103,43 @@ def write(
         env: The environment, for the anatomy and the shapes of the robot.
         path: File to write, see `record`.
         fluoroscopy: Whether a Rerun file has X-ray images.
+
+    Raises:
+        ValueError: it was recorded in an anatomy that the environment has not.
     """
     target = _checked(path)
-    surface = navigation_of(env).scene.anatomy.surface
     if target.suffix == ".npz":
         return episode.save(target)
+    surface = surface_of(episode, env)
     if target.suffix == ".rrd":
         from cathsim_dmc.recording.rerun_log import write_rrd
         from cathsim_dmc.recording.rerun_scene import body_geoms
 
-        own, film = env.task.config.fluoroscopy, None
+        film = None
         if fluoroscopy:
             # The task's own view and a second plane, in the size of a screen.
-            view = {"size": _FILM_SIZE, "noise": False}
-            view["magnification"] = max(own.magnification, _FILM_MAGNIFICATION)
-            view["biplane"] = own.biplane or "LATERAL"
-            film = xray_film(episode, surface, dataclasses.replace(own, **view))
+            own = XRayRecord.of(episode).options
+            view = {"size": _FILM_SIZE, "biplane": own.biplane or "LATERAL"}
+            film = xray_film(episode, surface, on_screen(own, **view))
         geoms = body_geoms(env.physics)
         return write_rrd(episode, surface, target, robot_geoms=geoms, fluoroscopy=film)
     from cathsim_dmc.pictures.animation import animate
 
     return animate(episode, surface, target)
+
+
+def surface_of(episode: Episode, env: Any) -> Surface:
+    """The lumen in which an episode was recorded, of an anatomy of the environment."""
+    task, name = navigation_of(env), episode.meta.get("anatomy")
+    for anatomy in (task.scene.anatomy, *task.anatomies):
+        if name in (anatomy.name, None):
+            return anatomy.surface
+    names = bounds.shown([anatomy.name for anatomy in task.anatomies])
+    raise ValueError(
+        f"the episode of {episode.task!r} was recorded in the anatomy {name!r}, and "
+        f"the environment has {names}; load the task with that anatomy, random arches "
+        "with the same arches, pool and first"
+    )
 
 
 def xray_film(
@@ -139,16 +156,16 @@ def xray_film(
         moves is drawn anew in every fourth state.
     """
     record, states, films = VesselRecord.of(episode), episode.steps + 1, []
+    x_ray = XRayRecord.of(episode)
     moved = None if record is None or record.motion is None else record
     span = MESH_EVERY if moved else states
-    for plane in Angiograph(surface, options).planes():
+    for plane in Angiograph(surface, options).planes(x_ray.deviation):
         film = np.empty((states, *plane.carm.resolution, 1), np.uint8)
         for first in range(0, states, span):
-            line = episode.catheter[first : first + span]
-            radius = np.broadcast_to(episode.radii, (len(line), len(episode.radii)))
+            rows = slice(first, first + span)
             if moved:
                 plane = plane.around(moved.surface(surface, episode.time[first]))
-            film[first : first + span] = plane.render([Shadow(line, radius)])
+            film[rows] = plane.render(x_ray.shadows(episode, rows))
         darkest, brightest = int(film.min()), int(film.max())
         levels = 255 * (np.arange(256.0) - darkest) / max(brightest - darkest, 1)
         films.append(np.clip(levels, 0, 255).round().astype(np.uint8)[film])

@@ -28,7 +28,7 @@ def make_policy(name: str, seed: int = 0) -> Policy:
     Raises:
         ValueError: there is none of that name; lists those that exist.
     """
-    return POLICIES[bounds.choice("policy", name, POLICIES)](seed)
+    return POLICIES[bounds.choice("policy", name, POLICIES)](bounds.seed("seed", seed))
 
 
 __all__ = ["POLICIES", "Policy", "Teacher", "View", "in_environment", "make_policy"]

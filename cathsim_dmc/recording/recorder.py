@@ -14,7 +14,12 @@ from dm_control.rl import control
 
 from cathsim_dmc import __version__, bounds
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.records import DEVICE_SERIES, device_meta, vessel_state
+from cathsim_dmc.recording.records import (
+    DEVICE_SERIES,
+    device_meta,
+    vessel_state,
+    x_ray_meta,
+)
 from cathsim_dmc.simulation.episodes import play_alone
 
 Policy = Callable[[Any], np.ndarray]
@@ -88,7 +93,7 @@ class EpisodeRecorder:
         if max_steps is not None:
             bounds.whole("max_steps", max_steps, 1)
         if seed is not None:
-            self._env.random_state.seed(seed)
+            self._env.random_state.seed(bounds.seed("seed", seed))
         choose = functools.partial(self._action, policy)
         turns = play_alone(self._env, choose)
         next(turns)
@@ -138,6 +143,7 @@ class EpisodeRecorder:
             "body_pos": np.array(data.xpos),
             "body_quat": np.array(data.xquat),
             "base_insertion": float(task.readings.insertion),
+            "distance": task.info()["distance"],
             **({"vessel": vessel} if vessel else {}),
         }
 
@@ -168,7 +174,6 @@ class EpisodeRecorder:
     def _meta(self, rows: _Rows, end: dict[str, Any]) -> dict[str, Any]:
         model, task = self._env.physics.model, self._task
         termination = end["termination"] or "truncated"
-        goal = task.objective.goal.reshape(3)
         peaks = ("wall_force_peak_sum", "wall_force_peak_max")
         meta = {
             "success": termination == "success",
@@ -191,8 +196,11 @@ class EpisodeRecorder:
                 for name, values in rows.items()
                 if name.startswith(_TERM)
             },
-            "goal_position": goal.tolist(),
+            "goal_position": task.objective.goal.reshape(3).tolist(),
             "goal_radius": float(task.objective.goal_radius),
+            "distance": rows["distance"],
+            "anatomy": task.scene.anatomy.name,
+            "x_ray": x_ray_meta(task),
         }
         if task.devices is not None:
             series = {name: np.array(rows[name]) for name in DEVICE_SERIES}
@@ -203,7 +211,4 @@ class EpisodeRecorder:
                 **{name: [state[name] for state in states] for name in states[0]},
                 **(moving.record() if moving else {"lattice": [], "parameters": []}),
             }
-            goal = np.array(meta["vessel"]["goal"])
-        head = np.array(rows["catheter"])[:, -1]
-        meta["distance"] = np.linalg.norm(head - goal, axis=-1).tolist()
         return meta

@@ -1,12 +1,17 @@
-"""What `meta` of a recorded episode tells of coaxial devices and of a living vessel."""
+"""What `meta` of an episode tells of coaxial devices, living vessels and X-rays."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.motion import Motion
 from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.imaging.angiograph import Deviation
+from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.physics.sliding import device_points
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import along
 
@@ -112,4 +117,43 @@ def vessel_state(task: Any) -> dict[str, Any]:
         **{name: float(value[0]) for name, value in vessel.info().items()},
         "blood_velocity": vessel.blood_velocity[0].tolist(),
         "goal": task.rollout.goal.reshape(3).tolist(),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class XRayRecord:
+    """How X-rays show an episode."""
+
+    options: FluoroscopyOptions  # of the task
+    deviation: Deviation  # of the machine in this episode
+    devices: list[dict[str, Any]] | None  # fields of `Shadow`; None if not kept
+
+    @classmethod
+    def of(cls, episode: Episode) -> "XRayRecord":
+        """Reads it from an episode; the usual options where it is not kept."""
+        kept = episode.meta.get("x_ray", {"options": {}, "deviation": {}})
+        options = FluoroscopyOptions(**kept["options"])
+        return cls(options, Deviation(**kept["deviation"]), kept.get("devices"))
+
+    def shadows(self, episode: Episode, states: slice) -> list[Shadow]:
+        """The devices in some states (T,), from the innermost outwards."""
+        line = np.array(episode.catheter[states])
+        if self.devices is None:
+            radii = np.broadcast_to(episode.radii, (len(line), len(episode.radii)))
+            return [Shadow(line, radii)]
+        coaxial, gaps = CoaxialRecord.of(episode), np.zeros((len(line), 1))
+        if coaxial is not None:
+            gaps = coaxial.gaps[states]
+        nodes = arc_lengths(line[0, ::-1])[::-1].copy()
+        points = device_points(line, gaps, nodes)
+        return [Shadow(points[:, k], **each) for k, each in enumerate(self.devices)]
+
+
+def x_ray_meta(task: Any) -> dict[str, Any]:
+    """What ``meta['x_ray']`` holds, see `XRayRecord`."""
+    shadows = [vars(shadow).items() for shadow in task.rollout.shadows]
+    return {
+        "options": asdict(task.config.fluoroscopy),
+        "deviation": asdict(task.rollout.deviations[0]),
+        "devices": [{k: v for k, v in one if k != "points"} for one in shadows],
     }

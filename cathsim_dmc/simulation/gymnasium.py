@@ -9,7 +9,6 @@ from dm_env import specs
 from gymnasium.envs.registration import EnvSpec
 
 from cathsim_dmc import bounds, suite
-from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
@@ -84,7 +83,6 @@ class CathSimEnv(gymnasium.Env):
         entries = self.environment.task.observation_specs
         self.observation_space = space_of(entries, self._dtype)
         self.action_space = space(self.environment.action_spec(), self._dtype)
-        self._machines: dict[Surface, angiograph.Angiograph] = {}
         self._ended: bool | None = None  # before the first episode
         self._closed = False
 
@@ -120,12 +118,9 @@ class CathSimEnv(gymnasium.Env):
             return None
         if self._ended is None:
             raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")
-        task = self.environment.task
-        surface, rollout = task.scene.anatomy.surface, task.rollout
-        if surface not in self._machines:
-            machine = angiograph.Angiograph(surface, task.config.fluoroscopy)
-            self._machines[surface] = machine
-        planes = rollout.around(self._machines[surface].planes())
+        rollout = self.environment.task.rollout
+        machine = rollout.case().angiograph
+        planes = rollout.around(machine.planes(rollout.deviations[0]))
         image = angiograph.images([planes], rollout.shadows)[0]
         row = np.concatenate(list(np.moveaxis(image, -1, 0)), axis=1)
         return np.repeat(row[..., None], 3, axis=-1)

@@ -12,6 +12,7 @@ import numpy as np
 from dm_control import composer
 
 from cathsim_dmc import bounds
+from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.readings import CoaxialReadings, part
@@ -255,6 +256,11 @@ class Navigation(composer.Task):
         simulation: see `Rollout.case`. This is the first one then.
         """
         return self.rollout.case().scene if self._compiled else self._scene
+
+    @property
+    def anatomies(self) -> list[Anatomy]:
+        """Anatomies that an episode draws from."""
+        return [case.scene.anatomy for case in self._cases] or [self._scene.anatomy]
 
     @property
     def num_anatomies(self) -> int:

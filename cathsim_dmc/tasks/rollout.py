@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import RandomState
 
 from cathsim_dmc.imaging import endoluminal
-from cathsim_dmc.imaging.angiograph import Planes
+from cathsim_dmc.imaging.angiograph import Deviation, Planes
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.physics import effects, forces
 from cathsim_dmc.physics import vessel as vessels
@@ -51,6 +51,7 @@ class Rollout:
             simulations of each.
         resting_goal: (N, 3) m, goals where they are in the vessel at rest.
         steps: Control steps (N,) since each episode began.
+        deviations: Of the angiography machine of each episode from the options.
         moving: What moves the vessels; None where they rest.
         readings: State of the devices after the last step or reset.
         resting: The same, with places where they are in the vessel at rest: judged
@@ -106,6 +107,7 @@ class Rollout:
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
         self._goal_shift = np.zeros(count)
+        self.deviations = [Deviation()] * count
         self.steps = np.zeros(count, dtype=int)
         self._action = np.zeros((count, len(scene.catheter.action_names)))
         self._previous_action = self._action
@@ -167,6 +169,7 @@ class Rollout:
         self._state.userdata[index, list(self._labels)] = list(self._labels.values())
         for effect in self._effects:
             effect.restart(index, episode, random_state)
+        self.deviations[index] = episode.deviation
         if self._sensors.planes:
             self._sensors.planes[index] = case.angiograph.planes(episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
