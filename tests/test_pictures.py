@@ -10,8 +10,9 @@ from recording_samples import make_tube, same
 import cathsim_dmc
 from cathsim_dmc import suite
 from cathsim_dmc.pictures.animation import animate
-from cathsim_dmc.pictures.figure import scene_figure
-from cathsim_dmc.pictures.moment import Moment
+from cathsim_dmc.pictures.figure import Picture, draw_fluoroscopy, scene_figure
+from cathsim_dmc.pictures.moment import Moment, on_screen, xray
+from cathsim_dmc.pictures.recorded import write, xray_film
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_colours, force_scale, force_text
@@ -56,8 +57,48 @@ def test_the_fluoroscopy_of_a_state_shows_where_the_head_is(pushed):
     )[0]
     column, row = arm.project(env.task.readings.head)[0].round().astype(int)
     assert image[row, column] < image.max() - 20
-    with pytest.raises(TypeError, match="kontrast"):
-        cathsim_dmc.fluoroscopy(env, kontrast=1)
+
+
+@pytest.mark.parametrize(
+    ("task", "options"),
+    [
+        (TASK, {"randomisation": {"view": [4, 5], "gain": [0.85, 0.9]}}),
+        ("simple1_lcca_pair", {}),
+        (TASK, {"vessel": "living"}),
+    ],
+)
+def test_x_ray_pictures_show_what_the_task_observes(task, options):
+    options |= {"fluoroscopy": {"view": [30, 10], "size": 64}, "observation": "image"}
+    env = suite.load("cathsim", task, {"random": 0, **options})
+    forward = np.eye(env.action_spec().shape[0])[-2 if task.endswith("pair") else -1]
+    episode = cathsim_dmc.record(env, lambda _: forward, seed=3, max_steps=8)
+    image = env.task.observation["image"][0, ..., 0]
+    np.testing.assert_array_equal(cathsim_dmc.fluoroscopy(env), image)
+    surface, own = env.task.scene.anatomy.surface, env.task.config.fluoroscopy
+    moment = Moment.of_episode(episode, surface)
+    assert np.abs(xray(moment, own).astype(int) - image).max() <= 1
+    film = xray_film(episode, surface, own)[-1]  # in the contrast of a screen
+    assert np.corrcoef(film.ravel(), image.ravel())[0, 1] > 0.9999
+    axes, turned = Picture().add_subplot(), moment.x_ray.deviation
+    draw_fluoroscopy(axes, moment)
+    angles = turned.primary, turned.secondary
+    (arm,) = on_screen(own).carms(surface.vertices, angles)
+    ring = axes.patches[0].center
+    np.testing.assert_allclose(ring, arm.project(moment.goal)[0])
+
+
+def test_an_episode_is_drawn_in_its_own_anatomy(pushed, tmp_path):
+    env, episode = pushed
+    other = dataclasses.replace(episode, meta=episode.meta | {"anatomy": "type2"})
+    for draw in (
+        lambda: cathsim_dmc.show(env, other),
+        lambda: write(other, env, tmp_path / "other.gif"),
+    ):
+        with pytest.raises(ValueError, match="'type2'.*'simple1'.*load the task"):
+            draw()
+    kept = {k: v for k, v in episode.meta.items() if k not in ("anatomy", "x_ray")}
+    old = dataclasses.replace(episode, meta=kept)
+    assert cathsim_dmc.show(env, old, views=())
 
 
 @pytest.mark.slow
@@ -156,6 +197,16 @@ def test_the_frames_of_a_film_differ_where_the_device_moves(pushed, tmp_path):
     [
         (lambda env: cathsim_dmc.record(env, "expret"), ValueError, "expert"),
         (lambda env: cathsim_dmc.record(env, 3), TypeError, "function"),
+        (
+            lambda env: cathsim_dmc.record(env, "pretrained:a"),
+            ValueError,
+            "load_policy",
+        ),
+        (lambda env: cathsim_dmc.record(env, "push", seed=-1), ValueError, "from 0 to"),
+        (lambda env: cathsim_dmc.record(env, str, seed=1.5), ValueError, "an integer"),
+        (lambda env: cathsim_dmc.fluoroscopy(env, "LAO45"), TypeError, "positional"),
+        (lambda env: cathsim_dmc.fluoroscopy(env, vieww=1), TypeError, "vieww.*view"),
+        (lambda env: cathsim_dmc.show(env, foo=1), TypeError, "foo.*views"),
         (lambda env: cathsim_dmc.record(env, "push", "e.avi"), ValueError, "rrd, .npz"),
         (lambda env: cathsim_dmc.record(env, "push", "no/e.gif"), OSError, "no folder"),
         (lambda env: cathsim_dmc.show(env, views=("top",)), ValueError, "front"),

@@ -90,6 +90,14 @@ def _everywhere(objective):
     return dataclasses.replace(objective, branch=wide, ostium=-1.0)
 
 
+def test_render_shows_the_image_of_the_episodes_machine():
+    drawn = {"view": [4, 5], "gain": [0.85, 0.9]}
+    options = {"observation": "image", "randomisation": drawn}
+    env = gymnasium.make(TASK, render_mode="rgb_array", **options)
+    image = env.reset(seed=3)[0]["image"]
+    np.testing.assert_array_equal(env.render(), np.repeat(image, 3, axis=-1))
+
+
 @pytest.mark.slow
 def test_render_shows_the_device_as_it_goes():
     env = gymnasium.make(TASK, render_mode="rgb_array", fluoroscopy={"size": 96})
@@ -101,10 +109,9 @@ def test_render_shows_the_device_as_it_goes():
     for _ in range(15):
         env.step(push)
     darker = (first.astype(int) - env.render())[..., 0]
-    unwrapped = env.unwrapped
-    (machine,) = unwrapped._machines.values()
-    carm = machine.planes()[0].carm
-    (column, row), _ = carm.project(unwrapped.environment.task.readings.head)
+    task = env.unwrapped.environment.task
+    carm = task.rollout.case().angiograph.planes()[0].carm
+    (column, row), _ = carm.project(task.readings.head)
     # The tip has come here: the picture is darker, and nowhere far from the device.
     top, left = round(row) - 1, round(column) - 1
     near = darker[top : top + 3, left : left + 3]

@@ -8,6 +8,7 @@ from test_parity import PICTURES, SIMULATIONS, Pair, actions
 from cathsim_dmc import policies, suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.physics.readings import part
+from cathsim_dmc.pictures.recorded import record, surface_of
 from cathsim_dmc.policies.pursuit import Plan
 from cathsim_dmc.tasks import cases, placement
 from cathsim_dmc.tasks.physics_errors import ESCAPE_INTERVAL
@@ -150,6 +151,16 @@ def test_one_seed_gives_the_same_bits_and_another_seed_another_arch(
         assert runs.setdefault(seed, run) == run
     assert len(set(runs.values())) == 5
     assert drawn == set(names())
+
+
+def test_an_episode_is_drawn_in_the_arch_it_was_recorded_in(environment):
+    episodes, arches = [], []
+    while len(set(arches)) < 2:
+        episodes.append(record(environment, "push", seed=len(arches), max_steps=2))
+        arches.append(environment.task.scene.anatomy.name)
+    for episode, name in zip(episodes, arches, strict=True):
+        (arch,) = (one for one in environment.task.anatomies if one.name == name)
+        assert surface_of(episode, environment) is arch.surface
 
 
 def test_models_of_a_pool_take_few_megabytes(plain_pair, record_property):

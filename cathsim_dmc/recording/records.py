@@ -126,24 +126,23 @@ class XRayRecord:
 
     options: FluoroscopyOptions  # of the task
     deviation: Deviation  # of the machine in this episode
-    devices: list[dict[str, Any]] | None  # fields of `Shadow`; None if not kept
+    devices: list[dict[str, Any]]  # fields of `Shadow` of each, innermost first
 
     @classmethod
     def of(cls, episode: Episode) -> "XRayRecord":
-        """Reads it from an episode; the usual options where it is not kept."""
-        kept = episode.meta.get("x_ray", {"options": {}, "deviation": {}})
-        options = FluoroscopyOptions(**kept["options"])
-        return cls(options, Deviation(**kept["deviation"]), kept.get("devices"))
+        """Reads it from an episode; what is not kept is as usual."""
+        kept, coaxial = episode.meta.get("x_ray", {}), CoaxialRecord.of(episode)
+        radii = episode.radii[:1] if coaxial is None else coaxial.radii
+        return cls(
+            FluoroscopyOptions(**kept.get("options", {})),
+            Deviation(**kept.get("deviation", {})),
+            kept.get("devices", [{"radius": radius} for radius in radii.tolist()]),
+        )
 
     def shadows(self, episode: Episode, states: slice) -> list[Shadow]:
         """The devices in some states (T,), from the innermost outwards."""
-        line = np.array(episode.catheter[states])
-        if self.devices is None:
-            radii = np.broadcast_to(episode.radii, (len(line), len(episode.radii)))
-            return [Shadow(line, radii)]
-        coaxial, gaps = CoaxialRecord.of(episode), np.zeros((len(line), 1))
-        if coaxial is not None:
-            gaps = coaxial.gaps[states]
+        line, coaxial = np.array(episode.catheter[states]), CoaxialRecord.of(episode)
+        gaps = np.zeros((len(line), 1)) if coaxial is None else coaxial.gaps[states]
         nodes = arc_lengths(line[0, ::-1])[::-1].copy()
         points = device_points(line, gaps, nodes)
         return [Shadow(points[:, k], **each) for k, each in enumerate(self.devices)]
