@@ -58,24 +58,33 @@ class _Compiled:
         functools.update_wrapper(self, function)
         self._function, self._cache = function, cache
 
-    @functools.cached_property
-    def _compiled(self) -> Any:
+    def _made(self, **options: Any) -> Any:
         import numba
 
         keep_together()
-        # Nothing calls them from C, which would take a tenth more time to compile.
-        options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+        # Wrappers that nothing calls would take a fifth more time to compile.
+        options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+        return numba.njit(self._function, **options)
+
+    @functools.cached_property
+    def _compiled(self) -> Any:
+        """What Python calls."""
         try:
-            return numba.njit(self._function, cache=self._cache, **options)
+            return self._made(cache=self._cache)
         except RuntimeError:  # neither this folder nor the user's can be written to
-            return numba.njit(self._function, **options)
+            return self._made()
+
+    @functools.cached_property
+    def _inner(self) -> Any:
+        """What compiled code calls, which is kept with the caller."""
+        return self._made(no_cpython_wrapper=True)
 
     def __call__(self, *arguments: Any) -> Any:
         return self._compiled(*arguments)
 
     @property
     def _numba_type_(self) -> Any:
-        return self._compiled._numba_type_  # noqa: SLF001
+        return self._inner._numba_type_  # noqa: SLF001
 
     @property
     def cache_path(self) -> str | None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import math
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -21,14 +22,16 @@ import mujoco
 import numpy as np
 from llvmlite import ir
 from numba import cfunc
-from numba.core import cgutils, types
+from numba.core import types
 from numba.extending import intrinsic, overload, register_jitable
-from numba.np.numpy_support import carray
+from numba.np.arrayobj import populate_array
+from numba.np.numpy_support import from_dtype
 
 from cathsim_dmc.compiled import keep_together
 
 # Compiled code calls what this decorates without its first argument.
 _intrinsic: Any = intrinsic
+_typed: Any = intrinsic(prefer_literal=True)
 
 COUNT = 1 << 40  # more than any array has; nothing checks it
 # Types of values that are neither pointers nor structs; the others are enumerations.
@@ -134,29 +137,54 @@ def field(struct: str, name: str) -> tuple[int, Any, Any]:
     return place, kind, known
 
 
+def _load(builder, place, kind):
+    """What is at an address."""
+    return builder.load(builder.inttoptr(place, kind.as_pointer()))
+
+
+def _array_at(context, builder, kind, place, shape):
+    """An array of a type and shape at an address; it owns nothing."""
+    data = builder.inttoptr(place, context.get_data_type(kind.dtype).as_pointer())
+    size = context.get_abi_sizeof(context.get_data_type(kind.dtype))
+    numbers = [size * math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
+    extent, strides, size = (
+        [context.get_constant(types.intp, number) for number in row]
+        for row in (shape, numbers, [size])
+    )
+    array = context.make_array(kind)(context, builder)
+    populate_array(array, data, extent, strides, size[0], meminfo=None)
+    return array._getvalue()  # noqa: SLF001
+
+
 def _reader(struct: str) -> Any:
-    def read(address, name):
+    @_typed
+    def read(_, address, name):
         """A field of the struct at an address: a number, or an array.
 
         An array (COUNT,) or (COUNT, n) owns nothing, and nothing checks its bounds. The
         name is a literal.
         """
-
-    @overload(read, prefer_literal=True)
-    def generate(address, name):
         if not isinstance(name, types.StringLiteral):
             return None
         place, held, known = field(struct, name.literal_value)
-        if not isinstance(known, np.ndarray):
-            kind = held.type
-            return lambda address, name: carray(pointer(address + place), 1, kind)[0]
-        kind, shape = known.dtype.type, known.shape[1:]
-        if struct == "mjContact":
-            shape = shape or (1,)
-            return lambda address, name: carray(pointer(address + place), shape, kind)
-        # Widths that a model chooses are not known here.
-        shape = (COUNT, *(() if name.literal_value.endswith("_user") else shape))
-        return lambda address, name: carray(pointer(word(address + place)), shape, kind)
+        shape, inside = (), struct == "mjContact"
+        if isinstance(known, np.ndarray):
+            held, shape = known.dtype, known.shape[1:]
+            # Widths that a model chooses are not known here.
+            wide = () if name.literal_value.endswith("_user") else shape
+            shape = shape or (1,) if inside else (COUNT, *wide)
+        kind = from_dtype(held)
+        kind = types.Array(kind, len(shape), "C") if shape else kind
+
+        def generate(context, builder, signature, arguments):
+            there = builder.add(arguments[0], ir.Constant(ir.IntType(64), place))
+            if shape and not inside:
+                there = _load(builder, there, ir.IntType(64))
+            if not shape:
+                return _load(builder, there, context.get_data_type(kind))
+            return _array_at(context, builder, kind, there, shape)
+
+        return kind(address, name), generate
 
     return read
 
@@ -233,8 +261,7 @@ def word(_, address):
     """The int64 at an address: a size, or the address of an array."""
 
     def generate(context, builder, signature, arguments):
-        place = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
-        return builder.load(place)
+        return _load(builder, arguments[0], ir.IntType(64))
 
     return types.int64(types.int64), generate
 
@@ -249,26 +276,21 @@ def fused(_, one, other, more):
     return types.float64(types.float64, types.float64, types.float64), generate
 
 
-@_intrinsic
-def pointer(_, address):
-    """An address as the untyped pointer that `numba.carray` takes."""
-
-    def generate(context, builder, signature, arguments):
-        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
-
-    return types.voidptr(types.int64), generate
-
-
 def _array(kind: Any) -> Any:
-    @register_jitable
-    def array(address):
+    @_intrinsic
+    def array(_, address):
         """The array (COUNT,) at an address; it owns nothing."""
-        return carray(pointer(address), COUNT, kind)
+        array = types.Array(kind, 1, "C")
+
+        def generate(context, builder, signature, arguments):
+            return _array_at(context, builder, array, arguments[0], (COUNT,))
+
+        return array(types.int64), generate
 
     return array
 
 
-numbers, wholes, shorts = map(_array, (np.float64, np.int32, np.int16))
+numbers, wholes, shorts = map(_array, (types.float64, types.int32, types.int16))
 
 
 def _call(builder, values, result, variadic=False):

@@ -242,7 +242,7 @@ def sampled(entry, centre, axis, half, limit):
             values[i] = value
             i += 1
     if least > limit + step:
-        return np.empty(0), 0.0
+        return values[:0], 0.0
     return values, step
 
 
@@ -297,7 +297,10 @@ def touches(entry, centre, axis, half, closed, limit):
     values, step = sampled(entry, centre, axis, half, limit)
     if len(values) == 0:
         return seen
-    deepest = np.argmin(values)
+    deepest = 0
+    for i in range(1, len(values)):
+        if values[i] < values[deepest]:
+            deepest = i
     for i in range(len(values)):
         close, left_open = candidate(values, i, deepest, closed)
         t, value = -half + i * step, values[i]

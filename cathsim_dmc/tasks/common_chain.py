@@ -76,7 +76,11 @@ class CommonChain:
         if not self._behind:
             inertia, velocity, force = (a[:, -self.num_links :] for a in arrays)
             return inertia, velocity, force
-        return _continued(*arrays, state.centreline, self._behind)
+        shape = len(state.com_inertia), self.num_links
+        inertia, velocity, force = (np.zeros((*shape, width)) for width in (10, 6, 6))
+        found = inertia, velocity, force
+        _continued(*arrays, state.centreline, self._behind, *found)
+        return found
 
     def tracked(self, line: np.ndarray) -> np.ndarray:
         """Tracked points (..., K, 3) of a centreline (..., l + 1, 3), the head last."""
@@ -85,12 +89,9 @@ class CommonChain:
 
 
 @compiled
-def _continued(inertia, velocity, force, line, behind):
-    """Inertia, velocity and force of all links, see `CommonChain.links`."""
+def _continued(inertia, velocity, force, line, behind, inertias, velocities, forces):
+    """Writes inertia, velocity and force of all links, see `CommonChain.links`."""
     count, simulated = inertia.shape[:2]
-    inertias = np.zeros((count, simulated + behind, 10))
-    velocities = np.zeros((count, simulated + behind, 6))
-    forces = np.zeros((count, simulated + behind, 6))
     back, shift = np.zeros(3), np.zeros(3)
     for i in range(count):
         first, mass = inertia[i, 0, 9], behind * inertia[i, 0, 9]
@@ -128,4 +129,3 @@ def _continued(inertia, velocity, force, line, behind):
                     across = push[3 + p] * shift[q] - push[3 + q] * shift[p]
                     forces[i, row, k] = push[k] + across
                     forces[i, row, 3 + k] = push[3 + k]
-    return inertias, velocities, forces
