@@ -99,7 +99,7 @@ class Moment:
         now, own = surface, {"radius": episode.radii}
         x_ray = XRayRecord.of(episode)
         if (record := VesselRecord.of(episode)) is not None:
-            now = record.surface(surface, episode.time[step])
+            now = record.surface(surface, step)
             goal = record.series["goal"][step]
         if (coaxial := CoaxialRecord.of(episode)) is not None:
             own = {"outermost": coaxial.outermost(episode.catheter)[step]}

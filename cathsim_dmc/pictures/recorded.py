@@ -164,7 +164,7 @@ def xray_film(
         for first in range(0, states, span):
             rows = slice(first, first + span)
             if moved:
-                plane = plane.around(moved.surface(surface, episode.time[first]))
+                plane = plane.around(moved.surface(surface, first))
             film[rows] = plane.render(x_ray.shadows(episode, rows))
         darkest, brightest = int(film.min()), int(film.max())
         levels = 255 * (np.arange(256.0) - darkest) / max(brightest - darkest, 1)

@@ -89,7 +89,7 @@ class VesselRecord:
     """A vessel over T+1 states."""
 
     # (T+1,) by names of `VESSEL_SERIES`; (T+1, 3), world frame, "goal" (m) and
-    # "blood_velocity" at the head (m/s); "parameters" of the motion.
+    # "blood_velocity" at the head (m/s); "time" (T+1,) and "parameters" of the motion.
     series: dict[str, np.ndarray]
     motion: Motion | None  # how it moves; None where it rests
 
@@ -99,24 +99,27 @@ class VesselRecord:
         if not (meta := episode.meta.get("vessel")):
             return None
         given = {name: np.array(values, np.float64) for name, values in meta.items()}
+        given.setdefault("time", episode.time)
         return cls(given, Motion(given["lattice"]) if meta["lattice"] else None)
 
-    def surface(self, rest: Surface, time: float) -> Surface:
-        """The surface of the lumen at a time, s."""
+    def surface(self, rest: Surface, state: int) -> Surface:
+        """The surface of the lumen in a state."""
         if self.motion is None:
             return rest
-        return self.motion.surface(self.series["parameters"], float(time), rest)
+        time = float(self.series["time"][state])
+        return self.motion.surface(self.series["parameters"], time, rest)
 
 
 def vessel_state(task: Any) -> dict[str, Any]:
     """What a record keeps of the vessel in a state; nothing of one that rests."""
-    vessel = task.rollout.vessel
+    vessel, moving = task.rollout.vessel, task.rollout.moving
     if vessel is None:
         return {}
     return {
         **{name: float(value[0]) for name, value in vessel.info().items()},
         "blood_velocity": vessel.blood_velocity[0].tolist(),
         "goal": task.rollout.goal.reshape(3).tolist(),
+        **({} if moving is None else {"time": moving.warp(0)[2]}),
     }
 
 

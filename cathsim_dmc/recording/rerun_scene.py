@@ -104,7 +104,7 @@ def log_vessel(log: Log, surface: Surface) -> None:
         log.columns("world/goal", rr.Transform3D.columns(translation=way))
     if moves:
         rows = np.arange(0, log.episode.steps + 1, MESH_EVERY)
-        states = (record.surface(surface, t) for t in log.episode.time[rows])
+        states = (record.surface(surface, row) for row in rows.tolist())
         vertices = np.concatenate([each.vertices for each in states]).astype("f4")
         columns = rr.Mesh3D.columns(vertex_positions=vertices)
         columns = columns.partition(np.full(len(rows), len(surface.vertices)))
