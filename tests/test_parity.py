@@ -150,6 +150,19 @@ def test_shaped_devices_are_equal(name, options):
             pair.reset_some([1])
 
 
+@pytest.mark.parametrize("name", ["diagnostic_5f_simmons", "berenstein_5f"])
+def test_a_shaped_device_that_is_left_alone_comes_to_rest(name):
+    batch = BatchSimulation(suite.make_task("type2_lcca", device=name), 1)
+    batch.reset()
+    heads, action = [], np.ones((1, 1))
+    for count in range(200):
+        action[:] = count < 50
+        step = batch.step(action)
+        heads.append(step.readings.head[0])
+        assert step.errors == (None,)
+    assert np.ptp(heads[-25:], axis=0).max() < 0.1e-3
+
+
 def test_success_ends_both(anatomy):
     # A goal in the aorta ahead of the tip, which a straight push reaches.
     aorta = anatomy.tree.vessel("aorta").centreline

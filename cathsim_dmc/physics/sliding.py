@@ -25,7 +25,7 @@ from cathsim_dmc.physics import sliding_loops
 from cathsim_dmc.physics.chain_fields import FIELDS, places_of
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.physics.effects import Effect, Episode, World
-from cathsim_dmc.physics.readings import CoaxialReadings, Readings, ids
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 # Length of the straight device behind its base that X-rays meet, m.
@@ -55,16 +55,19 @@ class SingleDevice(Effect):
 
     data_fields: tuple[str, ...] = ("act",)
     model_fields: tuple[str, ...] = ()
-    # Whether it writes the springs of an unloaded shape.
-    _shaped = False
 
     def __init__(self, chain: Chain):
         """Takes the entity of the device."""
         self._device = chain.device
         self._behind = BEHIND / float(chain.link_lengths[0])  # links
-        self._shaped = bool(chain.device.tip_shape)
-        if self._shaped:
-            self.model_fields = ("qpos_spring",)
+
+    def num_parameters(self, chain: Chain) -> int:
+        """Of the springs of a device with a shape, see `shape_loops`."""
+        if not chain.device.tip_shape:
+            return 0
+        from cathsim_dmc.physics import shape_loops  # late, as numba takes long
+
+        return 1 + shape_loops.OF_JOINT * (len(chain.bends) // 2)
 
     def bind(self, world: World) -> None:
         """Finds the drives and the hinges in the model."""
@@ -73,37 +76,34 @@ class SingleDevice(Effect):
         self.slipped = self._drives.slipped
         model, places = world.model, world.index.bends_qpos
         self._bends_qpos = np.sort(places, axis=None)
-        # Of the unloaded device, whose shape lies in the plane of x and z.
-        self._shape = model.qpos_spring[places[:, 1]].astype(complex)
-        hinges = ids(model, world.chain.bends[::2])
-        self._compliance = 1 / model.jnt_stiffness[hinges]
+        self._springs = np.zeros(0)
+        if len(world.parameters.T) and not world.chain.coaxial:
+            from cathsim_dmc.physics import shape_loops
+
+            shape_loops.install()
+            joints = np.searchsorted(model.jnt_qposadr, places)
+            # The shape lies in the plane of x and z.
+            rest = model.qpos_spring[places[:, 1]]
+            compliance = 1 / model.jnt_stiffness[joints[:, 0]]
+            dofs = model.jnt_dofadr[joints]
+            rows = np.column_stack([rest, compliance, places, dofs])
+            self._springs = np.append(shape_loops.MARK, rows)
 
     def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Holds the base of one simulation where it stands."""
         self._drives.hold(index)
-        if self._shaped:
-            self._bend(index)
+        self.world.parameters[index, : len(self._springs)] = self._springs
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
-        """Lets clamps slip; turns motors and shape against the twist of the links."""
+        """Lets clamps slip; turns motors against the twist of the links."""
         motors = len(self.world.chain.tip_motors)
         self._drives.follow(action[:, motors:])
-        if self._shaped:
-            for index in range(len(action)):
-                self._bend(index)
         if not motors:
             return action
         angles = self.world.arrays.qpos[:, self._bends_qpos]
         commands = np.ascontiguousarray(action[:, :motors])
         steered = hinge_loops.steered(commands, angles)
         return np.concatenate([steered, action[:, motors:]], axis=1)
-
-    def _bend(self, index: int) -> None:
-        """Writes the springs of a shaped device for the angles of its hinges."""
-        angles = self.world.arrays.qpos[index, self._bends_qpos]
-        free = hinge_loops.free_hinges(self._shape, self._compliance, angles)
-        springs = self.world.field(index, "qpos_spring")
-        springs[self.world.index.bends_qpos] = free
 
     def follower_posture(self) -> np.ndarray:
         """Joints (N, len(JOINTS)) of the robot that holds the devices."""
