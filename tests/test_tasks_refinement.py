@@ -52,16 +52,17 @@ def test_what_goes_deep_in_the_last_physics_step_is_seen():
 )
 def test_shorter_steps_are_equal_in_both_paths(task, options, limit, monkeypatch):
     monkeypatch.setattr(forces, *limit.popitem())
-    refined = []
+    refined, every, missed = [], {}, 0
     original = Stepper._refine
-    monkeypatch.setattr(
-        _BatchStepper,
-        "_refine",
-        lambda self, indices, parts: (
-            refined.extend(indices.tolist()),
-            original(self, indices, parts),
-        ),
-    )
+
+    def refine(self, indices, parts):
+        rows = original(self, indices, parts)
+        assert rows.shape[1] == parts * self.substeps
+        refined.extend(indices.tolist())
+        every.update(zip(indices, forces.wall_force(rows)[0].peak_sum, strict=True))
+        return rows
+
+    monkeypatch.setattr(_BatchStepper, "_refine", refine)
     task = suite.make_task(task, **options)
     environments = [suite.environment(twin(task, seed)) for seed in (5, 6)]
     batch = BatchSimulation(task, 2, num_threads=1, seeds=5)
@@ -70,16 +71,21 @@ def test_shorter_steps_are_equal_in_both_paths(task, options, limit, monkeypatch
         environment.reset()
     rng = np.random.default_rng(0)
     for _ in range(10):
+        every.clear()
         action = rng.uniform(-1, 1, (2, batch.num_actions))
         action[:, -1 if batch.num_actions == 21 else slice(0, 2)] = 1.0
         step = batch.step(action)
+        kept, _ = forces.wall_force(batch.stepper.contact_rows)
+        for index, peak in every.items():
+            assert step.wall_force.peak_sum[index] == peak >= kept.peak_sum[index]
+            missed += peak > kept.peak_sum[index]
         for index, environment in enumerate(environments):
             environment.step(action[index])
             data, own = environment.physics.data.ptr, environment.task
             np.testing.assert_array_equal(batch.batch.qpos[index], data.qpos)
             assert own.wall_force.peak_max == step.wall_force.peak_max[index]
             assert own.readings.push_force == step.readings.push_force[index]
-    assert 0 < len(refined) < 20
+    assert 0 < len(refined) < 20 and missed
     timestep = batch.task.physics_timestep
     for index in range(2):
         assert batch.batch.get_model(index).opt.timestep == timestep

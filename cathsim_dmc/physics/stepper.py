@@ -79,8 +79,12 @@ class Stepper(abc.ABC):
         """Rows (N, S, M * 14) of the wall's sensor in the last control step."""
 
     @abc.abstractmethod
-    def _run(self, indices: np.ndarray, parts: int) -> None:
-        """Does S * parts physics steps, and keeps the contacts of every last part."""
+    def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
+        """Does S * parts physics steps, and keeps the contacts of every last part.
+
+        Returns:
+            Rows (K, S * parts, M * 14) of the wall's sensor in all of them.
+        """
 
     @abc.abstractmethod
     def _keep_still(self, indices: np.ndarray) -> None:
@@ -113,15 +117,20 @@ class Stepper(abc.ABC):
         warned, (force, depth) = self._warned(), forces.wall_force(self.contact_rows)
         limit = forces.DEEPEST if self.deepest is None else self.deepest
         depth = self._depth_at_end(depth, warned, limit)
+        peaks = np.zeros((2, self.num_simulations))
         # A wall that gives is soft enough for half the step, as a rule.
         for parts in (forces.REFINEMENT,) if self.deepest is None else (2, 8):
             coarse = ((force.peak_max > forces.HARDEST) | (depth > limit)) & ~warned
             if not np.count_nonzero(coarse):
                 break
-            self._refine(np.flatnonzero(coarse), parts)
+            indices = np.flatnonzero(coarse)
+            finer, _ = forces.wall_force(self._refine(indices, parts))
+            peaks[:, indices] = finer.peak_sum, finer.peak_max
             rows = self.contact_rows
             warned, (force, depth) = self._warned(), forces.wall_force(rows)
-        return force, warned
+        own = force.peak_sum, force.peak_max
+        peak_sum, peak_max = np.maximum(peaks, own)
+        return force._replace(peak_sum=peak_sum, peak_max=peak_max), warned
 
     def still(self, indices: np.ndarray) -> forces.WallForce:
         """Force on the wall where some simulations have not moved yet."""
@@ -157,13 +166,13 @@ class Stepper(abc.ABC):
             depth[index] = max(depth[index], end)
         return depth
 
-    def _refine(self, indices: np.ndarray, parts: int) -> None:
+    def _refine(self, indices: np.ndarray, parts: int) -> np.ndarray:
         """Does the control step of some simulations again, in steps so much shorter."""
         self.repeated[indices] += 1
         self.set_states(indices, self._before[indices])
         self._change(indices, "timestep", lambda timestep: timestep / parts)
         try:
-            self._run(indices, parts)
+            return self._run(indices, parts)
         finally:
             self._change(indices, "timestep", lambda timestep: timestep * parts)
 
@@ -233,19 +242,25 @@ class SingleStepper(Stepper):
         """Writes the state (1, nstate)."""
         mujoco.mj_setState(self._model, self._data, states[0], _STATE)
 
-    def run(self, parts: int = 1) -> None:
-        """Does the physics steps of a control step, each in so many parts."""
+    def run(self) -> None:
+        """Does the physics steps of a control step."""
+        self._step(self._rows)
+
+    def _step(self, rows: np.ndarray) -> None:
+        """Does a physics step for each of the sensor's rows."""
         before = self._warnings_before.tobytes()
-        for substep, row in enumerate(self._rows):
-            for _ in range(parts):
-                mujoco.mj_step(self._model, self._data)
-                if self.warnings.tobytes() != before:  # where a batch stops, too
-                    self._rows[substep:] = 0.0
-                    return
+        for substep, row in enumerate(rows):
+            mujoco.mj_step(self._model, self._data)
+            if self.warnings.tobytes() != before:  # where a batch stops, too
+                rows[substep:] = 0.0
+                return
             row[:] = self._sensor
 
-    def _run(self, indices: np.ndarray, parts: int) -> None:
-        self.run(parts)
+    def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
+        rows = np.empty((self.substeps * parts, self._rows.shape[1]))
+        self._step(rows)
+        self._rows[:] = rows[parts - 1 :: parts]
+        return rows[None]
 
     def _keep_still(self, indices: np.ndarray) -> None:
         self._rows[:-1], self._rows[-1] = 0.0, self._sensor

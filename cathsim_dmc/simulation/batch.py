@@ -216,11 +216,13 @@ class _BatchStepper(Stepper):
     def set_states(self, indices: np.ndarray, states: np.ndarray) -> None:
         self.batch.state[indices] = states
 
-    def _run(self, indices: np.ndarray, parts: int) -> None:
+    def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
         record = self.batch.rollout(
             parts * self.substeps, record=("sensordata",), ids=indices
         )
-        self.rows[indices] = record["sensordata"][:, parts - 1 :: parts]
+        rows = record["sensordata"]
+        self.rows[indices] = rows[:, parts - 1 :: parts]
+        return rows[..., self._contacts]
 
     def _keep_still(self, indices: np.ndarray) -> None:
         self.rows[indices] = self.batch.sensordata[indices, None]
