@@ -225,7 +225,7 @@ def checks() -> Iterator[Check]:
     for speed in SPEEDS:
         lag, expected = np.degrees(spin(speed))
         name = f"lag in a frictionless half circle at {speed:g} rad/s, deviation from "
-        name += "that of the material"
+        name += "that of its dampers"
         note = f"{lag:.1f}°, Σ τωθ²/C {expected:.1f}°"
         yield Check.at_most(name, abs(lag - expected), SPIN_BOUND, "°", note)
     for span in SPANS:
