@@ -34,7 +34,8 @@ class EpisodeForces:
     Attributes:
         sum: Of the sum of the magnitudes over all contacts at the end of a control
             step.
-        max: Of the largest single contact at the end of a control step.
+        max: Of the largest single contact at the end of a control step; one place of
+            the wall may be two contacts.
         peak_sum: Of the largest sum in any physics step of a control step.
         peak_max: Of the largest single contact in any physics step of a control step.
     """

@@ -53,8 +53,9 @@ _HEAD_ON = 0.1  # sine between a capsule and the normal
 _HOLLOW = 5e-6  # m, least distance of their edge from the wall
 # One plane does as long as its load, which grows with the cube of the depth, times the
 # slope of the wall beside it is a stiffness that the time step stands: to this depth,
-# m, at this slope. Two planes bear what one does at a depth less by a share; from there
-# to twice the depth they come up to the wall.
+# m, at this slope. With steps of 4 ms some light tips vibrate even so (docs/limits.md).
+# Two planes bear what one does at a depth less by a share; from there to twice the
+# depth they come up to the wall.
 _DEEP, _SLOPED, _SHARED = 1e-4, 0.06, 0.18
 _SLACK = 0.1  # first impedance of a law that starts soft enough for that
 _CORNER = -0.3  # slope of the clearance beside a place in a corner

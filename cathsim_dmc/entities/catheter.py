@@ -45,6 +45,7 @@ class Catheter(Chain):
         compliances = half[:-1] + half[1:]
         # Mass per length that moves with the device across its axis, kg/m.
         moved = device.linear_density + carried_mass(self.devices)
+        # The whole disc, as if no blood filled the lumen (docs/limits.md).
         displaced = BLOOD_DENSITY * np.pi * device.outer_radius**2
         weight = max(0.0, device.linear_density - displaced)
         self.density = BLOOD_DENSITY / (1 - weight / moved)

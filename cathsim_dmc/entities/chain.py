@@ -15,9 +15,11 @@ from cathsim_dmc.entities.posture import x_first
 # Physics step of the tasks, s. An implicit step of length h damps a spring like a
 # relaxation time of h, so the hinges have that much less.
 TIMESTEP = 4e-3
-# Rotor inertia of the hinges, kg·m². With the damping it acts within 2 ms, far below
-# the relaxation time. It sets the mass scale of the contact solver, at which the wall
-# is as hard as silicone (docs/physics.md).
+# Rotor inertia of the hinges, kg·m². It sets the mass scale of the contact solver and
+# with it the stiffness of the rigid wall: 1.2 to 3.2 kN/m for steerable_5f
+# (`physics.wall.rigid_stiffness`). Over the damping of a hinge it is a delay of 19 to
+# 25 ms in steerable_5f, and of 2.2 s in a link of 3 mm in the tip of wire_014_micro:
+# light tips swing too slowly (docs/limits.md).
 HINGE_ARMATURE = 1e-6
 # Rotor inertia of the torsion hinges, kg·m². They are softer, so a larger one would
 # delay the twist by more than a few milliseconds.

@@ -119,8 +119,9 @@ VERTEBRAL_5F = _shaped(
     *(Arc(18e-3, math.radians(45)), _straight(10e-3)),
 )
 
-# Distal part of a 2.1F tube of 0.021 inch lumen: I = π (R⁴ - r⁴) / 4 = 7.9e-15 m⁴, of
-# polyether block amides with the moduli of the data sheets of Pebax 5533 and 4033.
+# Distal part of a 2.1F tube of 0.021 inch lumen: I = π (R⁴ - r⁴) / 4 = 7.9e-15 m⁴ of
+# the diameters 0.70 and 0.53 mm (7.81e-15 m⁴ with 0.021 inch), of polyether block
+# amides with the moduli of the data sheets of Pebax 5533 and 4033.
 MICROCATHETER_021 = Device(
     name="microcatheter_021",
     outer_radius=2.1 * FRENCH / 2,

@@ -20,9 +20,10 @@ REFINEMENT = 8
 
 @dataclasses.dataclass(frozen=True)
 class Contacts:
-    """Contacts of the device with the wall; K places, of which some are empty.
+    """Contacts of the device with the wall; K rows, of which some are empty.
 
-    World frame, SI units, float64. Empty places hold zeros.
+    World frame, SI units, float64. Empty rows hold zeros. A place of a hollow lumen may
+    be two rows, each with about half of its load.
 
     Attributes:
         present: (..., K) bool.
@@ -64,7 +65,8 @@ class WallForce(NamedTuple):
 
     Attributes:
         sum: (...), sum of the magnitudes of all contacts, last substep.
-        max: (...), largest single contact, last substep.
+        max: (...), largest single contact, last substep; one place of the wall may
+            be two contacts.
         peak_sum: (...), largest sum of any substep of the control step.
         peak_max: (...), largest single contact of any substep.
     """

@@ -30,7 +30,7 @@ _LIMITS = {
     "breath_phase": (0.0, 1.0, ""),
 }
 OF_HEART = {"rate": 60.0, "phase": 0.0, "wave_speed": 4.6}
-_CLOCK_MASS = 0.1  # kg; a contact that moves at 0.05 m/s feels 0.25 kg⁻¹ of it
+_CLOCK_MASS = 0.1  # kg; a contact that moves at 0.05 m/s feels 0.025 kg⁻¹ of it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,8 +38,9 @@ class MotionOptions:
     """How a vessel moves; a range (low, high) is drawn from in each episode.
 
     Attributes:
-        heart: Way of the aortic root in a beat, m, 0 to 0.012.
-        breathing: Amplitude over that of Sailer 2015, 0 to 2.
+        heart: Way of the aortic root in a beat, m, 0 to 0.012, before it is smoothed
+            and fades towards the inlet (docs/vessel_model.md).
+        breathing: Amplitude over that of Sailer 2015, 0 to 2, likewise.
         distensibility: Area distensibility of a wide artery, 1/kPa, 0 to 0.08; 0.044
             when young, 0.02 at about 50 years.
         rate: Heart rate, 1/min, 30 to 200; None for that of the flow, or 60.

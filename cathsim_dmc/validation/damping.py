@@ -112,8 +112,8 @@ def _beam(
     """Deflection (n,) of the end of a beam released from its first mode, m."""
     mass = device.linear_density + (carried_mass([device]) if blood else 0.0)
     squares = (_ROOTS / length) ** 4
-    # The rotors of the hinges stand for no mass of the device, and matter little in
-    # blood.
+    # The rotors of the hinges stand for no mass of the device. The reference in air
+    # contains them, so it does not show what they change; in blood it does not.
     rotors = 0.0 if blood else HINGE_ARMATURE * LINK / mass * squares
     rates = device.shaft.bending_stiffness / mass * squares / (1 + rotors)
     places, weights = np.polynomial.legendre.leggauss(40)
