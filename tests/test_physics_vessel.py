@@ -9,6 +9,7 @@ from conftest import twin
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.circulation import Circulation
+from cathsim_dmc.physics.blood import BLOOD_VISCOSITY
 from cathsim_dmc.physics.vessel import VesselOptions
 from cathsim_dmc.physics.wall import stiffness
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -52,6 +53,25 @@ def test_flow_is_alike_in_both_paths_and_on_any_threads(living):
         np.testing.assert_array_equal(observed["blood_velocity"], velocity[k, 2])
     assert np.ptp(np.linalg.norm(velocity, axis=-1)) > 0.1
     assert environment.task.info()["indentation"] >= 0.0
+
+
+def test_blood_drags_along_a_pair_by_the_radii_of_its_links_now():
+    """The wire of one simulation advances, and the catheter of the other."""
+    task = suite.make_task("simple1_lcca_pair", vessel={"flow": True})
+    batch = BatchSimulation(task, 2, seeds=0)
+    batch.reset()
+    action = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    for _ in range(20):
+        batch.step(action)
+    flow = batch.rollout._effects[0]
+    geoms = flow.world.index.geoms
+    radii = batch.batch.expand("geom_size")[:, geoms, 0].copy()
+    batch.step(action)
+    inside = flow.radius > 0.0
+    assert (inside & (radii[0] < radii[1])).sum() > 2
+    gap = np.maximum(flow.radius[inside] / radii[inside], 1.2)
+    expected = 2 * np.pi * BLOOD_VISCOSITY / np.log(gap)
+    np.testing.assert_allclose(flow._links[inside][:, 4], expected)
 
 
 @pytest.mark.parametrize("access", ["ascending", "descending"])

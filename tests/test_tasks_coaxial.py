@@ -5,7 +5,7 @@ import pytest
 
 from cathsim_dmc import suite
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
-from cathsim_dmc.physics import sliding
+from cathsim_dmc.physics import chain_fields, sliding
 from cathsim_dmc.physics.blood import StillBlood
 from cathsim_dmc.physics.effects import userdata_size
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
@@ -112,6 +112,31 @@ def test_rotation_turns_the_shape_of_the_end(environment):
     assert turned == pytest.approx(seen.tip_rotation[0, 0], abs=0.05)
     assert 1.0 < turned < 1.7
     assert seen.rotation[0, 1] == 0.0
+
+
+@pytest.mark.parametrize("stiffness, loss", [(2.0, 1.0), (1.0, 3.0)])
+def test_factors_scale_the_torsion_of_the_devices(environment, stiffness, loss):
+    """In a smooth bend, twist does not depend on stiffness; loss is that of devices."""
+    entity, model = environment.task.scene.catheter, environment.physics.model.ptr
+    fields = [getattr(model, name).copy() for name in chain_fields.FIELDS]
+    made = sliding.made(entity, chain_fields.places_of(model, entity))
+    (tables, rods, *of_devices), *others = made
+    links = len(tables[1])
+    hinges = np.random.default_rng(0).uniform(-0.2, 0.2, 2 * links - 2)
+    turned, axial = np.array([0.0, 0.1]), np.zeros((2, links - 1))
+
+    def angles(times, *factors):
+        devices = (tables, rods._replace(times=times), *of_devices)
+        state = np.zeros((2, links + 1)), np.zeros(1), np.zeros(1), np.zeros(2)
+        sliding.sliding_loops.settle(
+            (devices, *others), entity.start_gaps, turned, np.zeros(links), 0.0, state,
+            axial, hinges, 0.0, np.array(factors), tuple(fields),
+        )  # fmt: skip
+        return state[0]
+
+    expected = angles(loss * rods.times, 1.0, 1.0)
+    assert np.abs(expected[:, -1]).min() > 1e-3
+    np.testing.assert_allclose(angles(rods.times, stiffness, loss), expected, 1e-9)
 
 
 @pytest.mark.parametrize("catheter", [1.0, 0.0], ids=["apart", "coinciding ends"])

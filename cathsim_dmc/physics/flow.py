@@ -80,7 +80,8 @@ class Flow(StillBlood):
     def bind(self, world: World) -> None:
         """Finds the parameters of blood and the radii of the links."""
         super().bind(world)
-        self._link_radii = world.model.geom_size[world.index.geoms, 0]
+        radii = world.model.geom_size[world.index.geoms, 0]
+        self._link_radii = np.tile(radii, (world.num_simulations, 1))
         self._circulations: dict[int, Circulation] = {}
         self._wave_speed = np.ones(world.num_simulations)
 
@@ -107,6 +108,10 @@ class Flow(StillBlood):
         nodes = state.centreline
         found = self._at(0.5 * (nodes[:, :-1] + nodes[:, 1:]))
         self.radius = found[..., 4]
+        if self.world.chain.coaxial:  # radii change as the devices slide
+            for index, radii in enumerate(self._link_radii):
+                sizes = self.world.field(index, "geom_size")
+                radii[:] = sizes[self.world.index.geoms, 0]
         given = self._header[:, 2], self._link_radii, self._options is not None
         _fill(found, self._wave_speed, *given, self._links)
         return action
@@ -178,14 +183,14 @@ def moving_velocities(
 def _fill(found, speed, viscosity, radii, flowing, links):
     """Writes the parameters of links (N, L, 8), see `blood_loops.OF_LINK`."""
     for index in range(len(found)):
-        for n in range(len(radii)):
+        for n in range(radii.shape[1]):
             row, link = found[index, n], links[index, n]
             link[5:] = row[5:]
             if flowing:
                 link[:3] = row[:3]
                 link[3], link[4] = row[3] / speed[index], 0.0
                 if row[4] > 0.0:
-                    gap = max(row[4] / radii[n], _LEAST_GAP)
+                    gap = max(row[4] / radii[index, n], _LEAST_GAP)
                     link[4] = 2.0 * math.pi * viscosity[index] / math.log(gap)
 
 

@@ -54,6 +54,7 @@ def settle(
     (tables, rods, arms, of_links), (lined, duration, torque), _ = made
     angles, ways, drag, slipped = state
     nodes, lengths, radii = tables[0], tables[1], of_links[0]
+    rods = torsion.Rods(factors[0] * rods.stiffness, factors[1] * rods.times)
     overlap = coaxial_loops.overlap(gaps, tables)
     turns = torsion.at_joints(angles, gaps, nodes)
     bends, _ = hinge_loops.bent(hinges)
