@@ -10,6 +10,7 @@ import pytest
 from conftest import twin
 
 from cathsim_dmc import suite
+from cathsim_dmc.physics import shape_loops
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.simulation.batch import BatchSimulation
 
@@ -102,10 +103,11 @@ def test_other_models_are_left_alone(windy):
     </mujoco>
     """
     windy("simple1_bca")
+    shape_loops.install()
     model = mujoco.MjModel.from_xml_string(spring)
     data = mujoco.MjData(model)
-    data.xfrc_applied[1] = 1.0
-    mujoco.mj_step(model, data)
+    data.xfrc_applied[1], data.userdata[:] = 1.0, -2.0
+    mujoco.mj_step(model, data)  # which would not end, were -2 taken for a count
     np.testing.assert_array_equal(data.xfrc_applied[1], 1.0)
 
 

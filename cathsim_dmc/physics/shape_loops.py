@@ -18,6 +18,7 @@ from cathsim_dmc.collision.native import (
     model_field,
 )
 from cathsim_dmc.entities.hinge_loops import free_hinges
+from cathsim_dmc.physics import blood_loops
 
 # The first parameter of an effect with a shape; the others are OF_JOINT a joint: rest
 # angle, rad; compliance, rad/(N·m); places in `qpos` and degrees of freedom about x, y.
@@ -32,6 +33,9 @@ def _bend(model, data):
     """Adds what the springs lack to the passive forces of a shaped device."""
     call_before(address_of(_SYMBOL), model, data)
     total, user = model_field(model, "nuserdata"), data_field(data, "userdata")
+    # Blood is the first effect of every task; another model has other numbers.
+    if total <= _HEADER or user[_HEADER] != blood_loops.MARK:
+        return
     start = 0
     while start + _HEADER < total and user[start + _HEADER] != MARK:
         start += _HEADER + int(user[start + 1])
@@ -40,11 +44,8 @@ def _bend(model, data):
     joints = (int(user[start + 1]) - 1) // OF_JOINT
     own = user[start + _HEADER + 1 :]
     qpos, passive = data_field(data, "qpos"), data_field(data, "qfrc_passive")
-    stiffness, rest = (
-        model_field(model, "jnt_stiffness"),
-        model_field(model, "qpos_spring"),
-    )
-    joint_of = model_field(model, "dof_jntid")
+    stiffness = model_field(model, "jnt_stiffness")
+    rest, joint_of = model_field(model, "qpos_spring"), model_field(model, "dof_jntid")
     shape, compliance = np.empty(joints, np.complex128), np.empty(joints)
     angles = np.empty(2 * joints)
     for j in range(joints):

@@ -117,7 +117,7 @@ class Stepper(abc.ABC):
         warned, (force, depth) = self._warned(), forces.wall_force(self.contact_rows)
         limit = forces.DEEPEST if self.deepest is None else self.deepest
         depth = self._depth_at_end(depth, warned, limit)
-        peaks = np.zeros((2, self.num_simulations))
+        peaks = None
         # A wall that gives is soft enough for half the step, as a rule.
         for parts in (forces.REFINEMENT,) if self.deepest is None else (2, 8):
             coarse = ((force.peak_max > forces.HARDEST) | (depth > limit)) & ~warned
@@ -125,12 +125,15 @@ class Stepper(abc.ABC):
                 break
             indices = np.flatnonzero(coarse)
             finer, _ = forces.wall_force(self._refine(indices, parts))
+            if peaks is None:
+                peaks = np.zeros((2, self.num_simulations))
             peaks[:, indices] = finer.peak_sum, finer.peak_max
             rows = self.contact_rows
             warned, (force, depth) = self._warned(), forces.wall_force(rows)
-        own = force.peak_sum, force.peak_max
-        peak_sum, peak_max = np.maximum(peaks, own)
-        return force._replace(peak_sum=peak_sum, peak_max=peak_max), warned
+        if peaks is not None:
+            peak_sum, peak_max = np.maximum(peaks, [force.peak_sum, force.peak_max])
+            force = force._replace(peak_sum=peak_sum, peak_max=peak_max)
+        return force, warned
 
     def still(self, indices: np.ndarray) -> forces.WallForce:
         """Force on the wall where some simulations have not moved yet."""
