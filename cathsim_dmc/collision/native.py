@@ -21,13 +21,13 @@ import llvmlite.binding as llvm
 import mujoco
 import numpy as np
 from llvmlite import ir
-from numba import cfunc
-from numba.core import types
+from numba.core import sigutils, types
+from numba.core.ccallback import CFunc
 from numba.extending import intrinsic, overload, register_jitable
 from numba.np.arrayobj import populate_array
 from numba.np.numpy_support import from_dtype
 
-from cathsim_dmc.compiled import keep_together
+from cathsim_dmc import compiled_cache
 
 # Compiled code calls what this decorates without its first argument.
 _intrinsic: Any = intrinsic
@@ -349,13 +349,14 @@ def callback(signature: str, cache: bool = True) -> Callable:
         signature: numba's, such as "void(int64, int64)"; a pointer is an int64.
         cache: Whether it is kept on disk.
     """
-    keep_together()
 
-    def decorate(function: Callable):
+    def decorate(function: Callable) -> Any:
         options = {"nopython": True, "error_model": "numpy"}
-        try:
-            return cfunc(signature, cache=cache, **options)(function)
-        except RuntimeError:  # neither this folder nor the user's can be written to
-            return cfunc(signature, **options)(function)
+        kinds = sigutils.normalize_signature(signature)
+        made = CFunc(function, kinds, locals={}, options=options)
+        if cache:
+            compiled_cache.keep(made, function)
+        made.compile()
+        return made
 
     return decorate

@@ -1,0 +1,144 @@
+"""The cache of compiled loops: no fault of it stops a run, and none goes unsaid."""
+
+import ctypes
+import errno
+import logging
+
+import numba
+import pytest
+from numba.core import caching
+
+from cathsim_dmc import compiled_cache
+from cathsim_dmc.collision import native
+from cathsim_dmc.compiled import compiled
+
+
+def double(number):
+    return 2 * number
+
+
+def loop():
+    """The function as a new process makes it: its answer, and what it found on disk."""
+    made = compiled(double)
+    answer = made(21)
+    hits = sum(made._compiled.stats.cache_hits.values())
+    return answer, hits
+
+
+def call_by_c():
+    made = native.callback("int64(int64)")(double)
+    answer = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(made.address)(21)
+    return answer, made.cache_hits
+
+
+KINDS = pytest.mark.parametrize("run", [loop, call_by_c])
+
+
+@pytest.fixture
+def folder(monkeypatch, tmp_path):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "kept"))
+    monkeypatch.setattr(compiled_cache, "_told", set())
+    return tmp_path / "kept"
+
+
+def files(folder, suffix):
+    return sorted(folder.rglob(f"*.{suffix}"))
+
+
+def cut(share):
+    return lambda data: data[: int(share * len(data))]
+
+
+DAMAGES = {
+    "empty": cut(0),
+    "first bytes": lambda data: data[:3],
+    "half": cut(0.5),
+    "all but the end": lambda data: data[:-1],
+    "zeros": lambda data: bytes(len(data)),
+    "zeros at the end": lambda data: data[: len(data) // 2] + bytes(len(data) // 2),
+    "text": lambda data: b"not a cache",
+}
+
+
+@KINDS
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_cache_is_compiled_anew(run, suffix, damage, folder, caplog):
+    assert run() == (42, 0)
+    assert run() == (42, 1)
+    assert not caplog.records
+    (path,) = files(folder, suffix)
+    path.write_bytes(DAMAGES[damage](path.read_bytes()))
+    assert run() == (42, 0)
+    (record,) = caplog.records
+    assert str(path) in record.getMessage() and "\n" not in record.getMessage()
+    assert "compiled anew" in record.getMessage()
+    assert run() == (42, 1)  # it is whole again
+    assert len(caplog.records) == 1
+
+
+@KINDS
+def test_a_warning_is_given_once(run, folder, caplog):
+    run()
+    for _ in range(3):
+        for path in files(folder, "nbi"):
+            path.write_bytes(b"")
+        run()
+    assert len(caplog.records) == 1
+
+
+@KINDS
+def test_a_file_that_cannot_be_read_stops_nothing(run, folder, caplog):
+    run()
+    for path in files(folder, "nb?"):
+        path.unlink()
+        path.mkdir()  # also for root no file that can be read or replaced
+    assert run() == (42, 0)
+    texts = [record.getMessage() for record in caplog.records]
+    assert "is damaged" in texts[0] and "cannot be kept" in texts[1]
+
+
+@KINDS
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EROFS])
+def test_a_full_disk_stops_nothing(run, code, folder, caplog, monkeypatch):
+    def full(*_):
+        raise OSError(code, "no room")
+
+    monkeypatch.setattr(caching.IndexDataCacheFile, "_open_for_write", full)
+    assert run() == (42, 0) == run()
+    (record,) = caplog.records
+    assert str(folder) in record.getMessage() and "no room" in record.getMessage()
+    assert "NUMBA_CACHE_DIR" in record.getMessage()
+
+
+@KINDS
+def test_code_that_an_index_names_by_mistake_is_not_run(
+    run, folder, caplog, monkeypatch
+):
+    """The disk fills up between the index of new sources and their code."""
+    run()
+    monkeypatch.setattr(caching.UserProvidedCacheLocator, "get_source_stamp", bytes)
+    with monkeypatch.context() as context:
+        context.setattr(compiled_cache._Files, "_save_data", lambda *_: None)
+        assert run() == (42, 0)
+    assert run() == (42, 0)
+    assert "is damaged" in caplog.text
+    assert run() == (42, 1)
+
+
+@KINDS
+def test_without_a_folder_nothing_is_kept(run, caplog, monkeypatch):
+    monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
+    compiled_cache.keep_together()
+    assert run() == (42, 0) == run()
+    assert not caplog.records
+
+
+def test_a_warning_is_one_line_on_standard_error(folder, capfd, monkeypatch):
+    logger = logging.getLogger("cathsim_dmc.compiled_cache")
+    loop()
+    files(folder, "nbi")[0].write_bytes(b"")
+    monkeypatch.setattr(logger, "handlers", [logging.lastResort])
+    monkeypatch.setattr(logger, "propagate", False)
+    loop()
+    assert len(capfd.readouterr().err.splitlines()) == 1
