@@ -12,16 +12,16 @@ from typing import Any
 class _Compiled:
     """A function that is compiled when it is called, from Python or compiled code."""
 
-    def __init__(self, function: Callable, cache: bool):
+    def __init__(self, function: Callable, cache: bool, checked: bool):
         functools.update_wrapper(self, function)
-        self._function, self._cache = function, cache
+        self._function, self._cache, self._checked = function, cache, checked
 
     def _made(self, **options: Any) -> Any:
         import numba
 
         # Wrappers that nothing calls would take a fifth more time to compile.
         options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-        return numba.njit(self._function, **options)
+        return numba.njit(self._function, boundscheck=self._checked, **options)
 
     @functools.cached_property
     def _compiled(self) -> Any:
@@ -51,10 +51,11 @@ class _Compiled:
         return self._compiled.stats.cache_path
 
 
-def compiled(function: Callable, cache: bool = True) -> Callable:
+def compiled(function: Callable, cache: bool = True, checked: bool = False) -> Callable:
     """Compiles a function, once on each machine where there is a place to keep it.
 
     Without `fastmath`: the same numbers bit for bit, alone and in a batch. A function
     that refers to others which change from call to call must not be kept (`cache`).
+    `checked` has an index beyond an array raise IndexError.
     """
-    return _Compiled(function, cache)
+    return _Compiled(function, cache, checked)

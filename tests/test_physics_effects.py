@@ -4,13 +4,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 from conftest import twin
 
 from cathsim_dmc import suite
-from cathsim_dmc.physics import shape_loops
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.simulation.batch import BatchSimulation
 
@@ -95,20 +93,132 @@ def test_arrays_once_a_control_step_and_compiled_forces_agree(windy):
     np.testing.assert_array_equal(compiled, arrays)
 
 
-def test_other_models_are_left_alone(windy):
-    spring = """
-    <mujoco>
-      <size nuserdata="9"/>
-      <worldbody><body><freejoint/><geom size="0.1"/></body></worldbody>
-    </mujoco>
-    """
-    windy("simple1_bca")
-    shape_loops.install()
-    model = mujoco.MjModel.from_xml_string(spring)
-    data = mujoco.MjData(model)
-    data.xfrc_applied[1], data.userdata[:] = 1.0, -2.0
-    mujoco.mj_step(model, data)  # which would not end, were -2 taken for a count
-    np.testing.assert_array_equal(data.xfrc_applied[1], 1.0)
+# What one who builds a scene without this package may have in `userdata` and `solimp`.
+_FOREIGN = """
+import mujoco, numpy as np, sys
+sys.path.insert(0, "examples")
+from side_wind import SideWind
+from cathsim_dmc import suite
+
+scene = '''
+<mujoco>
+  <size nuserdata="8"/>
+  <worldbody>
+    <geom type="plane" size="1 1 1" solimp="0.7 0.95 0.003" solref="-2000 -20"/>
+    <body pos="0.1 0 0.09"><freejoint/><geom size="0.1" solimp="0.7 0.95 0.003"/></body>
+    <body pos="-.3 0 0.2"><freejoint/><geom type="capsule" size="0.02 0.1"/></body>
+  </worldbody>
+</mujoco>
+'''
+
+
+def run(values):
+    model = mujoco.MjModel.from_xml_string(scene)
+    data, seen = mujoco.MjData(model), []
+    data.userdata[:] = values
+    data.xfrc_applied[1, 0] = 0.1
+    for _ in range(300):
+        mujoco.mj_step(model, data)
+        seen += [data.qpos.copy(), data.xfrc_applied.ravel(), data.userdata.copy()]
+    return np.concatenate(seen)
+
+
+rows = []
+numbers = (-2.0, -1000.0, np.nan, 1e30, 1843.0, 2718.0, 2947.0, 2.0)
+for value in numbers:
+    for place in (1, slice(None)):
+        row = np.zeros(8)
+        row[place] = value
+        rows.append(row)
+rows += [np.array([1, 4, 2947, 1e9, -5, 7, 1, first]) for first in numbers]
+before = [run(row) for row in rows]
+options = {"vessel": "living", "effects": [SideWind((0, 0, 0.1))]}
+environment = suite.load("cathsim", "simple1_bca", options)
+environment.reset()
+suite.load("cathsim", "femoral_type1_lcca_wire", {}).reset()
+for row, expected in zip(rows, before, strict=True):
+    np.testing.assert_array_equal(run(row), expected)
+"""
+
+
+def ended(script, *arguments, timeout=300):
+    """Standard error of a script that must end by itself, without an error."""
+    done = subprocess.run(
+        [sys.executable, "-c", script, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        cwd=Path(__file__).parents[1],
+    )
+    assert done.returncode == 0, (done.returncode, done.stderr)
+    return done.stderr
+
+
+def test_other_models_are_left_alone_whatever_their_numbers():
+    ended(_FOREIGN)
+
+
+_LOST = """
+import ctypes, sys, mujoco, numpy as np
+sys.path.insert(0, "examples")
+from side_wind import SideWind
+from cathsim_dmc import suite
+
+options = {"vessel": "living", "effects": [SideWind((0, 0, 0.1))], "random": 3}
+action = np.zeros(21)
+
+
+def run(environment):
+    environment.reset()
+    for _ in range(8):
+        environment.step(action)
+    data = environment.physics.data
+    return np.concatenate([data.qpos, data.xfrc_applied.ravel()])
+
+
+expected = run(suite.load("cathsim", "simple1_bca", options))
+environment = suite.load("cathsim", "simple1_bca", options)
+for name in ("mjcb_passive", "mjcb_control"):
+    change = getattr(mujoco, f"set_{name}")
+    change(lambda model, data: None)
+    try:
+        environment.reset()
+    except RuntimeError as error:
+        assert f"mujoco.set_{name}(None), then" in str(error), error
+    else:
+        raise AssertionError(f"{name}: a Python function was not noticed")
+    change(None)
+    again = suite.load("cathsim", "simple1_bca", options)
+    np.testing.assert_array_equal(run(again), expected)
+    change(None)
+    again = suite.load("cathsim", "simple1_bca", options)
+    again.reset()
+    change(None)
+    again.reset()
+    assert getattr(mujoco, f"get_{name}")() is not None
+"""
+
+
+def test_callbacks_that_were_removed_are_put_back_or_missed():
+    ended(_LOST)
+
+
+@pytest.mark.parametrize("place", [100, 10**8, -(10**8)])
+def test_an_index_beyond_the_bodies_is_an_error_and_writes_nothing(windy, place):
+    class Astray(SideWind):
+        def restart(self, index, episode, random_state):
+            super().restart(index, episode, random_state)
+            self.world.parameters[index, 3] = place
+
+    task = twin(windy("simple1_bca"), effects=[Astray(WIND)])
+    environment = suite.environment(task)
+    environment.reset()
+    with pytest.raises(RuntimeError, match=r"SideWind\.forces.*an index beyond"):
+        environment.step(np.zeros(21))
+    batch = BatchSimulation(twin(task), 2, num_threads=2)
+    batch.reset()
+    with pytest.raises(RuntimeError, match="an index beyond"):
+        batch.step(np.zeros((2, 21)))
 
 
 _CHAIN = """

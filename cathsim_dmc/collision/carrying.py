@@ -12,7 +12,7 @@ import functools
 import numpy as np
 
 from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, courses, wall_velocity, warp
-from cathsim_dmc.collision import native
+from cathsim_dmc.collision import callbacks, native
 from cathsim_dmc.collision.loops import SOFT
 from cathsim_dmc.collision.native import (
     address_of,
@@ -24,6 +24,7 @@ from cathsim_dmc.collision.native import (
     numbers,
     word,
 )
+from cathsim_dmc.collision.own import owned
 from cathsim_dmc.collision.table import (
     MOTION_ENTRY,
     SYMBOL,
@@ -52,6 +53,8 @@ def _share(data):
 def _carry(model, data):
     """Shares springs, and writes the wall's velocity into contacts' Jacobian."""
     call_before(address_of(_SYMBOL), model, data)
+    if not owned(model, data):
+        return
     _share(data)
     space, nv = motion_of(model, data), model_field(model, "nv")
     if space == 0:
@@ -84,5 +87,5 @@ def _carry(model, data):
 
 @functools.cache
 def install() -> None:
-    """Has MuJoCo call it in every physics step; RuntimeError as `native.follow`."""
-    native.follow(_carry, _before)
+    """Has MuJoCo call it in every physics step; RuntimeError as `follow`."""
+    callbacks.follow("mjcb_passive", _carry, _before)

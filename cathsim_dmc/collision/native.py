@@ -212,35 +212,6 @@ def symbol(name: str, count: int) -> np.ndarray:
     return array
 
 
-def stands_in(name: str) -> int:
-    """Address of the function in a callback of MuJoCo, "mjcb_passive" or other.
-
-    Returns:
-        0 for none.
-
-    Raises:
-        RuntimeError: if a Python function stands there.
-    """
-    stood = getattr(mujoco, f"get_{name}")()
-    if stood is not None and not hasattr(stood, "argtypes"):
-        raise RuntimeError(
-            f"{name} is the Python function {stood!r}, which compiled functions cannot "
-            f"call; remove it with mujoco.set_{name}(None)"
-        )
-    return 0 if stood is None else ctypes.cast(stood, ctypes.c_void_p).value or 0
-
-
-def follow(function: Any, before: np.ndarray) -> None:
-    """Has MuJoCo call a compiled function in `mjcb_passive`.
-
-    Args:
-        before: (1,), gets the address of the function that stood there, which the
-            function must call (`call_before`); see `stands_in`.
-    """
-    before[0] = stands_in("mjcb_passive")
-    mujoco.set_mjcb_passive(function.ctypes)
-
-
 @_intrinsic
 def address_of(_, name):
     """Address (int64) of the array that `symbol` has given a name, a literal."""
@@ -336,7 +307,7 @@ def call_error(_, address, text, number):
 
 @register_jitable
 def call_before(table, model, data):
-    """Calls the callback whose address `follow` has put into a table, if any."""
+    """Calls the callback whose address a table holds, if any; see `callbacks`."""
     before = word(table)
     if before != 0:
         call_callback(before, model, data)

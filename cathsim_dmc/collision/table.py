@@ -4,6 +4,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.motion_loops import MARK as MOTION
 from cathsim_dmc.collision.native import data_field, model_field, numbers, symbol, word
+from cathsim_dmc.collision.own import parameters_of
 from cathsim_dmc.compiled import compiled
 
 # Words in the head of the table: the functions that stood in MuJoCo's collision table,
@@ -55,13 +56,7 @@ def key_of(model, geom):
 @compiled
 def motion_of(model, data):
     """Place in `userdata` of the parameters of a simulation's motion; 0 for none."""
-    count = model_field(model, "nuserdata")
-    user, start = data_field(data, "userdata"), 0
-    while start + 2 < count:
-        if user[start + 2] == MOTION:
-            return start + 2
-        start += 2 + int(user[start + 1])
-    return 0
+    return parameters_of(model, data, MOTION)
 
 
 @compiled

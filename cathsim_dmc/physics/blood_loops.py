@@ -4,13 +4,14 @@ import functools
 import math
 
 from cathsim_dmc.anatomy.circulation import BEAT
-from cathsim_dmc.collision import native
+from cathsim_dmc.collision import callbacks, native
 from cathsim_dmc.collision.native import (
     address_of,
     call_before,
     data_field,
     model_field,
 )
+from cathsim_dmc.collision.own import parameters_of
 from cathsim_dmc.compiled import compiled
 
 # Parameters before those of the links: the mark of blood, its density and viscosity,
@@ -21,8 +22,6 @@ HEADER, MARK = 7, 1843.0
 # the friction along the link's axis per length and velocity, N·s/m², and the velocity
 # of the vessel's space, m/s.
 OF_LINK = 8
-# Numbers of `userdata` before the parameters of the first effect.
-_FIRST = 2
 _SYMBOL = "cathsim_blood"
 _before = native.symbol(_SYMBOL, 1)
 
@@ -40,12 +39,11 @@ def beat(phase):
 def _drag(model, data):
     """Adds the drag on each link to the passive forces of a model with blood."""
     call_before(address_of(_SYMBOL), model, data)
-    if model_field(model, "nuserdata") < _FIRST + HEADER:
+    start = parameters_of(model, data, MARK)
+    if start == 0:
         return
     user = data_field(data, "userdata")
-    if user[_FIRST] != MARK:
-        return
-    links, user = (int(user[1]) - HEADER) // OF_LINK, user[_FIRST:]
+    links, user = (int(user[start - 1]) - HEADER) // OF_LINK, user[start:]
     density, viscosity, first = user[1], user[2], int(user[3])
     if viscosity == 0.0:
         return
@@ -90,4 +88,4 @@ def _drag(model, data):
 @functools.cache
 def install() -> None:
     """Has MuJoCo add the drag where there is blood; RuntimeError as `follow`."""
-    native.follow(_drag, _before)
+    callbacks.follow("mjcb_passive", _drag, _before)

@@ -16,7 +16,7 @@ from numpy.random import RandomState
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.imaging.angiograph import Deviation
-from cathsim_dmc.physics.readings import MARK, Bodies, ModelIndex, Readings
+from cathsim_dmc.physics.readings import Bodies, ModelIndex, Readings
 
 # Numbers of `userdata` before the parameters of an effect: its mark and their number.
 _HEADER = 2
@@ -160,7 +160,9 @@ def bind(effects: Sequence[Effect], world: World) -> dict[int, float]:
             f"the effects of the task take {needed} numbers of userdata, and the "
             f"scene has room for {user.shape[1]}: build it with the same configuration"
         )
-    labels: dict[int, float] = {}
+    from cathsim_dmc.collision.own import OWN  # late, as numba takes long
+
+    labels: dict[int, float] = {needed - 1: OWN} if needed else {}
     start = 0
     for effect in effects:
         count, mark = effect.num_parameters(world.chain), 0
@@ -171,11 +173,30 @@ def bind(effects: Sequence[Effect], world: World) -> dict[int, float]:
             )
         first = start + _HEADER if count else start
         if count and effect.forces is not None:
-            from cathsim_dmc.physics import callbacks  # late, as numba takes long
+            from cathsim_dmc.physics import callbacks
 
-            mark, labels[needed - 1] = callbacks.install(effect.forces), MARK
+            mark = callbacks.install(effect.forces)
         if count:
             labels |= {start: mark, start + 1: count}
         start = first + count
         effect.bind(dataclasses.replace(world, parameters=user[:, first:start]))
+    check()
     return labels
+
+
+def check() -> None:
+    """Puts back what somebody has removed from MuJoCo's callbacks.
+
+    Raises:
+        RuntimeError: if a Python function stands in a callback.
+    """
+    from cathsim_dmc.collision import callbacks
+
+    callbacks.restore()
+
+
+def raise_fault() -> None:
+    """Raises RuntimeError if a compiled function has raised an error in a step."""
+    from cathsim_dmc.physics import callbacks
+
+    callbacks.raise_fault()

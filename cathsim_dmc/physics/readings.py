@@ -14,9 +14,6 @@ from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.physics import forces
 
-# The last number of `userdata` where a compiled function may act.
-MARK = 0.7389056098930650
-
 
 class Readings(NamedTuple):
     """State of the device after a control step.

@@ -10,20 +10,19 @@ import functools
 
 import numpy as np
 
-from cathsim_dmc.collision import native
+from cathsim_dmc.collision import callbacks, native
 from cathsim_dmc.collision.native import (
     address_of,
     call_before,
     data_field,
     model_field,
 )
+from cathsim_dmc.collision.own import parameters_of
 from cathsim_dmc.entities.hinge_loops import free_hinges
-from cathsim_dmc.physics import blood_loops
 
 # The first parameter of an effect with a shape; the others are OF_JOINT a joint: rest
 # angle, rad; compliance, rad/(N·m); places in `qpos` and degrees of freedom about x, y.
 MARK, OF_JOINT = 2718.0, 6
-_HEADER = 2  # numbers of `userdata` before the parameters of an effect
 _SYMBOL = "cathsim_shape"
 _before = native.symbol(_SYMBOL, 1)
 
@@ -32,17 +31,10 @@ _before = native.symbol(_SYMBOL, 1)
 def _bend(model, data):
     """Adds what the springs lack to the passive forces of a shaped device."""
     call_before(address_of(_SYMBOL), model, data)
-    total, user = model_field(model, "nuserdata"), data_field(data, "userdata")
-    # Blood is the first effect of every task; another model has other numbers.
-    if total <= _HEADER or user[_HEADER] != blood_loops.MARK:
+    start, user = parameters_of(model, data, MARK), data_field(data, "userdata")
+    if start == 0:
         return
-    start = 0
-    while start + _HEADER < total and user[start + _HEADER] != MARK:
-        start += _HEADER + int(user[start + 1])
-    if start + _HEADER >= total:
-        return
-    joints = (int(user[start + 1]) - 1) // OF_JOINT
-    own = user[start + _HEADER + 1 :]
+    joints, own = (int(user[start - 1]) - 1) // OF_JOINT, user[start + 1 :]
     qpos, passive = data_field(data, "qpos"), data_field(data, "qfrc_passive")
     stiffness = model_field(model, "jnt_stiffness")
     rest, joint_of = model_field(model, "qpos_spring"), model_field(model, "dof_jntid")
@@ -66,4 +58,4 @@ def _bend(model, data):
 @functools.cache
 def install() -> None:
     """Has MuJoCo add the forces where there is a shape; RuntimeError as `follow`."""
-    native.follow(_bend, _before)
+    callbacks.follow("mjcb_passive", _bend, _before)

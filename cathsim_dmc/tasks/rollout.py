@@ -128,6 +128,7 @@ class Rollout:
             random_states: N sources of randomness; those of other simulations are left
                 alone.
         """
+        effects.check()
         self._random_states = list(random_states)
         for index in indices:
             self._draw(index, random_states[index])
@@ -225,6 +226,7 @@ class Rollout:
     def finish(self) -> Step:
         """Measures, judges and observes after the physics steps of a control step."""
         force, warned = self._stepper.end()
+        effects.raise_fault()
         self.steps += 1
         before = self.resting.head
         self._measure(force)

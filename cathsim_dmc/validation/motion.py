@@ -9,6 +9,7 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.motion import PULSE_PRESSURE, Motion, distensibility
 from cathsim_dmc.anatomy.motion_loops import MARK, PARAMETERS, courses, pulse
 from cathsim_dmc.collision import carrying
+from cathsim_dmc.collision.own import OWN
 from cathsim_dmc.entities import contact
 from cathsim_dmc.physics.flow import moving_velocities
 from cathsim_dmc.physics.stepper import PHYSICS_TIMESTEP
@@ -48,7 +49,7 @@ def begin(model: mujoco.MjModel, course: np.ndarray) -> mujoco.MjData:
     """Data of a model whose wall moves by parameters."""
     data = mujoco.MjData(model)
     data.userdata[1] = len(course)
-    data.userdata[2 : 2 + len(course)] = course
+    data.userdata[2:] = *course, OWN
     return data
 
 
@@ -188,7 +189,7 @@ def ride(
     model = spec.compile()
     data = begin(model, course)
     if inertial:
-        data.userdata[2:] = 0.0
+        data.userdata[2:-1] = 0.0
     times, half = np.arange(0.0, _RIDE, PHYSICS_TIMESTEP), 0.5 * PHYSICS_TIMESTEP
     link = []
     for time in times:

@@ -188,9 +188,11 @@ class Rig:
         if isinstance(self.catheter, DeviceStack):
             chain_fields.write_still(self.catheter, self.model, self.gaps)
         if blood is not None:
+            from cathsim_dmc.collision.own import OWN
+
             # What blood needs of a `World`, placed in `userdata` as by `effects.bind`.
             parameters = self.data.userdata[None, 2:-1]
-            self.data.userdata[1] = parameters.size
+            self.data.userdata[1], self.data.userdata[-1] = parameters.size, OWN
             first = slice(int(ids(self.model, self.catheter.links)[0]), None)
             index = types.SimpleNamespace(links=first)
             world: Any = types.SimpleNamespace(parameters=parameters, index=index)

@@ -63,6 +63,7 @@ def cantilever(speed: float) -> tuple[float, float]:
 
 def terminal_velocity(force: float) -> tuple[float, float]:
     """Velocity of a free link under a force (N) across its axis, m/s, and expected."""
+    from cathsim_dmc.collision.own import OWN
     from cathsim_dmc.physics import blood_loops
 
     blood_loops.install()
@@ -77,6 +78,7 @@ def terminal_velocity(force: float) -> tuple[float, float]:
     model = spec.compile()
     data = mujoco.MjData(model)
     data.userdata[1:6] = size, blood_loops.MARK, BLOOD_DENSITY, BLOOD_VISCOSITY, 1
+    data.userdata[-1] = OWN
     data.xfrc_applied[1, 0] = force
     mujoco.mj_step(model, data, 2000)
     expected = brentq(lambda u: LINK * drag(u, 2 * radius) - force, 1e-6, 10.0)
@@ -127,9 +129,11 @@ def indentation(
     It lies along a tube with a radius, m, and a wall of 1.5 mm with a modulus, Pa.
     """
     from cathsim_dmc.collision import carrying
+    from cathsim_dmc.collision.own import OWN
 
     carrying.install()
     spec = bare(tube(0.2, radius).lumen)
+    spec.nuserdata = 1
     half = LINK / 2 if kind == "capsule" else 0.0
     body = {"size": (1e-3, half, 0), "mass": 1e-3, "priority": 1}
     body["type"] = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
@@ -140,7 +144,7 @@ def indentation(
     depths = []
     for load in loads:
         data = mujoco.MjData(model)
-        data.xfrc_applied[1, 0] = load
+        data.xfrc_applied[1, 0], data.userdata[0] = load, OWN
         mujoco.mj_step(model, data, 1500)
         depths.append(data.qpos[0] - 1e-4)
     return np.array(depths)
