@@ -363,8 +363,8 @@ def main(
             files.write_text(out, json_.dumps(report.as_dict(), indent=2) + "\n")
 
     try:
-        if out is not None and not out.parent.is_dir():
-            raise ValueError(f"--out is {out}: make the directory {out.parent} first")
+        if out is not None:
+            files.require_file(out)
         report = difficulty(
             task or None,
             seeds,
@@ -374,7 +374,7 @@ def main(
             say=lambda text: print(text, file=sys.stderr, flush=True),
             keep=keep,
         )
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         print(f"difficulty: {error}", file=sys.stderr)
         return BAD_INPUT
     return show(report, json)

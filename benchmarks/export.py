@@ -59,6 +59,7 @@ def export(
             f"a policy cannot be called {name!r}; use lower-case letters, digits and "
             "underscores"
         )
+    files.require_folder(out, make=True)
     path = pretrained.pretrained_path(run)
     if path is not None:
         policy: Any = str(run)

@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 from import_cases import ASK, Case
 
+from cathsim_dmc import files
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.scan.importer import import_scan
@@ -140,6 +141,7 @@ def main() -> None:
     )
     parser.add_argument("--part", default="0/1", help="k/n: every n-th case from k on")
     options = parser.parse_args()
+    files.require_file(options.out)
     rows = []
     if options.out.exists():
         rows = [json.loads(line) for line in options.out.read_text().splitlines()]

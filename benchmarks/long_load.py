@@ -176,8 +176,11 @@ def main() -> int:
         )
         serve(load, arguments.serve)
         return 0
-    if arguments.out is not None and not arguments.out.parent.is_dir():
-        parser.error(f"--out: make the directory {arguments.out.parent} first")
+    try:
+        if arguments.out is not None:
+            files.require_file(arguments.out)
+    except OSError as error:
+        parser.error(f"--out: {error}")
     report = measure(arguments)
     text = json.dumps(report, indent=2) + "\n"
     print(text, end="")

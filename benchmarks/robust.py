@@ -17,6 +17,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from cathsim_dmc import files
 from cathsim_dmc.agents import evaluation, protocols
 from cathsim_dmc.agents.evaluation import SAFE_FORCES
 from cathsim_dmc.agents.policies import load_policy
@@ -186,7 +187,7 @@ def main(
     cells["changes"] = changes
     lines = out.read_text().splitlines() if out.exists() else []
     done = [json.loads(line) for line in lines]
-    out.parent.mkdir(parents=True, exist_ok=True)
+    files.require_file(out, make=True)
     for cell in (cell for part in only for cell in cells[part]()):
         key = {"policy": policy, "part": cell.part, **cell.labels}
         if any(key.items() <= line.items() for line in done):

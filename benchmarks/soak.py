@@ -395,7 +395,7 @@ def main() -> int:
     options = parser.parse_args()
     episodes = options.episodes or (QUICK_EPISODES if options.quick else EPISODES)
     steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
-    options.out.mkdir(parents=True, exist_ok=True)
+    files.require_folder(options.out, make=True)
     path = options.out / "episodes.jsonl"
     tasks = options.task or TASKS
     wanted = plan(episodes, tasks, options.policy or tuple(POLICIES))

@@ -192,6 +192,7 @@ def work(cell, runs, results):
         Whether it came to the end; a signal ends the training with a checkpoint.
     """
     config, folder = cell.config(), runs / cell.name
+    files.require_folder(results, make=True)  # now: a result would be lost
     task, options, arches, episodes = cell.evaluated(config)
     suite.make_task(task, **options)  # refuses options before the training
     resume = (folder / training.CONFIG_FILE).exists()

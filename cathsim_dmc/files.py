@@ -29,14 +29,13 @@ def atomic_path(
 
     Raises:
         ValueError: if `path` does not end in `suffix`.
-        FileNotFoundError: if the directory does not exist.
+        OSError: see `require_file`.
         RuntimeError: if the block ends without having written anything.
     """
     path = Path(path)
     if suffix is not None and path.suffix != suffix:
         raise ValueError(f"the file name must end in {suffix}, got {path.name!r}")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"no directory {path.parent}; create it first")
+    require_file(path)
     temporary = _temporary(path)
     # Before the work. Not tempfile, whose files only their owner may read.
     open(temporary, "xb").close()
@@ -60,6 +59,7 @@ def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
         OSError: if `path` exists with something in it, or cannot be written.
     """
     path = Path(path)
+    require_folder(path.parent)
     temporary = _temporary(path)
     temporary.mkdir()
     try:
@@ -67,6 +67,60 @@ def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.rename(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def require_folder(folder: str | os.PathLike[str], make: bool = False) -> Path:
+    """A folder that takes new files; checked before work whose result goes there.
+
+    Args:
+        make: Whether to make the folder, and those around it, where it is missing.
+
+    Raises:
+        FileNotFoundError: there is no such folder, and it is not to be made.
+        NotADirectoryError: it, or one around it, is a file.
+        PermissionError: it is read-only.
+    """
+    folder = Path(folder)
+    if make:
+        require_place(folder)
+        with contextlib.suppress(FileExistsError):  # a file, see below
+            folder.mkdir(parents=True, exist_ok=True)
+    if not folder.is_dir():
+        if folder.exists():
+            raise NotADirectoryError(f"{folder} is a file; give a directory (--out)")
+        raise FileNotFoundError(f"no directory {folder}; create it first")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(
+            f"{folder} cannot be written to: it is read-only for this user; choose "
+            f"another directory, or allow it (chmod u+wx {folder})"
+        )
+    return folder
+
+
+def require_place(folder: str | os.PathLike[str]) -> Path:
+    """A folder that takes new files, or could be made where there is none yet.
+
+    Raises:
+        OSError: as of `require_folder`, for it or for the nearest folder around it.
+    """
+    place = Path(folder)
+    while not (place.exists() or place.is_symlink()) and place != place.parent:
+        place = place.parent
+    require_folder(place)
+    return Path(folder)
+
+
+def require_file(path: str | os.PathLike[str], make: bool = False) -> Path:
+    """The path of a file that can be written, or replaced; see `require_folder`.
+
+    Raises:
+        OSError: as of `require_folder`; IsADirectoryError if `path` is a directory.
+    """
+    path = Path(path)
+    require_folder(path.parent, make)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a directory; give a file name in it")
+    return path
 
 
 @contextlib.contextmanager

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from cathsim_dmc.files import atomic_path
+from cathsim_dmc.files import atomic_path, require_file
 
 # Okabe and Ito's colours, which the colour-blind can tell apart, and print in grey as
 # different shades: blue, vermilion, green, purple, orange, light blue, black, grey.
@@ -28,8 +28,7 @@ def tidy(axes: Any) -> None:
 
 def save(figure: Any, path: str | Path, dpi: int = 110) -> None:
     """Writes a matplotlib figure as PNG, whole or not at all."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    require_file(path, make=True)
     with atomic_path(path) as temporary:
         options = {"format": "png", "pil_kwargs": {"optimize": True}}
         figure.savefig(temporary, dpi=dpi, **options)

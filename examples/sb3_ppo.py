@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import cathsim_dmc
 import cathsim_dmc.gym
-from cathsim_dmc import agents, suite
+from cathsim_dmc import agents, files, suite
 from cathsim_dmc.simulation.environments import VECTOR
 
 OBSERVATION = "internal"  # numbers, without images
@@ -117,7 +117,7 @@ def main(
 ) -> None:
     """Trains, or loads `policy`; evaluates under both protocols, records an episode."""
     torch.set_num_threads(1)  # the networks are small
-    out.mkdir(parents=True, exist_ok=True)
+    files.require_folder(out, make=True)
     if policy:
         model, normalise, metadata = load(policy, task)
         print(", ".join(f"{name} {x}" for name, x in metadata.items()))

@@ -9,33 +9,29 @@ import time
 import numpy as np
 import pytest
 import synthetic_env
+from recording_samples import make_episode, make_tube
 from test_agents_training import run, small_ppo
 
-from cathsim_dmc import suite
-from cathsim_dmc.agents import ConfigError, evaluate
+import cathsim_dmc
+from cathsim_dmc import cli, files, style, suite
+from cathsim_dmc.agents import ConfigError, evaluate, evaluation, submission, training
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.training_log import read_metrics
+from cathsim_dmc.analysis import heatmap
+from cathsim_dmc.cli import phantoms
 from cathsim_dmc.cli.agents import record
 from cathsim_dmc.cli.task_options import TaskOptions
+from cathsim_dmc.pictures import animation
+from cathsim_dmc.recording import dataset, image_set, rerun_log
 
 
-@pytest.mark.parametrize("kind", ["a file", "under a file", "read-only"])
+@pytest.mark.parametrize("kind", ["a file", "under a file"])
 def test_folders_that_cannot_be_written_are_refused_before_the_work(
     tmp_path, monkeypatch, kind
 ):
     out = tmp_path / "out"
-    if kind == "read-only":
-        if os.geteuid() == 0:
-            pytest.skip("root may write everywhere")
-        out.mkdir(mode=0o500)
-        out = out / "run"
-    else:
-        out.write_text("mine")
-        out = out if kind == "a file" else out / "run"
-
-    def work(*arguments, **options):
-        raise AssertionError("work was begun")
-
+    out.write_text("mine")
+    out = out if kind == "a file" else out / "run"
     monkeypatch.setattr(synthetic_env, "make_env", work)
     with pytest.raises((OSError, ConfigError), match="out"):
         run(small_ppo(), out, make_env=work)
@@ -44,8 +40,99 @@ def test_folders_that_cannot_be_written_are_refused_before_the_work(
     monkeypatch.setattr(suite, "load", work)
     with pytest.raises(OSError, match="out"):
         record("push", out / "a.rrd", task="type1_bca", options=TaskOptions())
-    if kind != "read-only":
-        assert (tmp_path / "out").read_text() == "mine"
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+# Every command that writes, and what it would do first that takes its time.
+WRITERS = {
+    "train type1_bca --out OUT": (training, "_prepare"),
+    "train type1_bca --out OUT/run": (training, "_prepare"),
+    "eval push --task type1_bca --out OUT": (evaluation, "_first_episodes"),
+    "submit push --task type1_bca --out OUT/a.json": (evaluation, "evaluate"),
+    "record push --task type1_bca --out OUT/a.rrd": (suite, "load"),
+    "record push --task type1_bca --gif OUT/a.gif": (suite, "load"),
+    "demos type1_bca --out OUT/a-v0": (suite, "make_task"),
+    "play type1_bca --out OUT": (suite, "load"),
+    "dataset OUT": (image_set, "_shards"),
+    "dataset OUT/set": (image_set, "_shards"),
+    "phantom import a.stl --out OUT": (phantoms, "import_scan"),
+    "phantom build a.json --out OUT/a/b": (phantoms, "read_tree"),
+    "phantom generate type1 --out OUT": (phantoms.shipped, "load"),
+    "phantom check type1 --figure OUT/a.png": (suite, "load_anatomy"),
+    "phantom export type1 --out OUT/a.xml": (suite, "load_anatomy"),
+}
+
+
+def work(*arguments, **options):
+    raise AssertionError("work was begun")
+
+
+@pytest.fixture
+def read_only(tmp_path, monkeypatch):
+    """A folder that is read-only, also for root."""
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    access = os.access
+
+    def denied(path, mode):
+        return os.fspath(path) != str(folder) and access(path, mode)
+
+    monkeypatch.setattr(files.os, "access", denied)
+    return folder
+
+
+@pytest.mark.parametrize("line", WRITERS)
+def test_a_read_only_folder_is_refused_before_the_work(
+    read_only, monkeypatch, capsys, line
+):
+    monkeypatch.setattr(*WRITERS[line], work)
+    words = line.replace("OUT", str(read_only)).split()
+    monkeypatch.setattr(sys, "argv", ["cathsim", *words])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    said = capsys.readouterr().err
+    assert ended.value.code == 2, said
+    assert f"PermissionError: {read_only} cannot be written to" in said
+    assert not list(read_only.iterdir())
+
+
+def test_a_read_only_folder_is_refused_before_the_work_in_python(
+    read_only, monkeypatch
+):
+    episode, surface = make_episode(), make_tube()
+    calls = {
+        "record": lambda: cathsim_dmc.record(object(), "push", read_only / "a.npz"),
+        "record_actions": lambda: submission.record_actions(
+            "push", read_only / "a.npz", "type1_lcca"
+        ),
+        "save": lambda: episode.save(read_only / "a.npz"),
+        "animate": lambda: animation.animate(episode, surface, read_only / "a.gif"),
+        "write_rrd": lambda: rerun_log.write_rrd(
+            episode, surface, read_only / "a.rrd"
+        ),
+        "heatmap": lambda: heatmap.heatmap(
+            np.zeros((0, 3)), np.zeros(0), surface, read_only / "a.png"
+        ),
+        "style": lambda: style.save(None, read_only / "a.png"),
+        "dataset": lambda: dataset.check_free(read_only / "a-v0"),
+    }
+    for module, name in (
+        (evaluation, "evaluate"), (rerun_log, "Log"), (animation, "_frames"),
+        (heatmap, "force_map"), (np, "savez_compressed"),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, work)
+    for name, call in calls.items():
+        with pytest.raises(PermissionError, match="chmod u"):
+            call()
+            raise AssertionError(name)
+    assert not list(read_only.iterdir())
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused_before_the_work(tmp_path):
+    (tmp_path / "a.npz").mkdir()
+    with pytest.raises(IsADirectoryError, match="give a file name in it"):
+        with files.atomic_path(tmp_path / "a.npz"):
+            raise AssertionError
 
 
 # Kills.
@@ -54,6 +141,7 @@ TRAIN = """
 import sys
 sys.path[:0] = sys.argv[3:]
 import synthetic_env
+from recording_samples import make_episode, make_tube
 from test_agents_training import small_ppo
 from cathsim_dmc.agents import train
 config = small_ppo(total_frames=int(sys.argv[2]), checkpoint_frames=512)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cathsim_dmc import suite
+from cathsim_dmc import files, suite
 from cathsim_dmc.simulation.batch import BatchSimulation
 
 STEPS = 60  # control steps of each of two episodes
@@ -102,6 +102,8 @@ def main() -> int:
     parser.add_argument("--compare", type=Path, help="digests of before")
     parser.add_argument("--only", nargs="*", default=list(CASES), help="some cases")
     options = parser.parse_args()
+    if options.out:
+        files.require_file(options.out)
     before = json.loads(options.compare.read_text()) if options.compare else {}
     found, wrong = {}, 0
     for case in options.only:
@@ -113,7 +115,7 @@ def main() -> int:
                 wrong += not same
                 print(f"{key:45} {found[key]} {'' if same else 'DIFFERS'}", flush=True)
     if options.out:
-        options.out.write_text(json.dumps(found, indent=1) + "\n")
+        files.write_text(options.out, json.dumps(found, indent=1) + "\n")
     print(f"{len(found)} trajectories, {wrong} differ", file=sys.stderr)
     return int(wrong > 0)
 

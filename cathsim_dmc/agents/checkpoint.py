@@ -141,7 +141,7 @@ def save_checkpoint(
         Its directory.
     """
     directory = Path(run) / _DIRECTORY
-    directory.mkdir(parents=True, exist_ok=True)
+    files.require_folder(directory, make=True)
     for one in set(directory.iterdir()) - set(checkpoints_in(run)):
         if one.is_dir() and re.fullmatch(r"\d{10,}|\.\d{10,}\..*partial", one.name):
             shutil.rmtree(one)  # of a process that was killed

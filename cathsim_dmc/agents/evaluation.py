@@ -200,7 +200,7 @@ def evaluate(
     parts = protocols.parts(conditions, task, options, episodes, seed)
     if out_dir is not None:
         # Now: an evaluation that cannot be written would be lost.
-        Path(out_dir).mkdir(parents=True, exist_ok=True)
+        files.require_folder(out_dir, make=True)
     outcomes: list[EpisodeOutcome] = []
     for part in parts:
         env = make_env(

@@ -67,7 +67,7 @@ def submit(
                 f"{policy} holds {len(player.seeds)} episodes, not the {count} of "
                 f"the {PROTOCOL} protocol; record them with agents.record_actions"
             )
-    out.parent.mkdir(parents=True, exist_ok=True)
+    files.require_file(out, make=True)
     result = evaluation.evaluate(
         player, task, episodes, protocol=PROTOCOL, num_threads=num_threads
     )

@@ -135,7 +135,7 @@ def train(
 @contextlib.contextmanager
 def _only_process(run: Path) -> Iterator[None]:
     """Make the directory of a run; lock it until this process ends, even killed."""
-    run.mkdir(parents=True, exist_ok=True)
+    files.require_folder(run, make=True)
     lock = FileLock(run / ".lock")
     text = f"another process trains in {run}; wait for its end, or choose a new folder"
     with files.refused(ConfigError, text, Timeout):

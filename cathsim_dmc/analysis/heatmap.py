@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cathsim_dmc.anatomy.parts import Surface
-from cathsim_dmc.files import atomic_path
+from cathsim_dmc.files import atomic_path, require_file
 
 # Cells of 2 mm: about the diameter of the device, below which neighbouring contacts
 # of one place would be told apart.
@@ -94,6 +94,7 @@ def heatmap(
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
 
+    require_file(path)
     outline = surface.vertices[:, AP_AXES]
     field = force_map(position, force, outline.min(0) - MARGIN, outline.max(0) + MARGIN)
     x_mm, z_mm = 1e3 * field.x_edges, 1e3 * field.z_edges

@@ -133,8 +133,7 @@ class Anatomy:
 
         A reader finds the old anatomy or the new one.
         """
-        directory = Path(directory)
-        directory.mkdir(parents=True, exist_ok=True)
+        directory = files.require_folder(directory, make=True)
         arrays = {
             "surface_vertices": self.surface.vertices,
             "surface_faces": self.surface.faces,

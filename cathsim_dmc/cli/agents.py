@@ -249,7 +249,7 @@ def record(
     bounds.choice("task", task, suite.SUITE)
     # Now: an episode that cannot be written would be lost.
     for path in targets:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        files.require_file(path, make=True)
     if player.observation is not None:
         task_kwargs["observation"] = player.observation
     env = suite.load(suite.DOMAIN, task, {**task_kwargs, "random": seed})

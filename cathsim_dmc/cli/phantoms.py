@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro import conf
 from tyro.extras import SubcommandApp
 
-from cathsim_dmc import bounds, style, suite
+from cathsim_dmc import bounds, files, style, suite
 from cathsim_dmc.anatomy import export as exported
 from cathsim_dmc.anatomy import phantoms as shipped
 from cathsim_dmc.anatomy.arch import arch, sampler
@@ -62,8 +62,7 @@ def import_phantom(
             raise ValueError(
                 f"rename is {rename}; give computed=wanted, e.g. branch_1=lra"
             )
-    if out.exists() and not out.is_dir():  # now: the import would be lost
-        raise ValueError(f"{out} is a file; give a directory for the anatomy (--out)")
+    files.require_place(out)  # now: the import would be lost
     notes: list[str] = []
     anatomy = import_scan(
         mesh, centreline, units=units, mesh_frame=frame, axes=axes, labels=label,
@@ -72,8 +71,8 @@ def import_phantom(
     )  # fmt: skip
     anatomy.save(out)
     style.save(anatomy_figure(anatomy), out / _PICTURE)
-    files = {"directory": str(out), "picture": str(out / _PICTURE), "notes": notes}
-    print_json({**files, **describe(anatomy)})
+    where = {"directory": str(out), "picture": str(out / _PICTURE), "notes": notes}
+    print_json({**where, **describe(anatomy)})
     return 0
 
 
@@ -89,6 +88,7 @@ def build(
         out: Directory of the anatomy.
         access: Inlet of the file that the device enters by; the first if left out.
     """
+    files.require_place(out)
     anatomy = read_tree(tree).build(access)
     anatomy.save(out)
     print(f"{anatomy.name}: goals {', '.join(anatomy.goals)}: {out}")
@@ -125,6 +125,7 @@ def generate(
         if (value is not None) != (option == needs[kind]):
             wanted = f"--{needs[kind]}" if needs[kind] else "neither --seed nor --index"
             raise ValueError(f"{kind!r} takes {wanted}; --{option} is {value}")
+    files.require_place(out)
     if seed is not None:
         anatomy = arch.build_seed(arch.ArchSeed(seed, kind, variant), access=access)
     elif index is not None:
@@ -158,9 +159,11 @@ def check(
     # Not at the top: an import of a scan needs none of the simulation.
     from cathsim_dmc.validation.wall import validate_anatomy
 
-    anatomy = suite.load_anatomy(phantom)
     if figure is None and Path(phantom).is_dir():
         figure = Path(phantom) / _PICTURE
+    if figure is not None:
+        files.require_place(figure.parent)
+    anatomy = suite.load_anatomy(phantom)
     report = validate_anatomy(anatomy)
     code = show(report, json)
     if not json:
@@ -179,6 +182,7 @@ def export(phantom: Annotated[str, conf.Positional], /, out: Path) -> int:
         phantom: Directory of an anatomy, or the name of a phantom.
         out: File of the model, ending in .xml.
     """
+    files.require_file(out)
     found = exported.write_mjcf(suite.load_anatomy(phantom), out)
     print_json({"file": str(out), **found})
     return 0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from cathsim_dmc.files import atomic_path
+from cathsim_dmc.files import atomic_path, require_file
 from cathsim_dmc.pictures import figure as drawing
 from cathsim_dmc.pictures.moment import Moment, on_screen
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
@@ -59,6 +59,7 @@ def animate(
     path = Path(path)
     if path.suffix not in SUFFIXES:
         raise ValueError(f"a film is a {' or '.join(SUFFIXES)} file, not {path.name}")
+    require_file(path)
     seconds = np.clip(episode.time[-1] - episode.time[0], *_LENGTH)
     count = min(frames, episode.steps + 1)
     chosen = np.unique(np.linspace(0, episode.steps, count).round().astype(int))

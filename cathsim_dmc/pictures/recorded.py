@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import bounds, policies
+from cathsim_dmc import bounds, files, policies
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.options import FluoroscopyOptions
@@ -51,7 +51,7 @@ def record(
         TypeError: the environment or the policy is none.
         ValueError: the policy's name or the file's kind does not exist, or the policy
             returns no action of the environment.
-        FileNotFoundError: the file's folder does not exist.
+        OSError: the file's folder does not exist or is read-only.
     """
     if path is not None:
         _checked(path)
@@ -70,9 +70,7 @@ def _checked(path: str | os.PathLike[str]) -> Path:
             f"the recording is to be written to {target}; give a file that ends in "
             f"{', '.join(FORMATS)}"
         )
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"no folder {target.parent}; make it first")
-    return target
+    return files.require_file(target)
 
 
 def as_function(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import suite
+from cathsim_dmc import files, suite
 from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.play.window import FluoroscopyWindow
 from cathsim_dmc.policies import Policy, in_environment
@@ -46,6 +46,8 @@ def play(
     """
     if not speed > 0:
         raise ValueError(f"speed is {speed}; it must be > 0")
+    if out is not None:
+        files.require_folder(out, make=True)
     options = dict(task_kwargs or {})
     # The screen is the operator's observation; the task's own would only cost.
     observation = (policy and policy.observation) or "tracking"
@@ -68,8 +70,6 @@ def play(
             raise StopIteration
         return chosen(timestep) if chosen else controls.action(CONTROL_TIMESTEP)
 
-    if out is not None:
-        Path(out).mkdir(parents=True, exist_ok=True)
     recorder, written = EpisodeRecorder(env, task, options), []
     try:
         for number in itertools.count() if episodes is None else range(episodes):

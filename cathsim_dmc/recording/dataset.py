@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.files import atomic_directory, naming
+from cathsim_dmc.files import atomic_directory, naming, require_folder
 
 
 def write(
@@ -40,8 +40,7 @@ def write(
 
     Raises:
         FileExistsError: the directory exists.
-        FileNotFoundError: the directory around it does not.
-        OSError: the disk is full.
+        OSError: the directory around it is missing or read-only, or the disk is full.
         ModuleNotFoundError: minari is not installed.
     """
     path = Path(path)
@@ -135,5 +134,4 @@ def check_free(path: Path) -> None:
     """Raises unless a dataset can be written there; see `write`."""
     if path.exists():
         raise FileExistsError(f"{path} exists: choose another directory, or remove it")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"no directory {path.parent}; create it first")
+    require_folder(path.parent)

@@ -75,7 +75,7 @@ def write(
 
     Raises:
         ValueError: if an option is wrong, or the folder is that of other options.
-        FileNotFoundError: if the directory around `out` does not exist.
+        OSError: if the directory around `out` does not exist, or `out` is read-only.
         ModuleNotFoundError: if h5py is not installed.
     """
     import h5py  # noqa: F401  # Now: hours later it would be missed.
@@ -106,8 +106,7 @@ def _begin(out: Path, options: ImageSetOptions) -> None:
     """Makes the folders; refuses one with anything else in it."""
     about = {"format": _FORMAT, "version": __version__, "options": vars(options)}
     text = json.dumps(about, indent=2) + "\n"
-    if not out.parent.is_dir():
-        raise FileNotFoundError(f"no directory {out.parent}; create it first")
+    files.require_folder(out if out.exists() else out.parent)
     described = out / "dataset.json"
     if out.exists() and not described.is_file() and any(out.iterdir()):
         raise ValueError(f"{out} is not empty and no data set; choose another folder")
@@ -117,7 +116,7 @@ def _begin(out: Path, options: ImageSetOptions) -> None:
             "version; give those, or another folder"
         )
     for name in ("annotations", *SPLITS):
-        (out / name).mkdir(parents=True, exist_ok=True)
+        files.require_folder(out / name, make=True)
     files.write_text(described, text)
 
 

@@ -35,6 +35,7 @@ def main():
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--threads", type=int, default=0)
     options = parser.parse_args()
+    files.require_file(options.out)
     rows = []
     for policy in POLICIES:
         rows += play(policy, options.threads)

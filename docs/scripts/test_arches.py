@@ -16,7 +16,7 @@ from pathlib import Path
 import figures
 import numpy as np
 
-from cathsim_dmc import policies, suite
+from cathsim_dmc import files, policies, suite
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -39,6 +39,7 @@ def main():
     if options.write:
         figures.put(PAGE, arches=table(read(options.out)))
         return
+    files.require_file(options.out)
     done = {(row["task"], row["arch"]) for row in read(options.out)}
     # Both goals of an arch in turn: it is built once.
     for number, seed in enumerate(arch.arch_set(options.arches)):
