@@ -2,9 +2,11 @@
 
 import contextlib
 import json
+import math
 import os
 import shutil
 import uuid
+import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,11 @@ from typing import Any
 import numpy as np
 
 _PARTIAL = ".partial"
+# What a file may unpack to: bytes, or times its size. Positions and forces shrink to a
+# third or less, and zeros, which a file of zeros could hold for ever, to a thousandth.
+_UNPACKED, _RATIO = 2**28, 100
+_HEADER_1 = np.lib.format.read_array_header_1_0
+_HEADER_2 = np.lib.format.read_array_header_2_0
 
 
 @contextlib.contextmanager
@@ -167,6 +174,25 @@ def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}{_PARTIAL}")
 
 
+def require_room(unpacked: int, stored: int) -> None:
+    """Refuse what unpacks to far more than its file holds, before it is unpacked.
+
+    Args:
+        unpacked: Bytes in memory.
+        stored: Bytes of the file.
+
+    Raises:
+        ValueError: if it unpacks to more than 268 MB and to more than 100 times its
+            file.
+    """
+    most = max(_UNPACKED, _RATIO * stored)
+    if unpacked > most:
+        raise ValueError(
+            f"it unpacks to {unpacked / 1e6:,.0f} MB from a file of "
+            f"{stored / 1e6:,.1f} MB; at most {most / 1e6:,.0f} MB are read"
+        )
+
+
 def read_arrays(
     path: str | os.PathLike[str], names: Iterable[str] | None = None
 ) -> dict[str, np.ndarray]:
@@ -174,11 +200,18 @@ def read_arrays(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no archive, is damaged, or lacks an array.
+        ValueError: if it is no archive, is damaged, lacks an array, or unpacks to far
+            more than it holds, see `require_room`.
     """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in (names or arrays)}
+        with open(path, "rb") as stream, zipfile.ZipFile(stream) as archive:
+            wanted = [f"{name}.npy" for name in names or ()] or archive.namelist()
+            held = [archive.getinfo(name) for name in wanted]
+            stored = os.fstat(stream.fileno()).st_size
+            require_room(sum(one.file_size for one in held), stored)
+            return {
+                one.filename.removesuffix(".npy"): _array(archive, one) for one in held
+            }
     except FileNotFoundError:
         raise
     except KeyError as error:
@@ -186,3 +219,19 @@ def read_arrays(
     except Exception as error:  # zipfile and numpy fail in many ways
         text = " ".join(str(error).split())
         raise ValueError(text or type(error).__name__) from error
+
+
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
+    """The array of an entry, which numpy would make as large as its header says."""
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{entry.filename} is packed in a way that numpy does not use")
+    with archive.open(entry) as stream:
+        version = np.lib.format.read_magic(stream)
+        read = {(1, 0): _HEADER_1, (2, 0): _HEADER_2}.get(version)
+        if read is None:
+            raise ValueError(f"{entry.filename} has the version {version}")
+        shape, _, dtype = read(stream)
+    if math.prod(shape) * max(dtype.itemsize, 1) > entry.file_size:
+        raise ValueError(f"{entry.filename} holds less than its shape {shape}")
+    with archive.open(entry) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)

@@ -1,8 +1,10 @@
 """Files of a run from elsewhere: what is wrong in them is named."""
 
 import hashlib
+import io
 import json
 import shutil
+import zipfile
 
 import numpy as np
 import pytest
@@ -10,7 +12,15 @@ import torch
 from tensordict import TensorDict
 from test_agents_training import run, small_ppo
 
-from cathsim_dmc.agents import Checkpoint, CheckpointError
+from cathsim_dmc.agents import (
+    Checkpoint,
+    CheckpointError,
+    checkpoint,
+    learner,
+    networks,
+    pretrained,
+)
+from cathsim_dmc.agents.learners import config_from_dict
 from cathsim_dmc.agents.replay import ReplayError, ReplayMemory
 
 
@@ -123,3 +133,115 @@ def test_a_damaged_file_of_a_checkpoint_is_named(tmp_path, trained, name):
     with pytest.raises(CheckpointError, match=f"{name} holds no weights") as caught:
         run(small_ppo(total_frames=1_024), tmp_path / "run", resume=True)
     assert "\n" not in str(caught.value)
+
+
+# What a description asks for is never made before the weights are seen to hold it.
+
+HUGE = [
+    ("config", "hidden", [20_000, 20_000]),
+    ("config", "hidden", [1] * 100_000),
+    ("config", "cnn_features", 60_000),
+    ("config", "convolutions", [[60_000, 1, 1], [60_000, 1, 1]]),
+    ("shapes", "vector", 10**9),
+    ("shapes", "actions", 10**12),
+    ("shapes", "pixels", [3, 10**6, 10**6]),
+]
+
+
+@pytest.fixture
+def only_shapes(monkeypatch):
+    """Networks may be described, and not made."""
+
+    def make_policy(shapes, config):
+        assert torch.empty(1).device.type == "meta", "a network was made"
+        return networks.make_policy(shapes, config)
+
+    monkeypatch.setattr(checkpoint, "make_policy", make_policy)
+    monkeypatch.setattr(learner, "make_policy", make_policy)
+
+
+def edited(path, group, name, value):
+    values = json.loads(path.read_text())
+    (values if group is None else values[group])[name] = value
+    path.write_text(json.dumps(values))
+
+
+@pytest.mark.parametrize(("group", "name", "value"), HUGE)
+def test_a_description_of_a_huge_network_is_refused_before_it_is_made(
+    tmp_path, trained, only_shapes, group, name, value
+):
+    shutil.copytree(trained / "ppo", tmp_path / "run")
+    path = checkpoint_of(tmp_path / "run")
+    edited(path / "checkpoint.json", group, name, value)
+    images = name in ("cnn_features", "convolutions")
+    if images:
+        edited(path / "checkpoint.json", "shapes", "pixels", [1, 80, 80])
+    found = Checkpoint.open(path)
+    with pytest.raises(CheckpointError, match="does not fit the network"):
+        found.policy()
+    if group == "config" and not images:
+        edited(tmp_path / "run" / "config.json", None, name, value)
+        with pytest.raises(CheckpointError, match="does not fit the network"):
+            config = config_from_dict(
+                json.loads((tmp_path / "run" / "config.json").read_text())
+            )
+            run(config.replace(total_frames=9_999), tmp_path / "run", resume=True)
+
+
+@pytest.mark.parametrize(("group", "name", "value"), HUGE)
+def test_a_card_of_a_huge_network_is_refused_before_it_is_made(
+    tmp_path, only_shapes, group, name, value
+):
+    for path in pretrained.DIRECTORY.glob("navigator_image.*"):
+        shutil.copy(path, tmp_path)
+    edited(tmp_path / "navigator_image.json", group, name, value)
+    if name in ("cnn_features", "convolutions"):
+        edited(tmp_path / "navigator_image.json", "shapes", "pixels", [1, 80, 80])
+    with pytest.raises(CheckpointError, match="does not fit the network"):
+        pretrained.read_pretrained(tmp_path / "navigator_image.safetensors")
+
+
+class Makes:
+    """A pickle that makes what a function returns."""
+
+    def __init__(self, function, *arguments):
+        self.made = function, arguments
+
+    def __reduce__(self):
+        return self.made
+
+
+def as_file(state, packing=zipfile.ZIP_STORED):
+    """A file of `torch.save` with another packing."""
+    stream, packed = io.BytesIO(), io.BytesIO()
+    torch.save(state, stream)
+    with zipfile.ZipFile(stream) as old, zipfile.ZipFile(packed, "w", packing) as new:
+        for one in old.infolist():
+            new.writestr(one.filename, old.read(one))
+    return packed.getvalue()
+
+
+# What a file holds, and what is said of it.
+FILES = {
+    "entries are larger": lambda: as_file(
+        {"a": torch.zeros(10**6)}, zipfile.ZIP_DEFLATED
+    ),
+    "names .*bytearray": lambda: as_file({"a": Makes(bytearray, 10**9)}),
+    "names .*torch Tensor": lambda: as_file({"a": Makes(torch.Tensor, 10**9)}),
+    "names .*exec": lambda: as_file({"a": Makes(exec, "raise SystemExit")}),
+    "of shape .1000000000000": lambda: as_file({"a": torch.zeros(1).expand(10**12)}),
+    "not a zip": lambda: b"no archive",
+    "does not fit": lambda: as_file([torch.zeros(1)]),
+}
+
+
+@pytest.mark.parametrize("message", FILES)
+def test_weights_that_would_grow_are_refused(tmp_path, trained, message):
+    shutil.copytree(trained / "ppo", tmp_path / "run")
+    path, data = checkpoint_of(tmp_path / "run"), FILES[message]()
+    (path / "policy.pt").write_bytes(data)
+    values = json.loads((path / "checkpoint.json").read_text())
+    values["sha256"]["policy.pt"] = hashlib.sha256(data).hexdigest()
+    (path / "checkpoint.json").write_text(json.dumps(values))
+    with pytest.raises(CheckpointError, match=f"policy.pt .*{message}"):
+        Checkpoint.open(path).policy()

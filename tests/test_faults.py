@@ -107,9 +107,7 @@ def test_a_read_only_folder_is_refused_before_the_work_in_python(
         ),
         "save": lambda: episode.save(read_only / "a.npz"),
         "animate": lambda: animation.animate(episode, surface, read_only / "a.gif"),
-        "write_rrd": lambda: rerun_log.write_rrd(
-            episode, surface, read_only / "a.rrd"
-        ),
+        "write_rrd": lambda: rerun_log.write_rrd(episode, surface, read_only / "a.rrd"),
         "heatmap": lambda: heatmap.heatmap(
             np.zeros((0, 3)), np.zeros(0), surface, read_only / "a.png"
         ),

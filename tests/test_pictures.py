@@ -208,7 +208,11 @@ def test_the_frames_of_a_film_differ_where_the_device_moves(pushed, tmp_path):
         (lambda env: cathsim_dmc.fluoroscopy(env, vieww=1), TypeError, "vieww.*view"),
         (lambda env: cathsim_dmc.show(env, foo=1), TypeError, "foo.*views"),
         (lambda env: cathsim_dmc.record(env, "push", "e.avi"), ValueError, "rrd, .npz"),
-        (lambda env: cathsim_dmc.record(env, "push", "no/e.gif"), OSError, "no directory"),
+        (
+            lambda env: cathsim_dmc.record(env, "push", "no/e.gif"),
+            OSError,
+            "no directory",
+        ),
         (lambda env: cathsim_dmc.show(env, views=("top",)), ValueError, "front"),
         (
             lambda env: cathsim_dmc.show(env, views=[], fluoroscopy=0),

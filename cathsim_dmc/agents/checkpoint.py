@@ -2,9 +2,12 @@
 
 import hashlib
 import io
+import itertools
 import json
+import pickletools
 import re
 import shutil
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -13,6 +16,7 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictSequential
+from torch.utils._pytree import tree_leaves
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.config import TrainingConfig
@@ -25,6 +29,11 @@ _DIRECTORY = "checkpoints"
 _DESCRIPTION = "checkpoint.json"
 _POLICY = "policy.pt"
 _LEARNING = "learning.pt"
+_OTHER_NETWORK = "does not fit the network described beside it"
+_WRONG = ValueError, TypeError, AttributeError, RuntimeError, OSError
+# What a pickle of tensors, numbers and texts names.
+_GLOBALS = {"torch._utils _rebuild_tensor_v2", "collections OrderedDict"}
+_STORAGE = re.compile(r"torch \w+Storage")
 
 
 class CheckpointError(RuntimeError):
@@ -91,13 +100,60 @@ class Checkpoint:
         file = self.path / _POLICY
         return policy_of(file, self.policy_state(), self.shapes, self.config)
 
+    def require_sizes(self) -> None:
+        """CheckpointError unless the files hold networks of the sizes in the config.
+
+        Called before networks are made to continue from it.
+        """
+        file = self.path / _POLICY
+        with files.refused(CheckpointError, f"{file} {_OTHER_NETWORK}", *_WRONG):
+            _require_sizes(self.policy_state(), self.shapes, self.config)
+            # Of images a critic alone has hidden layers, in the other file.
+            widths = self.config.hidden
+            least = 4 * sum(a * b for a, b in itertools.pairwise(widths))
+            sizes = [(self.path / name).stat().st_size for name in self.sha256]
+            if least > sum(sizes):
+                raise ValueError(f"hidden is {list(widths)}, larger than its files")
+
     def _load(self, name: str) -> dict[str, Any]:
         path = self.path / name
         data = read_bytes(path, self.sha256[name])
         # torch's reader of weights fails in many ways.
         with files.refused(CheckpointError, f"{path} holds no weights", Exception):
             # weights_only: a checkpoint from elsewhere must not be able to run code.
-            return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+            _require_plain(data)
+            state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+            _require_stored(state)
+            return state
+
+
+def _require_plain(data: bytes) -> None:
+    """Raises ValueError unless a file of `torch.save` holds tensors, uncompressed.
+
+    Torch's reader would inflate what is compressed, and make a buffer or a tensor of
+    any size that a file names.
+    """
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if sum(one.file_size for one in archive.infolist()) > len(data):
+            raise ValueError("its entries are larger than the file")
+        (name,) = (one for one in archive.namelist() if one.endswith("/data.pkl"))
+        for operation, named, _ in pickletools.genops(archive.read(name)):
+            known = named in _GLOBALS or _STORAGE.fullmatch(str(named))
+            if operation.name == "STACK_GLOBAL" or (
+                operation.name in ("GLOBAL", "INST") and not known
+            ):
+                raise ValueError(f"it names {named!r}, which is no tensor")
+
+
+def _require_stored(state: Any) -> None:
+    """Raises ValueError if a tensor is larger than the storage that it has."""
+    for one in tree_leaves(state):
+        if isinstance(one, torch.Tensor):
+            held = one.untyped_storage().nbytes()
+            if one.numel() * one.element_size() > held:
+                raise ValueError(
+                    f"a tensor of shape {tuple(one.shape)} has {held} bytes"
+                )
 
 
 def read_bytes(path: Path, sha256: str) -> bytes:
@@ -116,11 +172,32 @@ def policy_of(
     path: Path, state: Mapping[str, Any], shapes: NetworkShapes, config: TrainingConfig
 ) -> TensorDictSequential:
     """A policy ready to act; CheckpointError if the weights are of another network."""
-    text = f"{path} does not fit the network described beside it"
-    with files.refused(CheckpointError, text, ValueError, TypeError, RuntimeError):
+    with files.refused(CheckpointError, f"{path} {_OTHER_NETWORK}", *_WRONG):
+        _require_sizes(state, shapes, config)
         policy = make_policy(shapes, config)
         policy.load_state_dict(dict(state))
     return policy.eval().requires_grad_(False)
+
+
+def _require_sizes(
+    state: Mapping[str, Any], shapes: NetworkShapes, config: TrainingConfig
+) -> None:
+    """Raises ValueError unless weights have the sizes of a network, which is not built.
+
+    The description beside the weights may ask for a network of any size.
+    """
+    if len(config.hidden) + len(config.convolutions) > len(state):
+        raise ValueError("it has fewer weights than the network has layers")
+    with torch.device("meta"):  # shapes without memory
+        wanted = make_policy(shapes, config).state_dict()
+    sizes = {name: tuple(one.shape) for name, one in wanted.items()}
+    found = {name: tuple(one.shape) for name, one in state.items()}
+    wrong = [n for n in {**sizes, **found} if sizes.get(n) != found.get(n)]
+    if wrong:
+        raise ValueError(
+            f"{wrong[0]} has the shape {found.get(wrong[0])} in the weights and "
+            f"{sizes.get(wrong[0])} in the network"
+        )
 
 
 def checkpoints_in(run: Path) -> list[Path]:

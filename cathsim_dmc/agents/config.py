@@ -32,6 +32,7 @@ TUNED_IMAGES: Mapping[str, Any] = {
     "cnn_features": 256,
 }
 _MOST = 2**62
+_MOST_WIDTH = 2**16  # of a layer, whose square is 17 GB
 
 
 class ConfigError(ValueError):
@@ -185,15 +186,17 @@ class TrainingConfig:
     training_start: tuple[float, float] | None = within(
         None, low=0.0, high=bounds.MOST_START_SHARE
     )
-    num_envs: int = positive(16)
-    num_threads: int | None = positive(None)
+    num_envs: int = positive(16, high=bounds.MOST_SIMULATIONS)
+    num_threads: int | None = positive(None, high=bounds.MOST_THREADS)
     seed: int = within(0, low=0)
     total_frames: int = positive(600_000)
-    hidden: tuple[int, ...] = positive((64, 64))
+    hidden: tuple[int, ...] = positive((64, 64), high=_MOST_WIDTH)
     activation: Literal["tanh", "relu", "elu"] = "tanh"
     subtract_background: bool = False
-    convolutions: tuple[tuple[int, int, int], ...] = positive(PUBLISHED_CONVOLUTIONS)
-    cnn_features: int = positive(512)
+    convolutions: tuple[tuple[int, int, int], ...] = positive(
+        PUBLISHED_CONVOLUTIONS, high=_MOST_WIDTH
+    )
+    cnn_features: int = positive(512, high=_MOST_WIDTH)
     learning_rate: float = positive(3e-4)
     gamma: float = positive(0.99, high=1.0)
     observation_clip: float = positive(10.0)

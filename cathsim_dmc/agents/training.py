@@ -175,6 +175,7 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
             "Resume with the run's own, or start a new run in another directory. These "
             f"may change: {sorted(config.resumable & set(vars(config)))}."
         )
+    checkpoint.require_sizes()
     return checkpoint
 
 

@@ -21,6 +21,7 @@ from cathsim_dmc.anatomy.parts import End, Surface
 from cathsim_dmc.file_maps import mapped
 
 KEPT = 4_000_000_000  # bytes of all fields; a pool of 1,000 random arches has 2.6 GB
+MOST_ROOM = 1.0  # m³ around a lumen; its field has a brick for each 4 mm of it
 _NAMES = ("head", "coarse", "index", "samples")
 _DIGEST = "digest"
 _SHIPPED = Path(__file__).parent / "data"
@@ -40,7 +41,11 @@ def field_of(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Field:
     """As `Field.of`, mapped from its file in the cache if it was built before.
 
     A damaged file is built again; nothing is kept in a folder that is read-only.
+
+    Raises:
+        ValueError: if the box around the lumen is larger than `MOST_ROOM`.
     """
+    _require_size(lumen)
     shipped = shipped_path(lumen, ends)
     digest = hashlib.sha256(_name(lumen, ends).encode() + _code()).hexdigest()
     path = cache_folder() / f"{digest[:32]}{_SUFFIX}"
@@ -56,6 +61,22 @@ def field_of(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Field:
         with contextlib.suppress(OSError):
             os.utime(path)
     return field
+
+
+def _require_size(lumen: VesselTree | Surface) -> None:
+    if isinstance(lumen, Surface):
+        low, high = lumen.vertices.min(axis=0), lumen.vertices.max(axis=0)
+    else:
+        lines = [vessel.centreline for vessel in lumen.vessels.values()]
+        low = np.min([(one.points.T - one.radii).min(axis=1) for one in lines], axis=0)
+        high = np.max([(one.points.T + one.radii).max(axis=1) for one in lines], axis=0)
+    sides = high - low
+    if not sides.prod() <= MOST_ROOM:
+        size = " x ".join(f"{side:.3g}" for side in sides)
+        raise ValueError(
+            f"the lumen lies in a box of {size} m; it may have {MOST_ROOM:g} m³, so is "
+            "its unit right?"
+        )
 
 
 def shipped_path(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Path:

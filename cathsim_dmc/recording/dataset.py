@@ -9,7 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.files import atomic_directory, naming, require_folder
+from cathsim_dmc.files import (
+    atomic_directory,
+    naming,
+    require_folder,
+    require_room,
+)
 
 
 def write(
@@ -109,6 +114,8 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
         for name, value in options.items():
             if own and own.get(name) != value:
                 raise ValueError(f"its {name} is {own.get(name)!r}, not {value!r}")
+        for file in data.parent.glob("*.hdf5"):
+            check_stored(file)
         for number, episode in enumerate(minari.MinariDataset(data.parent)):
             _check_episode(episode, number)
             yield episode
@@ -117,6 +124,25 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
             TypeError, ValueError) as error:  # fmt: skip
         line = " ".join(str(error).split()) or type(error).__name__
         raise DatasetError(f"{data.parent} cannot be used: {line}") from error
+
+
+def check_stored(path: Path) -> None:
+    """Raises ValueError if an HDF5 file unpacks to far more, or names other files."""
+    import h5py
+
+    links: list[tuple[str, Any]] = []
+    with h5py.File(path) as file:
+        file.visititems_links(lambda *link: links.append(link))
+        unpacked = 0
+        for name, link in links:
+            if not isinstance(link, h5py.HardLink):
+                raise ValueError(f"{name} is a link to another place")
+            one = file[name]
+            if isinstance(one, h5py.Dataset):
+                if one.external or one.is_virtual:
+                    raise ValueError(f"{name} lies in another file")
+                unpacked += int(one.size or 0) * max(one.dtype.itemsize, 1)
+        require_room(unpacked, path.stat().st_size)
 
 
 def _check_episode(episode: Any, number: int) -> None:

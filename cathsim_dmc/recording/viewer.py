@@ -21,8 +21,11 @@ def check_recording(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no recording at {path}")
-    data = path.read_bytes()
-    if not data.startswith(_MAGIC) or not data[:_END].endswith(_FOOTER):
+    with path.open("rb") as stream:
+        begin = stream.read(len(_MAGIC))
+        stream.seek(max(path.stat().st_size - len(_FOOTER) + _END, 0))
+        end = stream.read()
+    if begin != _MAGIC or end[:_END] != _FOOTER:
         raise ValueError(
             f"{path} is not a whole Rerun recording of this version; record it again, "
             "or bring an older one up to date with `rerun rrd migrate`"

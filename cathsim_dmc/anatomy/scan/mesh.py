@@ -1,6 +1,9 @@
 """Reading a lumen's triangles from a mesh, or a label map of a segmented scan."""
 
+import bz2
+import gzip
 import io
+import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,6 +17,7 @@ from cathsim_dmc.anatomy.scan.units import to_lps
 FORMATS = {"obj": 35, "stl": 50, "ply": 12, "vtp": 12}
 _STL_TEXT = 100  # seven lines
 MOST = 4_000_000  # triangles; reading more takes gigabytes
+MOST_VOXELS = 500_000_000  # of a label map: 512 x 512 x 1,900
 LABEL_MAPS = (".nii", ".nii.gz", ".nrrd")
 BLUR = 0.7  # voxels, standard deviation that takes the steps off a surface
 _PAD = 3  # voxels around the labels
@@ -82,12 +86,15 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _announced(path: Path) -> int:
     """Triangles that a file announces, or the most its size leaves room for."""
-    with path.open("rb") as stream:
-        head = stream.read(4096)
-    said = re.search(rb'element face (\d+)|NumberOfPolys="\s*(\d+)', head)
-    if said:
-        return int(said[1] or said[2])
     kind = path.suffix.lower().lstrip(".")
+    with path.open("rb") as stream:
+        # The counts of a VTP file may stand anywhere in it.
+        head = stream.read(-1 if kind == "vtp" else 4096)
+    faces = re.findall(rb'element face (\d+)|NumberOf(?:Polys|Strips)="\s*(\d+)', head)
+    corners = re.findall(rb'element vertex (\d+)|NumberOfPoints="\s*(\d+)', head)
+    if faces or corners:
+        count, points = (sum(int(a or b) for a, b in one) for one in (faces, corners))
+        return max(count, points // 3)  # where no two triangles share a vertex
     size = path.stat().st_size
     if kind != "stl":
         return size // FORMATS[kind]
@@ -204,6 +211,36 @@ def label_surface(
     return vertices, faces.astype(np.int64), f"{taken}; unit and frame are the file's"
 
 
+def _require_few(shape: Sequence[int]) -> int:
+    """Number of voxels that a header announces; ValueError if there are too many."""
+    count = math.prod(map(int, shape))
+    if not 0 <= count <= MOST_VOXELS:
+        raise ValueError(
+            f"it announces {count / 1e6:,.0f} million voxels; at most "
+            f"{MOST_VOXELS / 1e6:,.0f} million are read: crop it to the lumen"
+        )
+    return count
+
+
+def _require_end(path: Path, count: int, encoding: str) -> None:
+    """ValueError if the packed voxels of a NRRD file go on after its last voxel.
+
+    Its reader unpacks the file to its end.
+    """
+    opened = {"gz": gzip.open, "bz": bz2.open}
+    if encoding[:2] not in opened:
+        return
+    left = 8 * count + 2**16  # bytes; no voxel has more than 8
+    with path.open("rb") as stream:
+        while stream.readline().strip():
+            pass
+        unpacked = opened[encoding[:2]](stream)
+        while left > 0 and (part := unpacked.read(2**20)):
+            left -= len(part)
+    if left <= 0:
+        raise ValueError(f"it holds more than the {count:,} voxels that it announces")
+
+
 def _nifti(path: Path):
     """Voxels, matrix (3, 3) and origin (3,) to m in LPS, names of labels."""
     import nibabel
@@ -211,6 +248,7 @@ def _nifti(path: Path):
     image: Any = nibabel.load(path)
     unit = _NIFTI_UNITS.get(image.header.get_xyzt_units()[0], 1e-3)
     affine = unit * to_lps("m", "RAS") @ image.affine[:3]
+    _require_few(image.shape)
     voxels = np.asanyarray(image.dataobj)
     shape = voxels.shape[:3] + tuple(n for n in voxels.shape[3:] if n != 1)
     return voxels.reshape(shape), affine[:, :3], affine[:, 3], {}
@@ -220,6 +258,11 @@ def _nrrd(path: Path):
     """As `_nifti`; Slicer's files name their labels."""
     import nrrd
 
+    header = nrrd.read_header(str(path))
+    if {"datafile", "data file"} & set(header):
+        raise ValueError("its voxels are in another file; save both as one .nrrd file")
+    count = _require_few(np.atleast_1d(header["sizes"]).tolist())
+    _require_end(path, count, str(header.get("encoding")))
     voxels, header = nrrd.read(str(path))
     space = str(header.get("space", "LPS")).upper()
     space = "".join(re.findall(r"\b\w", space)) if "-" in space else space
