@@ -12,7 +12,7 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan import mesh
 from cathsim_dmc.anatomy.scan.repair import mend
 from cathsim_dmc.anatomy.scan.topology import areas, merged
-from cathsim_dmc.anatomy.scan.units import UNITS, to_lps, upright
+from cathsim_dmc.anatomy.scan.units import UNITS, file_frame, to_lps, upright
 from cathsim_dmc.anatomy.surface import sampled
 
 SIZE = (15e-3, 2.0)  # m across: an intracranial segment, an aorta with arms and legs
@@ -74,7 +74,8 @@ def read_lumen(
             f"vessel tree is (allowed {SIZE[0]:g} to {SIZE[1]:g} m). Check the unit in "
             f"which the mesh was exported ({why})."
         )
-    surface, changed = mend(str(path), vertices, faces)
+    with file_frame(to_lps(units, frame, axes), units):
+        surface, changed = mend(str(path), vertices, faces)
     for text in changed:
         say(f"note: {text}")
     if surface.volume > VOLUME:

@@ -17,6 +17,9 @@ FOLD = 2.5e-3  # m, most that a vertex of a self-intersection is moved
 CUT = 16e-3  # m, widest hole that is filled where it was cut out
 END_AREA = 0.5e-6  # m^2, least area of an open end
 END = 0.55  # largest |cosine| between an end's axis and the normals around it
+# Of an open end seen from inside, in radii of its rim: how far behind the rim, and how
+# near the wall is all around, but for a share of the directions across.
+BEHIND, NEARBY, DIRECTIONS, OPEN = 0.75, 2.5, 32, 0.12
 RAGGED = 0.1  # of an end's width: rims that are less flat are cut back to a plane
 DENSE = 30_000  # triangles; more are decimated
 FEW = 12_000  # triangles that are left then
@@ -161,7 +164,8 @@ class _Work:
             area = float(np.linalg.norm(total))
             axis = total / max(area, 1e-30)
             widest = CUT if self._cut & set(map(tuple, points)) else HOLE
-            if len(loop) > 3 and area > END_AREA and self._is_end(loop, axis):
+            end = len(loop) > 3 and area > END_AREA
+            if end and self._is_end(loop, axis, wide > widest):
                 self._ends += 1
                 if self._cut_back(loop, middle, axis):
                     continue
@@ -224,14 +228,45 @@ class _Work:
         self._ragged = max(self._ragged, float(ragged))
         return True
 
-    def _is_end(self, loop: np.ndarray, axis: np.ndarray) -> bool:
-        """Whether the surface runs across the loop's plane, as a tube's does."""
+    def _is_end(self, loop: np.ndarray, axis: np.ndarray, wide: bool) -> bool:
+        """Whether a vessel ends at the loop: the wall behind it surrounds its axis.
+
+        Triangles at the rim show it where they run across its plane, but not where the
+        rim of a wide end is turned in or out. Behind a hole in the side the vessel goes
+        on both ways.
+        """
         beside = np.isin(self.faces, loop).any(axis=1)
         corners = self.vertices[self.faces[beside]]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         size = np.linalg.norm(cross, axis=1)
-        lean = np.abs(cross @ axis).sum() / max(size.sum(), 1e-30)
-        return bool(lean < END)
+        across = np.abs(cross @ axis).sum() < END * max(float(size.sum()), 1e-30)
+        if not wide:
+            return bool(across)
+        far = self._far_behind(loop, axis)
+        both_ways = far & np.roll(far, DIRECTIONS // 2)
+        return bool(far.mean() < OPEN or (across and not both_ways.any()))
+
+    def _far_behind(self, loop: np.ndarray, axis: np.ndarray) -> np.ndarray:
+        """Directions (n,) bool across the axis behind a loop without a wall near by."""
+        import igl
+
+        rim = self.vertices[loop]
+        middle = rim.mean(axis=0)
+        reach = float(np.linalg.norm(rim - middle, axis=1).mean())
+        off = self.vertices - middle
+        near = off[np.linalg.norm(off, axis=1) < NEARBY * reach]
+        back = np.sign(near.mean(axis=0) @ axis) * axis
+        # Its tolerances suit coordinates of order one.
+        vertices, faces = 1e3 * self.vertices, np.ascontiguousarray(self.faces)
+        boxes = igl.AABB()
+        boxes.init(vertices, faces)
+        angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+        rays = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        rays = rays @ np.linalg.svd(axis[None])[2][1:]
+        start = np.tile(1e3 * (middle + BEHIND * reach * back), (DIRECTIONS, 1))
+        hits = boxes.intersect_ray(vertices, faces, start, rays)
+        gaps = [min((hit[1] for hit in row), default=np.inf) for row in hits]
+        return np.array(gaps) > 1e3 * NEARBY * reach
 
     def turn_outwards(self) -> None:
         """Turn the whole surface if its normals point inwards."""

@@ -17,6 +17,7 @@ RAYS = 64
 ENCLOSED = 0.75  # share of rays that hit: the place is inside a vessel
 WALL = 0.25  # of the area: a surface of which so much is enclosed is a wall
 EDGE = 0.6  # cosine between the normals of triangles at the rim of an open end
+SOME = 500  # triangles by which a surface is first looked at
 
 
 def merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -200,20 +201,37 @@ def inner_shell(vertices: np.ndarray, *shells: np.ndarray) -> int | None:
 def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     """Faces (F,) bool of the inner surface of a wall, or None if it is no wall.
 
-    A wall with open ends is one closed surface with holes through it. Seen from its
-    inner side almost every ray meets the wall again. Faces (F, 3) are oriented alike.
+    A wall with an open end is one closed surface. Seen from its inner side almost every
+    ray meets the wall again. Faces (F, 3) are oriented alike.
     """
     import igl
 
-    if (edge_counts(faces)[1] != 2).any() or handles(faces) < 1:
-        return None  # open, or without a hole through it
+    if (edge_counts(faces)[1] != 2).any():
+        return None
     area = areas(vertices, faces)
     outward = igl.per_face_normals(vertices, faces, np.zeros(3))
     outward *= np.sign(Surface(vertices, faces).volume)
     middles = 1e3 * vertices[faces].mean(axis=1)  # its tolerances suit millimetres
-    hits = igl.ambient_occlusion(1e3 * vertices, faces, middles, outward, RAYS)
-    if area[hits > ENCLOSED].sum() < WALL * area.sum():
+
+    def enclosed(rows: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Share of the rays from some faces that hit, and whether many do of enough."""
+        places = middles[rows], outward[rows]
+        hits = igl.ambient_occlusion(1e3 * vertices, faces, *places, RAYS)
+        inside = area[rows][hits > ENCLOSED].sum()
+        return hits, bool(inside > WALL * area[rows].sum())
+
+    every = np.arange(len(faces))
+    some = np.random.default_rng(0).permutation(every)[:SOME]
+    if not enclosed(some)[1]:
         return None
+    hits, wall = enclosed(every)
+    return _inner_faces(faces, outward, area, hits) if wall else None
+
+
+def _inner_faces(
+    faces: np.ndarray, outward: np.ndarray, area: np.ndarray, hits: np.ndarray
+) -> np.ndarray:
+    """Faces (F,) bool of the side of a wall from which most rays hit it again."""
     # Parts between sharp edges are of one side.
     pairs = adjacent(faces)
     smooth = np.vecdot(outward[pairs[:, 0]], outward[pairs[:, 1]]) > EDGE
@@ -221,11 +239,16 @@ def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     share = np.bincount(label, area * hits) / np.bincount(label, area)
     size = np.bincount(label, area) / area.sum()
     inner = share > 0.6
-    if not (size[inner].sum() > 0.15 and size[~inner].sum() > 0.15):
+    if size[inner].sum() > 0.15 and size[~inner].sum() > 0.15:
+        large = inner & (size > 0.02 * size[inner].max())
+        chosen = large[label]
+    else:
         # Rounded rims: every triangle for itself, then the largest patch.
         chosen = hits > 0.5
         label = groups(len(faces), pairs[chosen[pairs].all(axis=1)])
         sizes = np.bincount(label, area * chosen)
-        return label == sizes.argmax()
-    large = inner & (size > 0.02 * size[inner].max())
-    return large[label]
+        chosen = label == sizes.argmax()
+    # The outer side is one piece: any other belongs to the inner side around it.
+    label = groups(len(faces), pairs[~chosen[pairs].any(axis=1)])
+    sizes = np.bincount(label, area * ~chosen)
+    return chosen | (label != sizes.argmax())

@@ -1,0 +1,110 @@
+"""Walls with a thickness, open ends of any rim, and where messages say that it is."""
+
+import numpy as np
+import pytest
+import trimesh
+from synthetic_scans import write_obj
+
+from cathsim_dmc.anatomy.scan.lumen import read_lumen
+from cathsim_dmc.anatomy.scan.repair import mend
+from cathsim_dmc.anatomy.scan.topology import edge_counts
+
+RADIUS, LENGTH = 6.0, 120.0  # mm, of a tube along z from 0 on
+STEP = 2.5
+CLOSED = (0.0, 0.0), (RADIUS, 0.0), (RADIUS, LENGTH), (0.0, LENGTH)
+
+
+def revolved(*corners, closed=False):
+    """Surface of a profile of corners (radius, z) that turns about z; mm."""
+    corners = [*corners, corners[0]] if closed else list(corners)
+    profile = [corners[0]]
+    for one, other in zip(corners[:-1], corners[1:], strict=True):
+        count = max(1, round(np.hypot(*np.subtract(other, one)) / STEP))
+        profile += [
+            tuple(np.add(one, np.subtract(other, one) * (k + 1) / count))
+            for k in range(count)
+        ]
+    mesh = trimesh.creation.revolve(np.array(profile), sections=20)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def mended(vertices, faces):
+    surface, notes = mend("tube", 1e-3 * np.asarray(vertices), np.asarray(faces))
+    assert set(edge_counts(surface.faces)[1]) == {2} and surface.volume > 0.0
+    return surface.volume * 1e9, " | ".join(notes)
+
+
+@pytest.mark.parametrize("left", [0.0, 0.5, 1.5, -1.0], ids="{:g} mm".format)
+def test_an_end_that_kept_a_rim_of_its_cap_is_an_end(left):
+    """The triangles at the rim lie in its plane, as those around a hole do."""
+    corners = [(RADIUS, 0.0), (RADIUS, LENGTH), (0.0, LENGTH)]
+    if left:
+        corners.insert(0, (RADIUS - left, 0.0))
+    volume, notes = mended(*revolved(*corners))
+    assert "1 open vessel ends capped" in notes
+    assert volume == pytest.approx(np.pi * RADIUS**2 * LENGTH, rel=0.03)
+
+
+@pytest.mark.parametrize("wide", [9.5, 12.0, 16.0], ids="{:g} mm".format)
+def test_a_hole_in_the_side_is_no_end(wide):
+    vertices, faces = revolved(*CLOSED)
+    middles = vertices[faces].mean(axis=1)
+    gone = np.linalg.norm(middles - (RADIUS, 0.0, 70.0), axis=1) < 0.5 * wide
+    with pytest.raises(ValueError, match="mm wide in the side of a vessel"):
+        mended(vertices, faces[~gone])
+
+
+def wall(*, ends=2, patch=False):
+    """A bent tube of 5 mm inner radius with a wall, open at one end or both (mm)."""
+    thick, length = 0.8, 40.0 * np.pi
+    outer, inner = 5.0 + thick, length - (thick if ends == 1 else 0.0)
+    corners = [(5.0, 0.0), (outer, 0.0), (outer, length)]
+    if ends == 1:
+        corners += [(0.0, length), (0.0, inner), (5.0, inner)]
+        vertices, faces = revolved(*corners[1:4])
+        more, others = revolved(*corners[4:], *corners[:2])
+        faces = np.concatenate([faces, others + len(vertices)])
+        vertices = np.concatenate([vertices, more])
+    else:
+        vertices, faces = revolved(*corners, (5.0, length), closed=True)
+    if patch:
+        # A spike that stands up from a triangle of the inner side.
+        middles = vertices[faces].mean(axis=1)
+        face = int(np.linalg.norm(middles - (-5.0, 0.0, 60.0), axis=1).argmin())
+        a, b, c = faces[face]
+        top = middles[face] * (0.8, 0.8, 1.0)
+        count = len(vertices)
+        vertices = np.concatenate([vertices, top[None]])
+        more = [(a, b, count), (b, c, count), (c, a, count)]
+        faces = np.concatenate([np.delete(faces, face, axis=0), more])
+    x, y, angle = (vertices / (1.0, 1.0, 40.0)).T
+    return np.stack([(40 + x) * np.cos(angle), y, (40 + x) * np.sin(angle)], 1), faces
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"ends": 1}, {"patch": True}], ids=["open", "one open", "patch"]
+)
+def test_the_lumen_of_a_wall_is_its_inner_side(options):
+    """Open at one end only, or with a small patch among large triangles inside."""
+    vertices, faces = wall(**options)
+    volume, notes = mended(vertices, faces)
+    assert "thick wall: its inner surface taken" in notes
+    assert "holes" not in notes
+    assert volume == pytest.approx(np.pi * 5.0**2 * 40 * np.pi, rel=0.04)
+
+
+def test_places_of_mending_are_those_of_the_file(tmp_path):
+    """A hole is told in the unit and frame in which the file has it."""
+    vertices, faces = revolved(*CLOSED)
+    middles = vertices[faces].mean(axis=1)
+    gone = np.linalg.norm(middles - (RADIUS, 0.0, 70.0), axis=1) < 6.0
+    path = write_obj(tmp_path / "hole.obj", 0.1 * vertices, faces[~gone])
+    with pytest.raises(
+        ValueError, match=r"vessel at \(-?0\.[456], -?0\.0, [67]\.\d\) cm"
+    ):
+        read_lumen(path, frame="RAS")
+    few = np.linalg.norm(middles - (RADIUS, 0.0, 70.0), axis=1) < 2.0
+    path = write_obj(tmp_path / "few.obj", 0.1 * vertices, faces[~few])
+    notes = read_lumen(path, frame="RAS", axes="ILA").notes
+    (filled,) = (note for note in notes if "holes filled" in note)
+    assert filled.endswith(" cm")
