@@ -3,14 +3,14 @@
 `gymnasium.make("cathsim_dmc.gym:cathsim/type1_bca-v0")` imports it by itself.
 """
 
+from cathsim_dmc import extras, suite
+
 try:
     import gymnasium
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
-        "gymnasium is not installed; `pip install 'cathsim-dmc[gym]'` adds it"
+        f"gymnasium is not installed; {extras.adding('gym')}"
     ) from error
-
-from cathsim_dmc import suite
 
 VERSION = 0  # the same as in simulation.gymnasium, which is imported late
 # Ids with the names of their tasks.

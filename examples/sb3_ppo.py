@@ -1,6 +1,6 @@
 """PPO of Stable-Baselines3, evaluated and recorded as the package's own policies are.
 
-    pip install "cathsim-dmc[gym]" stable-baselines3
+    pip install -c constraints.txt -e '.[gym]' stable-baselines3
     python examples/sb3_ppo.py --frames 150000 --out runs/sb3
     python examples/sb3_ppo.py --policy examples/sb3_ppo.safetensors --out runs/shipped
 

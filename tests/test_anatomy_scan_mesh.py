@@ -70,7 +70,7 @@ def test_damaged_vtp_files(tmp_path):
 
 def test_without_vtk_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "vtkmodules", None)
-    with pytest.raises(ValueError, match=r"needs vtk.*install 'cathsim-dmc\[vtp\]"):
+    with pytest.raises(ValueError, match=r"needs vtk.*pip install .*-e '\.\[vtp\]'"):
         read_triangles(DATA / "cylinder-ascii.vtp")
 
 
@@ -481,5 +481,5 @@ def test_what_is_no_label_map_is_refused(y_mesh, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="label is for label maps"):
         read_lumen(mesh, labels=(1,))
     monkeypatch.setitem(sys.modules, "nibabel", None)
-    with pytest.raises(ValueError, match=r"cathsim-dmc\[segmentation\]"):
+    with pytest.raises(ValueError, match=r"-e '\.\[segmentation\]'"):
         read_lumen(tmp_path / "image.nii")

@@ -15,7 +15,15 @@ import cathsim_dmc
 PACKAGE = Path(cathsim_dmc.__file__).parent
 NAME = "cathsim_dmc"
 
-BELOW = {"files", "file_maps", "bounds", "style", "compiled", "compiled_cache"}
+BELOW = {
+    "files",
+    "file_maps",
+    "bounds",
+    "style",
+    "extras",
+    "compiled",
+    "compiled_cache",
+}
 _TASK = {"anatomy", "collision", "imaging", "entities", "physics", "tasks"}
 _FACE = _TASK | {"suite", "simulation"}
 # Part of the package -> parts that it may import. Arrows point one way: what stands
@@ -28,6 +36,7 @@ ALLOWED = {
     "file_maps": set(),
     "bounds": set(),
     "style": set(),
+    "extras": set(),
     "compiled": {"compiled_cache"},
     "compiled_cache": set(),
     "anatomy": set(),

@@ -1,8 +1,11 @@
-"""The image task where there is no OpenGL library at all."""
+"""Images and commands where there is no OpenGL library at all."""
 
+import json
 import os
 import subprocess
 import sys
+
+import pytest
 
 CODE = """
 import sys
@@ -71,3 +74,51 @@ def test_images_need_no_opengl_library():
     assert done.returncode == 0, done.stderr
     assert "loaded: []" in done.stdout
     assert "modules: []" in done.stdout
+
+
+# PyOpenGL without the library that it is told to use.
+BROKEN = """
+import sys
+
+class Broken:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("OpenGL", "glfw"):
+            raise AttributeError("'NoneType' object has no attribute 'glGetError'")
+
+sys.meta_path.insert(0, Broken())
+sys.argv = ["cathsim", *sys.argv[1:]]
+from cathsim_dmc.cli import main
+main()
+"""
+
+
+def run_broken(backend, *arguments):
+    return subprocess.run(
+        [sys.executable, "-c", BROKEN, *arguments],
+        env={**os.environ, "MUJOCO_GL": backend},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+def test_a_command_that_draws_nothing_needs_no_opengl(backend):
+    done = run_broken(backend, "list", "--json")
+    assert done.returncode == 0, done.stderr
+    assert "type1_lcca" in json.loads(done.stdout)["tasks"]
+    (line,) = done.stderr.splitlines()
+    assert f"MUJOCO_GL={backend}" in line and "MUJOCO_GL=disable" in line
+
+
+def test_bad_input_stays_bad_input_without_opengl():
+    done = run_broken("osmesa", "eval", "no_such_policy", "--task", "type1_lcca")
+    assert done.returncode == 2, done.stderr
+    assert "no_such_policy" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_other_faults_are_not_taken_for_those_of_opengl():
+    done = run_broken("nonsense", "list")
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "MUJOCO_GL" in line and "nonsense" in line and "disable" in line

@@ -12,7 +12,7 @@ import torch
 from dm_env import specs
 from tensordict import TensorDict, TensorDictBase
 
-from cathsim_dmc import bounds, suite
+from cathsim_dmc import bounds, extras, suite
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import View
 from cathsim_dmc.policies.expert import ExpertPolicy
@@ -88,6 +88,7 @@ def record_demonstrations(
     bounds.whole("episodes", episodes, 1)
     bounds.number("noise", noise, 0.0, 1.0)
     dataset.check_free(out)
+    extras.require("gym", "gymnasium", "minari", "h5py")
     from cathsim_dmc.simulation import gymnasium
 
     names = observation if isinstance(observation, str) else list(observation)
@@ -203,7 +204,7 @@ def load_transitions(
     Raises:
         DatasetError: there is none, it is damaged, or it holds no successful episode,
             or observations or actions of other sizes.
-        ModuleNotFoundError: h5py is not installed.
+        ModuleNotFoundError: minari is not installed.
     """
     names = observations.resolve(observation)
     episodes = [_tensors(path, e, names) for e in read_episodes(path, **options)]

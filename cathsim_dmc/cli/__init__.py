@@ -1,6 +1,5 @@
 """The command `cathsim`: the module of a command is imported when it is called."""
 
-import importlib
 import os
 import sys
 from collections.abc import Callable
@@ -10,6 +9,7 @@ from tyro import conf
 from tyro.extras import SubcommandApp
 
 from cathsim_dmc import __version__
+from cathsim_dmc.cli.opengl import import_command
 from cathsim_dmc.cli.options import BAD_INPUT, INTERRUPTED
 
 _DESCRIPTION = (
@@ -63,7 +63,7 @@ def _run(arguments: list[str]) -> int:
         command: Any = _line(summary)
         if arguments[:1] == [name]:
             module, _, function = where.partition(":")
-            found = importlib.import_module(f"cathsim_dmc.cli.{module}")
+            found = import_command(f"cathsim_dmc.cli.{module}", arguments)
             command = getattr(found, function)
             if name == "train":  # its options depend on its arguments
                 command = command(arguments[1:])

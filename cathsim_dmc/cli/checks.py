@@ -51,7 +51,8 @@ def _versions(name: str) -> list[Finding]:
     try:
         required, own = metadata.requires(name) or (), metadata.version(name)
     except metadata.PackageNotFoundError:
-        return [Finding(name, "not installed", False, f"pip install {name}")]
+        advice = "in its checkout: pip install -c constraints.txt -e ."
+        return [Finding(name, "not installed", False, advice)]
     found = [Finding(name, own)]
     for one in map(Requirement, required):
         if one.marker is not None and not one.marker.evaluate({"extra": ""}):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import files
+from cathsim_dmc import extras, files
 from cathsim_dmc.recording.sequences import DEVICE, DEVICE_KEYPOINTS, OSTIA, VESSEL
 
 _CLASSES = (("device", DEVICE, DEVICE_KEYPOINTS), ("vessel", VESSEL, OSTIA))
@@ -66,6 +66,7 @@ def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[An
         number: Of the file in its split; ids are unique with it.
         pictures: Whether to write the images as PNG, into a folder beside the file.
     """
+    extras.require("gym", "h5py")
     import h5py
     from PIL import Image
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc import extras
 from cathsim_dmc.files import (
     atomic_directory,
     naming,
@@ -50,6 +51,7 @@ def write(
     """
     path = Path(path)
     check_free(path)
+    extras.require("gym", "minari")
     import minari
     from minari.dataset.minari_storage import MinariStorage
 
@@ -97,6 +99,7 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
         DatasetError: there is none, or it is damaged, or recorded with other options.
         ModuleNotFoundError: minari is not installed.
     """
+    extras.require("gym", "minari")
     import minari
 
     data = next(Path(path).glob("data"), Path(path)) / "metadata.json"

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import __version__, bounds, files
+from cathsim_dmc import __version__, bounds, extras, files
 from cathsim_dmc.recording import coco, sequences
 from cathsim_dmc.recording.sequences import KEYPOINTS, KITS, ImageSetOptions
 
@@ -78,7 +78,7 @@ def write(
         OSError: if the directory around `out` does not exist, or `out` is read-only.
         ModuleNotFoundError: if h5py is not installed.
     """
-    import h5py  # noqa: F401  # Now: hours later it would be missed.
+    extras.require("gym", "h5py")  # now: hours later it would be missed
 
     out, options = Path(out), options or ImageSetOptions()
     count = os.cpu_count() or 1

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc import extras
 from cathsim_dmc.anatomy.scan.units import to_lps
 
 # Endings, and the least bytes that a triangle takes where no header counts them.
@@ -37,7 +38,7 @@ def _parsed(path: Path, kind: str, read: Callable[[Path], Any], extra: str) -> A
         return read(path)
     except ImportError as error:
         raise ValueError(
-            f"{path} needs {error.name}: pip install 'cathsim-dmc[{extra}]'."
+            f"{path} needs {error.name}: {extras.adding(extra)}."
         ) from error
     except Exception as error:  # readers raise whatever their format leads to
         said = re.sub(r"\s+", " ", str(error)).strip()[:150] or type(error).__name__
