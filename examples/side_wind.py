@@ -7,37 +7,43 @@ compiled, in the composer environment and in batches alike.
 """
 
 import argparse
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cathsim_dmc import suite
+from cathsim_dmc.laws.parameters import Array
 from cathsim_dmc.physics.effects import Effect
+
+
+class Wind(NamedTuple):
+    """What the law reads, of one simulation."""
+
+    force_per_length: Any = Array(3)  # N/m, world frame
+    lengths: Any = Array("links")  # m
 
 
 class SideWind(Effect):
     """The same force per length on every link."""
 
+    parameters = Wind
+
     def __init__(self, force_per_length):
         """Takes (3,), N/m, world frame."""
         self._wind = np.asarray(force_per_length, dtype=float)
 
-    def num_parameters(self, chain):
-        """The wind, the first link's number among the bodies, lengths of the links."""
-        return 4 + len(chain.links)
-
     def restart(self, index, episode, random_state):
-        """Tells the compiled function what to do in one simulation."""
-        links, lengths = self.world.index.links, self.world.chain.link_lengths
-        self.world.parameters[index] = [*self._wind, links.start, *lengths]
+        """Writes the parameters of one simulation."""
+        self.world.parameters.force_per_length[index] = self._wind
+        self.world.parameters.lengths[index] = self.world.chain.link_lengths
 
     @staticmethod
-    def forces(parameters, time, bodies):
+    def law(wind, time, links):
         """Adds the force on each link; compiled, called in every physics step."""
-        first = int(parameters[3])
-        for link in range(len(parameters) - 4):
+        for link in range(len(wind.lengths)):
             for axis in range(3):
-                force = parameters[4 + link] * parameters[axis]
-                bodies.xfrc_applied[first + link, axis] += force
+                force = wind.lengths[link] * wind.force_per_length[axis]
+                links.xfrc_applied[link, axis] += force
 
 
 def main():

@@ -206,14 +206,14 @@ def test_callbacks_that_were_removed_are_put_back_or_missed():
 @pytest.mark.parametrize("place", [100, 10**8, -(10**8)])
 def test_an_index_beyond_the_bodies_is_an_error_and_writes_nothing(windy, place):
     class Astray(SideWind):
-        def restart(self, index, episode, random_state):
-            super().restart(index, episode, random_state)
-            self.world.parameters[index, 3] = place
+        @staticmethod
+        def law(wind, time, links):
+            links.xfrc_applied[place, 0] = 1.0
 
     task = twin(windy("simple1_bca"), effects=[Astray(WIND)])
     environment = suite.environment(task)
     environment.reset()
-    with pytest.raises(RuntimeError, match=r"SideWind\.forces.*an index beyond"):
+    with pytest.raises(RuntimeError, match=r"law of .*Astray.*an index beyond"):
         environment.step(np.zeros(21))
     batch = BatchSimulation(twin(task), 2, num_threads=2)
     batch.reset()
@@ -223,19 +223,33 @@ def test_an_index_beyond_the_bodies_is_an_error_and_writes_nothing(windy, place)
 
 _CHAIN = """
 import ctypes, mujoco, sys
-from cathsim_dmc.physics import callbacks
+from cathsim_dmc.physics import dispatcher
 calls = []
 def before(model, data):
     calls.append(data)
 kind = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 before_c = kind(before)
 mujoco.set_mjcb_control(before if "python" in sys.argv else before_c)
-callbacks.install(lambda parameters, time, bodies: None)
+dispatcher.stand()
 model = mujoco.MjModel.from_xml_string("<mujoco/>")
 data = mujoco.MjData(model)
 calls.clear()
 mujoco.mj_step(model, data)
 assert calls == [data._address]
+own = mujoco.get_mjcb_control()
+mujoco.set_mjcb_control(before_c)  # which removes all that stood there
+dispatcher.stand()
+calls.clear()
+mujoco.mj_step(model, data)
+assert calls == [data._address]
+assert mujoco.get_mjcb_control() is not before_c
+def after(model, data):
+    own(model, data)
+after_c = kind(after)
+mujoco.set_mjcb_control(after_c)  # which calls what stood there
+dispatcher.stand()
+standing = ctypes.cast(mujoco.get_mjcb_control(), ctypes.c_void_p).value
+assert standing == ctypes.cast(after_c, ctypes.c_void_p).value
 """
 
 
@@ -253,13 +267,13 @@ def test_what_stood_in_mujoco_before_is_still_called(kind):
 def test_what_is_no_effect_is_refused(windy):
     with pytest.raises(ValueError, match=r"effects.*physics\.effects\.Effect"):
         suite.make_task("simple1_bca", effects=[3])
-    idle = SideWind(WIND)
-    idle.num_parameters = lambda chain: 0
-    with pytest.raises(ValueError, match="SideWind has forces.*would not be called"):
-        suite.load("cathsim", "simple1_bca", {"effects": [idle]})
+    lost = SideWind(WIND)
+    lost.acts_in = "actuators"
+    with pytest.raises(ValueError, match="SideWind.acts_in.*passive, control, contact"):
+        suite.load("cathsim", "simple1_bca", {"effects": [lost]})
     silent = suite.environment(windy("simple1_bca"))
     silent.reset()
-    silent.task.rollout._effects[-2].act = lambda action, state: None
+    silent.task.rollout.effects[-2].act = lambda action, state: None
     with pytest.raises(ValueError, match="act of SideWind returns None"):
         silent.step(np.zeros(21))
     with pytest.raises(ValueError, match="build it with the same configuration"):

@@ -112,8 +112,7 @@ def test_a_wall_that_moves_past_the_sheath_does_not_touch_what_is_in_it(tube):
     model, found = spec.compile(), []
     for sheath in (-1, 1):
         course = motion.parameters(5.5e-3, 0.0, 0.0)
-        course[10] = sheath
-        data = motion.begin(model, course)
+        data = motion.begin(model, course, sheath)
         data.time = 1.35
         mujoco.mj_fwdPosition(model, data)
         found.append(data.ncon)

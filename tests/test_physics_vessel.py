@@ -9,9 +9,9 @@ from conftest import twin
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.circulation import Circulation
+from cathsim_dmc.laws.compliance import Material, stiffness
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY
 from cathsim_dmc.physics.vessel import VesselOptions
-from cathsim_dmc.physics.wall import stiffness
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import vessel
 
@@ -63,7 +63,7 @@ def test_blood_drags_along_a_pair_by_the_radii_of_its_links_now():
     action = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
     for _ in range(20):
         batch.step(action)
-    flow = batch.rollout._effects[0]
+    flow = batch.rollout.effects[0]
     geoms = flow.world.index.geoms
     radii = batch.batch.expand("geom_size")[:, geoms, 0].copy()
     batch.step(action)
@@ -71,7 +71,7 @@ def test_blood_drags_along_a_pair_by_the_radii_of_its_links_now():
     assert (inside & (radii[0] < radii[1])).sum() > 2
     gap = np.maximum(flow.radius[inside] / radii[inside], 1.2)
     expected = 2 * np.pi * BLOOD_VISCOSITY / np.log(gap)
-    np.testing.assert_allclose(flow._links[inside][:, 4], expected)
+    np.testing.assert_allclose(flow.world.parameters.friction[inside], expected)
 
 
 @pytest.mark.parametrize("access", ["ascending", "descending"])
@@ -122,7 +122,8 @@ def test_a_cantilever_in_a_cross_flow_bends_like_the_elastica():
 def test_what_is_drawn_and_shown_of_the_heart(living):
     batch = BatchSimulation(twin(living), 6, seeds=0)
     batch.reset()
-    inflow, rate, phase = batch.batch.userdata[:, 6:9].T
+    blood = batch.rollout.effects[0].world.parameters
+    inflow, rate, phase = (each.copy() for each in blood[2:5])
     assert np.ptp(rate) > 0.1 and np.ptp(phase) > 0.3 and np.ptp(inflow) > 0
     step = batch.step(np.zeros((6, 21)))
     shown = step.info()["heart_phase"]
@@ -134,7 +135,7 @@ def test_what_is_drawn_and_shown_of_the_heart(living):
 def test_force_rises_with_the_depth_as_the_formula_says(kind):
     places = 2 if kind == "capsule" else 1
     for radius, modulus in zip(vessel.RADII, vessel.MODULI, strict=True):
-        expected = places * stiffness(radius, modulus, 1.5e-3, 1.0)
+        expected = places * stiffness(radius, Material(modulus, 1.5e-3, 1.0))
         loads = expected * np.array([2e-4, 6e-4])
         slope = np.ptp(loads) / np.ptp(vessel.indentation(kind, radius, modulus, loads))
         assert slope == pytest.approx(expected, rel=vessel.SLOPE_BOUND / 100)
@@ -142,11 +143,11 @@ def test_force_rises_with_the_depth_as_the_formula_says(kind):
 
 def test_stiffness_lies_between_the_limits_of_a_silicone_tube():
     # Derived: an ovalising line load of 1.5e-2 N/mm per mm at 4.4 mm, over R √(R/t).
-    free, held = (stiffness(4.4e-3, 0.52e6, 1.5e-3, s) for s in (0.0, 1.0))
+    free, held = (stiffness(4.4e-3, Material(0.52e6, 1.5e-3, s)) for s in (0.0, 1.0))
     assert free == pytest.approx(1.5e4 * 4.4e-3 * np.sqrt(4.4 / 1.5), rel=0.05)
     assert held > free
     # An aorta yields by about 0.6 mm under 0.1 N.
-    aorta = stiffness(0.014, 0.45e6, 1.4e-3, 1.0)
+    aorta = stiffness(0.014, Material(0.45e6, 1.4e-3, 1.0))
     assert 0.1 / aorta == pytest.approx(0.6e-3, rel=0.05)
 
 

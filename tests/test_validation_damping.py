@@ -31,7 +31,7 @@ def test_drag_is_that_of_the_correlation_against_the_velocity_of_the_blood():
     model, data, rng = rig.model, rig.data, np.random.default_rng(1)
     data.qpos[:], data.qvel[:] = rng.normal(0, 0.1, (2, model.nv))
     flow = np.array([0.3, -0.2, 0.5])
-    blood.velocity[0] = flow
+    blood.world.parameters.velocity[0] = flow
     mujoco.mj_forward(model, data)
     found = data.qfrc_passive - data.qfrc_spring - data.qfrc_damper
     expected = np.zeros(model.nv)
@@ -52,7 +52,7 @@ def test_blood_is_still_in_every_simulation_of_a_task():
     options = {"randomisation": {"viscosity": (0.5, 2.0)}}
     batch = BatchSimulation(suite.make_task("simple1_bca", **options), 2, seeds=0)
     batch.reset()
-    user = batch.batch.userdata[:, 2:]
-    one, two = user[:, 2] / BLOOD_VISCOSITY
+    blood = batch.rollout.effects[0].world.parameters
+    one, two = blood.viscosity / BLOOD_VISCOSITY
     assert 0.5 <= min(one, two) < max(one, two) <= 2.0
-    assert not user[:, 4:-1].any()
+    assert not any(each.any() for each in blood[2:])

@@ -26,6 +26,7 @@ from cathsim_dmc.collision.native import (
     numbers,
     word,
 )
+from cathsim_dmc.collision.own import BORE, MOTION, motion_of
 from cathsim_dmc.collision.places import along, away, clearance, touches
 from cathsim_dmc.collision.table import (
     MOTION_ENTRY,
@@ -34,7 +35,6 @@ from cathsim_dmc.collision.table import (
     SYMBOL,
     entry_of,
     key_of,
-    motion_of,
     sheathed,
 )
 from cathsim_dmc.compiled import compiled
@@ -51,10 +51,12 @@ def in_motion(model, data, contacts, geoms, entry, pose, half, closed, margin, l
     local, axis = pose
     limit = radius + margin + near
     time, lattice = data_field(data, "time"), numbers(word(entry + MOTION_ENTRY))
-    parameters = data_field(data, "userdata")[motion_of(model, data) :]
+    layout = motion_of(model, data)
+    # `courses` has its first parameter at 1.
+    parameters = data_field(data, "userdata")[word(layout + MOTION) - 1 :]
     # The sheath lies where it does, whatever moves past it.
     centre = data_field(data, "geom_xpos")[geoms[0]]
-    if sheathed(model, data, int(parameters[10]), centre):
+    if sheathed(model, data, word(layout + BORE), centre):
         if clearance(entry, local[0], local[1], local[2]) >= FREE:
             return 0
     scratch = np.empty(WARP + 4 * VALUES)

@@ -262,6 +262,7 @@ def _array(kind: Any) -> Any:
 
 
 numbers, wholes, shorts = map(_array, (types.float64, types.int32, types.int16))
+longs = _array(types.int64)
 
 
 def _call(builder, values, result, variadic=False):

@@ -1,36 +1,78 @@
-"""Which models of the process are built by this package, for compiled functions.
+"""Which simulations of the process have effects of this package.
 
 MuJoCo calls its callbacks for every model of a process. The last number of `userdata`
-of a simulation with effects is `OWN`; nothing else of a model is read before that is.
+of a simulation with effects is the label of its layout, which stands in a table of the
+process with the sizes of its model. Nothing else of a model is read before label and
+sizes agree; every place beyond them is one of the layout's, none the simulation's.
 """
 
 import numpy as np
 
-from cathsim_dmc.collision.native import data_field, model_field
+from cathsim_dmc.collision.native import (
+    address_of,
+    data_field,
+    model_field,
+    numbers,
+    symbol,
+    word,
+)
 from cathsim_dmc.compiled import compiled
 
-OWN = 0.7389056098930650
+# Words of a layout. Its label, a float64 in [1, 2), and the sizes of its models:
+SIZES = ("nuserdata", "nbody", "nq", "nv", "njnt", "ngeom")
+# Addresses of the lists of laws of each callback: their number, then of each the
+# adapter and the place of its parameters in `userdata`.
+PASSIVE, CONTROL = 56, 64  # bytes from the layout
+# First link among the bodies, number of links and of joints (pairs of hinges); address
+# of the links' geoms, then of joints, positions and degrees of freedom of the hinges.
+LINK, LINKS, JOINTS, PLACES = range(72, 104, 8)
+# Geoms of wall and bore of the sheath, and place of the motion's parameters in
+# `userdata`; -1 for none.
+WALL, BORE, MOTION = 104, 112, 120
+# 1 + place of the parameters of a law that has raised an error, 0 for none.
+FAULT = 128
+WORDS, CAPACITY, SPAN = 17, 1 << 12, 1 << 52
+SYMBOL = "cathsim_layouts"
+# Before anything that knows it by the symbol is loaded.
+TABLE = symbol(SYMBOL, WORDS * CAPACITY).reshape(CAPACITY, WORDS)
 
 
 @compiled
-def owned(model, data):
-    """Whether a simulation is one of this package's that has begun an episode."""
-    count = model_field(model, "nuserdata")
-    return count > 0 and data_field(data, "userdata")[count - 1] == OWN
+def _agrees(model, layout):
+    """Whether a model has the sizes of a layout."""
+    return (
+        model_field(model, "nuserdata") == word(layout + 8)
+        and model_field(model, "nbody") == word(layout + 16)
+        and model_field(model, "nq") == word(layout + 24)
+        and model_field(model, "nv") == word(layout + 32)
+        and model_field(model, "njnt") == word(layout + 40)
+        and model_field(model, "ngeom") == word(layout + 48)
+    )
 
 
 @compiled
-def parameters_of(model, data, mark):
-    """Place in `userdata` of the parameters of the effect with a mark; 0 for none."""
-    if not owned(model, data):
+def layout_of(model, data):
+    """Address of the layout of a simulation; 0 for one of another package."""
+    count = np.int64(model_field(model, "nuserdata"))
+    if count < 1:
         return np.int64(0)
-    last = np.int64(model_field(model, "nuserdata")) - 1
-    user, start = data_field(data, "userdata"), np.int64(0)
-    while start + 2 < last:
-        size = user[start + 1]
-        if not 0.0 < size <= last - start - 2:
+    label = data_field(data, "userdata")[count - 1]
+    if not 1.0 <= label < 2.0:
+        return np.int64(0)
+    table, slot = address_of(SYMBOL), np.int64((label - 1.0) * SPAN) % CAPACITY
+    for _ in range(CAPACITY):
+        layout = table + 8 * WORDS * slot
+        found = numbers(layout)[0]
+        if found == label:
+            return layout if _agrees(model, layout) else np.int64(0)
+        if found == 0.0:
             return np.int64(0)
-        if user[start + 2] == mark:
-            return start + 2
-        start += 2 + np.int64(size)
+        slot = (slot + 1) % CAPACITY
     return np.int64(0)
+
+
+@compiled
+def motion_of(model, data):
+    """Layout of a simulation whose vessel moves; 0 where it rests."""
+    layout = layout_of(model, data)
+    return layout if layout != 0 and word(layout + MOTION) >= 0 else np.int64(0)

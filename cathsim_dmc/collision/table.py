@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from cathsim_dmc.anatomy.motion_loops import MARK as MOTION
 from cathsim_dmc.collision.native import data_field, model_field, numbers, symbol, word
-from cathsim_dmc.collision.own import parameters_of
 from cathsim_dmc.compiled import compiled
 
 # Words in the head of the table: the functions that stood in MuJoCo's collision table,
@@ -51,12 +49,6 @@ def key_of(model, geom):
         return np.int64(0)
     key = (np.int64(user[1]) * PART + np.int64(user[2])) * PART
     return key + np.int64(user[3])
-
-
-@compiled
-def motion_of(model, data):
-    """Place in `userdata` of the parameters of a simulation's motion; 0 for none."""
-    return parameters_of(model, data, MOTION)
 
 
 @compiled

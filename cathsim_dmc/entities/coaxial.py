@@ -5,7 +5,7 @@ device k ends `gap_k` before the end of the chain. Directions across the chain a
 complex numbers x + iy in frames that do not twist along it: a joint bent by a small
 `bend_y` about y and `bend_x` about x leads towards bend_y - i bend_x, and a rotation by
 φ about the device multiplies by exp(iφ). The frames of the links twist, because two
-hinges do (`hinge_loops.bent`).
+hinges do (`laws.hinges.bent`).
 """
 
 import itertools

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cathsim_dmc.compiled import compiled
-from cathsim_dmc.entities.hinge_loops import unit
+from cathsim_dmc.laws.hinges import unit
 
 # A distance beyond the end of any device, m.
 _FAR = 1e3

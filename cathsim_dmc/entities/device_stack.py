@@ -10,8 +10,8 @@ from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
 from cathsim_dmc.entities.coaxial import Stack, carried_mass, weight_density
 from cathsim_dmc.entities.contact import FRICTION, device_contact
 from cathsim_dmc.entities.device import Device
-from cathsim_dmc.entities.hinge_loops import unloaded_hinges
 from cathsim_dmc.entities.torsion import Rods
+from cathsim_dmc.laws.hinges import unloaded_hinges
 
 # Coulomb coefficient between a device and the lined lumen around it (Lin 2020).
 LUMEN_FRICTION = 0.04
@@ -79,7 +79,8 @@ class DeviceStack(Chain):
         self.rods = Rods.of(self.devices, self.stack.nodes)
         self.start_gaps = lead * np.arange(len(self.devices), dtype=np.float64)
         overlap = self.stack.overlap(self.start_gaps)
-        rest = unloaded_hinges(overlap.rest.sum(axis=0).astype(complex))
+        rest = np.empty((len(self.stack.spans), 2))
+        unloaded_hinges(overlap.rest.sum(axis=0).astype(complex), rest)
         tip = self.stack.nodes <= self.devices[0].tip_length + 1e-9
         self.density = _density(self.devices)
         self._assemble(
@@ -89,7 +90,7 @@ class DeviceStack(Chain):
                 max(device.outer_radius for device in self.devices),
                 masses=self.stack.links(overlap, 0.0).mass.tolist(),
                 compliances=overlap.compliance.tolist(),
-                rest_angles=rest.tolist(),
+                rest_angles=[(x, y) for x, y in rest.tolist()],
                 axial_stiffness=sum(device.axial_stiffness for device in self.devices),
                 tip=int(tip.argmax()),
             ),

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.entities import coaxial_loops
 from cathsim_dmc.entities.device_stack import DeviceStack
-from cathsim_dmc.entities.hinge_loops import unloaded_hinges
+from cathsim_dmc.laws.hinges import unloaded_hinges
 from cathsim_dmc.physics.readings import ids
 
 # Fields of the model that change as the devices slide. The constants that MuJoCo
@@ -69,7 +69,8 @@ def write_still(
     if rotation is not None:
         turns += np.asarray(rotation)[:, None]
     overlap = stack.overlap(entity.start_gaps if gaps is None else gaps)
-    rest = unloaded_hinges(coaxial_loops.rest_angles(overlap.rest, turns))
+    rest = np.empty((len(stack.spans), 2))
+    unloaded_hinges(coaxial_loops.rest_angles(overlap.rest, turns), rest)
     links = stack.links(overlap, entity.friction)
     fields = tuple(getattr(model, name) for name in FIELDS)
     write(fields, places_of(model, entity), overlap, rest, links, np.ones(2))

@@ -1,9 +1,6 @@
 """Drives of the base: position servos that follow the command until their clamp slips.
 
-The actuator integrates its command to the place where the servo pulls, MuJoCo's `act`,
-with the force at which the clamp slips at most. Once in a control step `act` is set to
-where the servo, under its load, holds the base at the place that it has been told;
-where the clamp has slipped, that place is where the base stands.
+`laws.drive` has the law.
 """
 
 import types
@@ -12,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from cathsim_dmc.compiled import compiled
+from cathsim_dmc.laws import drive
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 
@@ -31,20 +28,25 @@ class Drives:
         )
         joints = model.actuator_trnid[found, 0]
         self._arrays = arrays
-        addresses = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-        self._places = np.stack([*addresses, model.actuator_actadr[found]])
         gain, spring = model.actuator_gainprm[found, 0], model.actuator_biasprm[found]
-        stiffness, limit = -spring[:, 1], model.actuator_forcerange[found, 1]
-        reach = gain / stiffness * CONTROL_TIMESTEP
-        self._constants = np.stack([gain, stiffness, -spring[:, 2], limit, reach])
+        stiffness = -spring[:, 1]
+        self._servos = drive.Servos(
+            qpos=model.jnt_qposadr[joints],
+            dof=model.jnt_dofadr[joints],
+            act=model.actuator_actadr[found],
+            gain=gain.copy(),
+            stiffness=stiffness,
+            damping=-spring[:, 2],
+            limit=model.actuator_forcerange[found, 1],
+            reach=gain / stiffness * CONTROL_TIMESTEP,
+        )
         self.slipped, self.told = np.zeros((2, len(arrays.qpos), len(found)))
 
     def hold(self, index: int) -> None:
         """Sets the command of one simulation to where its base stands."""
-        qpos, _, act = self._places
-        gain, stiffness = self._constants[:2]
-        place = self._arrays.qpos[index, qpos]
-        self._arrays.act[index, act] = place * stiffness / gain
+        servos = self._servos
+        place = self._arrays.qpos[index, servos.qpos]
+        self._arrays.act[index, servos.act] = place * servos.stiffness / servos.gain
         self.told[index] = place
         self.slipped[index] = 0.0
 
@@ -57,10 +59,10 @@ class Drives:
         Returns:
             Way (N, D) by which the clamps have slipped in the last one, m and rad.
         """
-        state = self._arrays.qpos, self._arrays.qvel, self._arrays.act
-        command, slip = np.ascontiguousarray(command), np.zeros_like(self.told)
-        servos = self._places, self._constants, self.told, self.slipped
-        _follow(*state, *servos, command, slip)
+        arrays, slip = self._arrays, np.zeros_like(self.told)
+        state = drive.State(arrays.qpos, arrays.qvel, arrays.act)
+        told = drive.Told(self.told, self.slipped, slip)
+        drive.follow(self._servos, state, np.ascontiguousarray(command), told)
         return slip
 
 
@@ -70,21 +72,3 @@ def hold(model: mujoco.MjModel, data: mujoco.MjData) -> Drives:
     drives = Drives(model, types.SimpleNamespace(**arrays))
     drives.hold(0)
     return drives
-
-
-@compiled
-def _follow(qpos, qvel, act, places, constants, told, slipped, command, slip):
-    """Corrects servos, of a control step to come, see `Drives.follow`."""
-    for i in range(len(qpos)):
-        for k in range(places.shape[1]):
-            gain, stiffness, damping, limit, reach = constants[:, k]
-            place = qpos[i, places[0, k]]
-            brake = damping * qvel[i, places[1, k]]
-            effort = gain * act[i, places[2, k]] - (stiffness * place + brake)
-            if abs(effort) >= limit:
-                slip[i, k] = told[i, k] - place
-                told[i, k] -= slip[i, k]
-                slipped[i, k] += abs(slip[i, k])
-                effort = min(max(effort, -limit), limit)
-            act[i, places[2, k]] = (stiffness * told[i, k] + effort + brake) / gain
-            told[i, k] += command[i, k] * reach

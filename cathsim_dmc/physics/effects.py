@@ -1,13 +1,16 @@
 """Effects on the simulation: forces, fields of the model, commands of the drives.
 
 A task lists them: `suite.make_task(name, effects=[...])`. An effect restarts with each
-episode and acts once in a control step on the arrays of all simulations; in every
-physics step acts a function that is compiled and that MuJoCo calls, `Effect.forces`.
+episode and acts once in a control step on the arrays of all simulations. In every
+physics step acts its law, a function of its parameters that is compiled and that MuJoCo
+calls through `dispatcher`. The parameters of all effects of a simulation lie one after
+the other in MuJoCo's `userdata`; its last number says by which layout.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import Any
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import mujoco
 import numpy as np
@@ -16,10 +19,8 @@ from numpy.random import RandomState
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.imaging.angiograph import Deviation
-from cathsim_dmc.physics.readings import Bodies, ModelIndex, Readings
-
-# Numbers of `userdata` before the parameters of an effect: its mark and their number.
-_HEADER = 2
+from cathsim_dmc.laws import parameters as declared
+from cathsim_dmc.physics.readings import ModelIndex, Readings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,8 +66,8 @@ class World:
             `ModelIndex.FIELDS` and of `Effect.data_fields`.
         field: Gives a field of the model that one simulation has for itself, by its
             number and MuJoCo's name, to be written.
-        parameters: (N, P) numbers of the effect's own, which the compiled function
-            reads; they are part of MuJoCo's state, and 0 when an episode begins.
+        parameters: Those of the effect's law, `Effect.parameters` of views (N, ...);
+            they are part of MuJoCo's state, and 0 when an episode begins.
     """
 
     model: mujoco.MjModel
@@ -75,12 +76,21 @@ class World:
     start_depth: float
     arrays: Any
     field: Callable[[int, str], np.ndarray]
-    parameters: np.ndarray
+    parameters: Any
 
     @property
     def num_simulations(self) -> int:
         """N."""
         return len(self.arrays.qpos)
+
+
+E = TypeVar("E", bound="Effect")
+
+
+class NoParameters(NamedTuple):
+    """Parameters of a law that has none."""
+
+    unused: Any
 
 
 class Effect:
@@ -90,20 +100,28 @@ class Effect:
         data_fields: Fields of `mujoco.MjData` that it reads, beside
             `ModelIndex.FIELDS`.
         model_fields: Fields of `mujoco.MjModel` that it writes.
-        forces: Static method with parameters (P,), time in s and `Bodies`: plain loops
-            that add to `xfrc_applied`, which numba compiles and MuJoCo calls in every
-            physics step; None for none.
+        state: Names of its attributes, arrays with a leading axis N, that are its state
+            beside parameters and fields: what an episode goes on from.
+        parameters: NamedTuple of what its law reads, see `laws.parameters`; None for
+            none.
+        law: Static method, plain loops that numba compiles and MuJoCo calls in every
+            physics step: parameters of one simulation, time in s, and in "control" the
+            `laws.device.Links`, to whose `xfrc_applied` it adds forces, in "passive"
+            the `laws.device.Device`, to whose `qfrc_passive` it adds, in "contact" a
+            `laws.device.Contact`, whose `solref` it changes. None for none.
+        acts_in: "control", "passive" or "contact".
+        adapter: Name of a function of `physics.adapters` in place of `law`.
         world: The simulations, there from `bind` on.
     """
 
     data_fields: tuple[str, ...] = ()
     model_fields: tuple[str, ...] = ()
-    forces: Callable[[np.ndarray, float, Bodies], None] | None = None
+    state: tuple[str, ...] = ()
+    parameters: Any = None
+    law: Callable[[Any, float, Any], None] | None = None
+    acts_in: str = "control"
+    adapter: str | None = None
     world: World
-
-    def num_parameters(self, chain: Chain) -> int:
-        """P, how many parameters it has; the compiled function needs one or more."""
-        return 0
 
     def bind(self, world: World) -> None:
         """Finds what it acts on; no episode has begun yet."""
@@ -134,69 +152,95 @@ class Effect:
         return action
 
 
-def userdata_size(effects: Sequence[Effect], chain: Chain) -> int:
+def _kind(effect: Effect) -> Any:
+    """Class of the parameters of an effect; None for one without."""
+    acts = effect.law is not None or effect.adapter is not None
+    return effect.parameters or (NoParameters if acts else None)
+
+
+def _sizes(chain: Chain) -> dict[str, int]:
+    """The sizes that shapes of parameters name."""
+    sizes = {"links": len(chain.links), "joints": len(chain.bends) // 2}
+    if chain.coaxial:
+        stack: Any = chain
+        sizes |= {"devices": len(stack.devices), "nodes": len(stack.stack.nodes)}
+    return sizes
+
+
+def of_kind(effects: Iterable[Effect], kind: type[E]) -> E | None:
+    """The effect of a class among some; None if there is none."""
+    return next((effect for effect in effects if isinstance(effect, kind)), None)
+
+
+def userdata_size(effects: Iterable[Effect], chain: Chain) -> int:
     """Numbers of MuJoCo's `userdata` that some effects take."""
-    counts = [effect.num_parameters(chain) for effect in effects]
-    taken = sum(_HEADER + count for count in counts if count)
-    return taken + 1 if taken else 0
+    sizes, kinds = _sizes(chain), [_kind(effect) for effect in effects]
+    found = [declared.total(kind, sizes) for kind in kinds if kind is not None]
+    return sum(found) + 1 if found else 0
 
 
-def bind(effects: Sequence[Effect], world: World) -> dict[int, float]:
-    """Gives each effect its part of the world.
+def views(kind: Any, rows: np.ndarray, sizes: Mapping[str, int]) -> Any:
+    """Parameters (N, ...) in rows (N, P), of a class."""
+    found, start = [], 0
+    for shape in declared.shapes(kind, sizes).values():
+        count = math.prod(shape)
+        found.append(rows[:, start : start + count].reshape(len(rows), *shape))
+        start += count
+    return kind(*found)
 
-    Args:
-        effects: Of one rollout only.
-        world: Simulations; its parameters are all of `userdata`.
 
-    Returns:
-        What `userdata` holds beside parameters, by place, in every episode.
+class Layout:
+    """Where the parameters of some effects lie in `userdata`.
 
-    Raises:
-        ValueError: if the scene was built for other effects.
+    Attributes:
+        effects: They.
     """
-    user, needed = world.parameters, userdata_size(effects, world.chain)
-    if user.shape[1] != needed:
-        raise ValueError(
-            f"the effects of the task take {needed} numbers of userdata, and the "
-            f"scene has room for {user.shape[1]}: build it with the same configuration"
-        )
-    from cathsim_dmc.collision.own import OWN  # late, as numba takes long
 
-    labels: dict[int, float] = {needed - 1: OWN} if needed else {}
-    start = 0
-    for effect in effects:
-        count, mark = effect.num_parameters(world.chain), 0
-        if effect.forces is not None and not count:
+    def __init__(self, effects: Sequence[Effect], world: World, places: Any = None):
+        """Gives each effect its part of the world, and has MuJoCo call the laws.
+
+        Args:
+            effects: Of one rollout only.
+            world: Simulations; its parameters are all of `userdata`, (N, n).
+            places: `dispatcher.Places` of the device; None for those of a task's scene.
+
+        Raises:
+            ValueError: if the scene was built for other effects.
+            RuntimeError: if a Python function stands in one of MuJoCo's callbacks.
+        """
+        from cathsim_dmc.physics import dispatcher  # late, as numba takes long
+
+        self.effects = tuple(effects)
+        self._user, sizes = world.parameters, _sizes(world.chain)
+        needed = userdata_size(effects, world.chain)
+        if self._user.shape[1] != needed:
             raise ValueError(
-                f"{type(effect).__name__} has forces, but num_parameters is 0, so they "
-                "would not be called; return 1 or more"
+                f"the effects of the task take {needed} numbers of userdata, and the "
+                f"scene has room for {self._user.shape[1]}: build it with the same "
+                "configuration"
             )
-        first = start + _HEADER if count else start
-        if count and effect.forces is not None:
-            from cathsim_dmc.physics import callbacks
+        laws, start = [], 0
+        for effect in effects:
+            kind, parameters = _kind(effect), None
+            if kind is not None:
+                count = declared.total(kind, sizes)
+                parameters = views(kind, self._user[:, start : start + count], sizes)
+                laws += dispatcher.laws(effect, kind, start)
+                start += count
+            effect.bind(dataclasses.replace(world, parameters=parameters))
+        places = places or dispatcher.Places.of(world.model, world.index)
+        self._callbacks = dispatcher.layout(world.model, places, laws)
+        self._stand = dispatcher.stand
 
-            mark = callbacks.install(effect.forces)
-        if count:
-            labels |= {start: mark, start + 1: count}
-        start = first + count
-        effect.bind(dataclasses.replace(world, parameters=user[:, first:start]))
-    check()
-    return labels
+    def begin(self, index: int) -> None:
+        """Has laws act on a simulation, whose `userdata` have been reset.
 
+        Raises:
+            RuntimeError: if a Python function stands in one of MuJoCo's callbacks.
+        """
+        self._stand()
+        self._user[index, -1] = self._callbacks.label
 
-def check() -> None:
-    """Puts back what somebody has removed from MuJoCo's callbacks.
-
-    Raises:
-        RuntimeError: if a Python function stands in a callback.
-    """
-    from cathsim_dmc.collision import callbacks
-
-    callbacks.restore()
-
-
-def raise_fault() -> None:
-    """Raises RuntimeError if a compiled function has raised an error in a step."""
-    from cathsim_dmc.physics import callbacks
-
-    callbacks.raise_fault()
+    def raise_fault(self) -> None:
+        """Raises RuntimeError if a law has raised an error since the last call."""
+        self._callbacks.raise_fault()

@@ -1,7 +1,7 @@
 """Blood that flows: a pulsatile flow past the links of the device.
 
 docs/vessel_model.md has the equations and their sources. The velocity at each link is
-taken once a control step where the link is, its course in time (`blood_loops.beat`) in
+taken once a control step where the link is, its course in time (`laws.blood.beat`) in
 every physics step.
 """
 
@@ -16,6 +16,7 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, carried, courses, warp
 from cathsim_dmc.compiled import compiled
+from cathsim_dmc.laws.blood import beat
 from cathsim_dmc.physics.blood import StillBlood
 from cathsim_dmc.physics.effects import Episode, World
 from cathsim_dmc.physics.motion import Moving
@@ -71,6 +72,7 @@ class Flow(StillBlood):
         radius: (N, L), of the lumen around each link, m, 0 where it is in none.
     """
 
+    state = ("_wave_speed", "radius")
     radius: np.ndarray
 
     def __init__(self, options: FlowOptions | None, moving: Moving | None = None):
@@ -84,6 +86,7 @@ class Flow(StillBlood):
         self._link_radii = np.tile(radii, (world.num_simulations, 1))
         self._circulations: dict[int, Circulation] = {}
         self._wave_speed = np.ones(world.num_simulations)
+        self.radius = np.zeros(self._link_radii.shape)
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Fills the vessels of an anatomy."""
@@ -99,8 +102,9 @@ class Flow(StillBlood):
         rate, peak, phase, speed = (
             drawn(getattr(self._options, name), random_state) for name in _LIMITS
         )
-        inflow = peak * np.pi * self._circulations[index].radius ** 2
-        self._header[index, 4:] = inflow, rate / 60.0, phase
+        blood = self.world.parameters
+        blood.peak[index] = peak * np.pi * self._circulations[index].radius ** 2
+        blood.rate[index], blood.phase[index] = rate / 60.0, phase
         self._wave_speed[index] = speed
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
@@ -112,14 +116,14 @@ class Flow(StillBlood):
             for index, radii in enumerate(self._link_radii):
                 sizes = self.world.field(index, "geom_size")
                 radii[:] = sizes[self.world.index.geoms, 0]
-        given = self._header[:, 2], self._link_radii, self._options is not None
-        _fill(found, self._wave_speed, *given, self._links)
+        flowing = self._options is not None
+        _fill(found, self._wave_speed, self._link_radii, flowing, self.world.parameters)
         return action
 
     def heart(self, index: int) -> dict[str, float]:
         """Rate (1/s) and phase of the heart and pulse wave velocity (m/s)."""
-        rate, phase = self._header[index, 5:].tolist()
-        speed = float(self._wave_speed[index])
+        blood, speed = self.world.parameters, float(self._wave_speed[index])
+        rate, phase = float(blood.rate[index]), float(blood.phase[index])
         return {"rate": rate, "phase": phase, "wave_speed": speed}
 
     def _at(self, points: np.ndarray) -> np.ndarray:
@@ -145,11 +149,11 @@ class Flow(StillBlood):
         found = self._at(state.head[:, None])[:, 0]
         if self._options is None:
             return {"blood_velocity": found[:, 5:]}
-        inflow, rate, phase = self._header[:, 4:].T
-        phases = rate * time + phase
-        delays = found[:, 3] / self._wave_speed
-        beats = [self._loops.beat(phase) for phase in (phases - rate * delays).tolist()]
-        velocity = (inflow * np.array(beats))[:, None] * found[:, :3] + found[:, 5:]
+        blood = self.world.parameters
+        phases = blood.rate * time + blood.phase
+        delayed = phases - blood.rate * (found[:, 3] / self._wave_speed)
+        beats = [beat(phase) for phase in delayed.tolist()]
+        velocity = (blood.peak * np.array(beats))[:, None] * found[:, :3] + found[:, 5:]
         return {"heart_phase": phases % 1.0, "blood_velocity": velocity}
 
 
@@ -180,18 +184,20 @@ def moving_velocities(
 
 
 @compiled
-def _fill(found, speed, viscosity, radii, flowing, links):
-    """Writes the parameters of links (N, L, 8), see `blood_loops.OF_LINK`."""
+def _fill(found, speed, radii, flowing, blood):
+    """Writes the `Blood` of the links of N simulations, from `Flow._at`."""
     for index in range(len(found)):
         for n in range(radii.shape[1]):
-            row, link = found[index, n], links[index, n]
-            link[5:] = row[5:]
+            row = found[index, n]
+            blood.space_velocity[index, n] = row[5:]
             if flowing:
-                link[:3] = row[:3]
-                link[3], link[4] = row[3] / speed[index], 0.0
+                blood.velocity[index, n] = row[:3]
+                blood.delay[index, n] = row[3] / speed[index]
+                blood.friction[index, n] = 0.0
                 if row[4] > 0.0:
                     gap = max(row[4] / radii[index, n], _LEAST_GAP)
-                    link[4] = 2.0 * math.pi * viscosity[index] / math.log(gap)
+                    friction = 2.0 * math.pi * blood.viscosity[index] / math.log(gap)
+                    blood.friction[index, n] = friction
 
 
 @compiled

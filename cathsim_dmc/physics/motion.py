@@ -6,18 +6,17 @@ and of expiration, and moves in full after `motion_loops.RAMP`.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.random import RandomState
 
 from cathsim_dmc.anatomy import Anatomy, Surface, motion_loops
 from cathsim_dmc.anatomy.motion import Motion
-from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.physics.effects import Effect, Episode, World
 from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
 from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 _LIMITS = {
     "heart": (0.0, 12e-3, "m"),
@@ -71,6 +70,19 @@ class MotionOptions:
         anatomy.motion.check(anatomy.name, *map(float, largest))
 
 
+class MotionParameters(NamedTuple):
+    """See `motion_loops.PARAMETERS`."""
+
+    heart: Any
+    breathing: Any
+    distensibility: Any
+    rate: Any
+    phase: Any
+    wave_speed: Any
+    breath_rate: Any
+    breath_phase: Any
+
+
 class Moving(Effect):
     """Moves the wall of each simulation.
 
@@ -78,25 +90,18 @@ class Moving(Effect):
         flow: `flow.Flow` with the same heart; None for none.
     """
 
+    parameters = MotionParameters
+    acts_in, adapter = "contact", "motion"
+    state = ("_clock",)
     flow: Any
 
     def __init__(self, options: MotionOptions):
         """Takes the options of the task."""
         self._options, self.flow = options, None
 
-    def num_parameters(self, chain: Chain) -> int:
-        """Those of `motion_loops`."""
-        return motion_loops.PARAMETERS
-
     def bind(self, world: World) -> None:
-        """Has contacts see the velocity of the wall."""
-        from cathsim_dmc.collision import carrying
-
+        """Starts at rest."""
         super().bind(world)
-        carrying.install()
-        model, kind = world.model, mujoco.mjtObj.mjOBJ_GEOM
-        names = "wall", "sheath/bore"
-        self._geoms = [mujoco.mj_name2id(model, kind, name) for name in names]
         self._motions: dict[int, Motion] = {}
         self._surfaces: dict[int, Surface] = {}
         self._inlets = np.zeros((world.num_simulations, 2, 3))
@@ -117,25 +122,31 @@ class Moving(Effect):
         values["breath_rate"] /= 60.0
         if self.flow is not None:
             values |= self.flow.heart(index)
-        self.world.parameters[index] = motion_loops.MARK, *values.values(), *self._geoms
+        for name, each in self.world.parameters._asdict().items():
+            each[index] = values[name]
         self._clock[index] = 0.0
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Counts the control steps; the last effect of the vessel."""
-        from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
-
         self._clock += CONTROL_TIMESTEP
         return action
 
     def record(self) -> dict[str, list[float]]:
         """Lattice, to six digits, and parameters of the first simulation."""
         lattice = [float(f"{value:.6g}") for value in self._motions[0].lattice]
-        return {"lattice": lattice, "parameters": self.world.parameters[0].tolist()}
+        return {"lattice": lattice, "parameters": self._numbers(0).tolist()}
+
+    def _numbers(self, index: int) -> np.ndarray:
+        """Numbers (PARAMETERS,) of one simulation, as `anatomy.motion` takes them."""
+        numbers = np.zeros(motion_loops.PARAMETERS)
+        numbers[1:9] = [each[index] for each in self.world.parameters]
+        return numbers
 
     def phases(self) -> tuple[np.ndarray, np.ndarray]:
         """Phases (N,), (N,) of heart and breathing, 0 to 1."""
-        _, _, _, _, rate, phase, _, breath, begin, *_ = self.world.parameters.T
-        return (rate * self._clock + phase) % 1.0, (breath * self._clock + begin) % 1.0
+        given, time = self.world.parameters, self._clock
+        breath = given.breath_rate * time + given.breath_phase
+        return (given.rate * time + given.phase) % 1.0, breath % 1.0
 
     def entered(self, index: int, nodes: np.ndarray) -> int:
         """Number of the first node (P, 3) of a device, m, that is past the inlet."""
@@ -163,7 +174,7 @@ class Moving(Effect):
         The time is that of what MuJoCo has derived, one physics step before the end.
         """
         time = max(float(self._clock[index]) - self._step, 0.0)
-        return self._motions[index].lattice, self.world.parameters[index], time
+        return self._motions[index].lattice, self._numbers(index), time
 
     def surface(self, index: int) -> Surface:
         """The lumen's surface of one simulation where it is now."""
@@ -172,7 +183,7 @@ class Moving(Effect):
 
 
 def add_clock(root) -> None:
-    """Adds the body of the last degree of freedom, see `collision.carrying`.
+    """Adds the body of the last degree of freedom, see `adapters.motion`.
 
     Args:
         root: MJCF of the whole scene, to which nothing is attached any more.

@@ -6,11 +6,11 @@ is turned lies in MuJoCo's `userdata`, which is part of the state that is saved.
 """
 
 import operator
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.random import RandomState
 
-from cathsim_dmc.entities import hinge_loops
 from cathsim_dmc.entities.chain import (
     MAX_PUSH_FORCE,
     MAX_PUSH_SPEED,
@@ -21,6 +21,10 @@ from cathsim_dmc.entities.chain import (
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import postures
 from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.laws import hinges
+from cathsim_dmc.laws.hinges import Bends
+from cathsim_dmc.laws.parameters import Array
+from cathsim_dmc.laws.springs import Springs
 from cathsim_dmc.physics import sliding_loops
 from cathsim_dmc.physics.chain_fields import FIELDS, places_of
 from cathsim_dmc.physics.drives import Drives
@@ -55,44 +59,35 @@ class SingleDevice(Effect):
 
     data_fields: tuple[str, ...] = ("act",)
     model_fields: tuple[str, ...] = ()
+    state = ("slipped", "told")
 
     def __init__(self, chain: Chain):
         """Takes the entity of the device."""
         self._device = chain.device
         self._behind = BEHIND / float(chain.link_lengths[0])  # links
-
-    def num_parameters(self, chain: Chain) -> int:
-        """Of the springs of a device with a shape, see `shape_loops`."""
-        if not chain.device.tip_shape:
-            return 0
-        from cathsim_dmc.physics import shape_loops  # late, as numba takes long
-
-        return 1 + shape_loops.OF_JOINT * (len(chain.bends) // 2)
+        if self._device.tip_shape:
+            self.parameters = Springs
+            self.acts_in, self.adapter = "passive", "springs"
 
     def bind(self, world: World) -> None:
         """Finds the drives and the hinges in the model."""
         super().bind(world)
         self._drives = Drives(world.model, world.arrays)
-        self.slipped = self._drives.slipped
+        self.slipped, self.told = self._drives.slipped, self._drives.told
         model, places = world.model, world.index.bends_qpos
-        self._bends_qpos = np.sort(places, axis=None)
-        self._springs = np.zeros(0)
-        if len(world.parameters.T) and not world.chain.coaxial:
-            from cathsim_dmc.physics import shape_loops
-
-            shape_loops.install()
-            joints = np.searchsorted(model.jnt_qposadr, places)
-            # The shape lies in the plane of x and z.
-            rest = model.qpos_spring[places[:, 1]]
-            compliance = 1 / model.jnt_stiffness[joints[:, 0]]
-            dofs = model.jnt_dofadr[joints]
-            rows = np.column_stack([rest, compliance, places, dofs])
-            self._springs = np.append(shape_loops.MARK, rows)
+        self._bends_qpos, joints = np.sort(places, axis=None), len(places)
+        self._bends = Bends(np.empty(joints, complex), np.empty(joints))
+        hinges_x = np.searchsorted(model.jnt_qposadr, places[:, 0])
+        # The shape lies in the plane of x and z.
+        rest = model.qpos_spring[places[:, 1]]
+        self._springs = Springs(rest, 1 / model.jnt_stiffness[hinges_x])
 
     def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
         """Holds the base of one simulation where it stands."""
         self._drives.hold(index)
-        self.world.parameters[index, : len(self._springs)] = self._springs
+        if self.parameters is Springs:
+            self.world.parameters.rest[index] = self._springs.rest
+            self.world.parameters.compliance[index] = self._springs.compliance
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Lets clamps slip; turns motors against the twist of the links."""
@@ -102,8 +97,9 @@ class SingleDevice(Effect):
             return action
         angles = self.world.arrays.qpos[:, self._bends_qpos]
         commands = np.ascontiguousarray(action[:, :motors])
-        steered = hinge_loops.steered(commands, angles)
-        return np.concatenate([steered, action[:, motors:]], axis=1)
+        turned = np.empty_like(commands)
+        hinges.steered(commands, angles, self._bends, turned)
+        return np.concatenate([turned, action[:, motors:]], axis=1)
 
     def follower_posture(self) -> np.ndarray:
         """Joints (N, len(JOINTS)) of the robot that holds the devices."""
@@ -125,19 +121,29 @@ class SingleDevice(Effect):
         return None
 
 
+class Positions(NamedTuple):
+    """Where K coaxial devices are, part of the state that is saved.
+
+    Attributes:
+        insertion: (K,), way of each device, m.
+        angles: (K, M + 1), rotations of its nodes, rad.
+    """
+
+    insertion: Any = Array("devices")
+    angles: Any = Array("devices", "nodes")
+
+
 class SlidingDevices(SingleDevice):
     """Coaxial devices, each moved along and about its axis by its actions."""
 
     data_fields = ("cfrc_int", "act", "qfrc_applied")
     model_fields = FIELDS
+    state = ("slipped", "told", "_friction", "_factors", "_ways", "_drag", "_axial")
+    parameters = Positions
 
     def __init__(self, stack: DeviceStack):
         """Takes the entity of the devices."""
         self._entity, self._stack = stack, stack.stack
-
-    def num_parameters(self, chain: Chain) -> int:
-        """Insertions, and rotations of nodes."""
-        return len(self._entity.devices) * (1 + len(self._stack.nodes))
 
     def bind(self, world: World) -> None:
         """Finds the places in the model."""
@@ -149,8 +155,7 @@ class SlidingDevices(SingleDevice):
         (base,) = np.flatnonzero(world.model.jnt_qposadr == self._index.insertion_qpos)
         self._others = world.arrays.qfrc_applied[:, world.model.jnt_dofadr[base]]
         # Views: writing to them writes the state.
-        self._insertion = world.parameters[:, :count]
-        self._angles = world.parameters[:, count:].reshape(total, count, -1)
+        self._insertion, self._angles = world.parameters
         places = places_of(world.model, self._entity)
         self._made = made(self._entity, places)
         first = places[0][2]

@@ -6,7 +6,8 @@ N simulations, K devices, J joints, L links; each simulation on its own.
 import numpy as np
 
 from cathsim_dmc.compiled import compiled
-from cathsim_dmc.entities import coaxial_loops, hinge_loops, torsion
+from cathsim_dmc.entities import coaxial_loops, torsion
+from cathsim_dmc.laws.hinges import Bends, bent, free_hinges
 from cathsim_dmc.physics import chain_fields
 
 _GAP_STEP = 1e-8  # m, for a derivative
@@ -16,7 +17,9 @@ _GAP_STEP = 1e-8  # m, for a derivative
 def _lay(made, overlap, turns, hinges, friction, factors, fields):
     (tables, _, _, of_links), _, places = made
     shape = coaxial_loops.rest_angles(overlap.rest, turns)
-    rest = hinge_loops.free_hinges(shape, overlap.compliance, hinges)
+    rest, joints = np.empty((len(shape), 2)), len(shape)
+    scratch = Bends(np.empty(joints, np.complex128), np.empty(joints))
+    free_hinges(shape, overlap.compliance, hinges, scratch, rest)
     links = coaxial_loops.links(overlap, tables[1], friction, *of_links)
     chain_fields.write(fields, places, overlap, rest, links, factors)
 
@@ -57,7 +60,9 @@ def settle(
     rods = torsion.Rods(factors[0] * rods.stiffness, factors[1] * rods.times)
     overlap = coaxial_loops.overlap(gaps, tables)
     turns = torsion.at_joints(angles, gaps, nodes)
-    bends, _ = hinge_loops.bent(hinges)
+    joints = turns.shape[1]
+    bends = np.empty(joints, np.complex128)
+    bent(hinges, Bends(bends, np.empty(joints)))
     loads = np.empty((3, *turns.shape))
     loads[:2] = coaxial_loops.restoring(overlap, bends, turns) * factors[0]
     loads[2] = coaxial_loops.wall_friction(arms, overlap.outermost, force, friction)

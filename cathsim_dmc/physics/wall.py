@@ -1,19 +1,18 @@
-"""A wall that gives: contacts as springs of the stiffness of the vessel where they are.
+"""Compliant wall: contacts as springs of the stiffness of the vessel where they are.
 
-docs/vessel_model.md has the equations. The contact of each link is set once a control
-step. It obeys the rule of `entities.contact`, α(1 + m) < 2; what is stiffer than the
+`laws.compliance` has the law. The contact of each link is set once a control step. It
+obeys the rule of `entities.contact`, α(1 + m) < 2; what is stiffer than the
 contact with the rigid wall has that contact's law.
 """
 
 import dataclasses
-import math
 
 import numpy as np
 from numpy.random import RandomState
 
-from cathsim_dmc.compiled import compiled
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import CONTACT_SOLIMP, CONTACT_SOLREF
+from cathsim_dmc.laws.compliance import Law, Links, Material, write_contacts
 from cathsim_dmc.physics.effects import Effect, Episode, World
 from cathsim_dmc.physics.flow import Flow
 from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
@@ -22,14 +21,11 @@ from cathsim_dmc.physics.readings import Readings
 STIFFENING = 3e-3  # m, indentation from which the wall is as stiff as it gets
 SOLIMP = (0.7, 0.95, STIFFENING, 0.5, 4)
 RELAXATION = 8e-3  # s, as that of the rigid wall
-_LAWS = np.array([(*CONTACT_SOLIMP, *CONTACT_SOLREF), (*SOLIMP, 0.0, 0.0)])
+RIGID = Law(np.array(CONTACT_SOLREF), np.array(CONTACT_SOLIMP, float), 0.0)
+COMPLIANT = Law(np.zeros(2), np.array(SOLIMP), RELAXATION)
 # The secant of the rigid wall's law under this load, N, is its stiffness.
 _LOAD = 0.1
 
-POISSON = 0.5
-# Thickness of an artery over its radius, and the least: 1.4 and 1.0 mm at the ascending
-# and descending aorta (PMC3154923), 0.6 mm at a carotid.
-_RELATIVE, _THINNEST = 0.1, 0.6e-3
 _LIMITS = {
     "modulus": (1e4, 1e9, "Pa"),
     "thickness": (1e-4, 5e-3, "m"),
@@ -39,7 +35,7 @@ _LIMITS = {
 
 @dataclasses.dataclass(frozen=True)
 class WallOptions:
-    """What the wall is made of; a range (low, high) is drawn from in each episode.
+    """Material of the wall; a range (low, high) is drawn from in each episode.
 
     Attributes:
         modulus: Young's modulus, Pa, 1e4 to 1e9: 0.45e6 of an aorta, 0.52e6 of
@@ -73,7 +69,9 @@ def rigid_stiffness(weight: np.ndarray) -> np.ndarray:
 class Wall(Effect):
     """Sets the contact of each link by the vessel where it is."""
 
+    acts_in, adapter = "contact", "compliance"
     model_fields = ("geom_solref", "geom_solimp")
+    state = ("_radius", "_material")
 
     def __init__(self, options: WallOptions, blood: Flow):
         """Takes the options of the task, and the blood, which knows the vessels."""
@@ -81,19 +79,16 @@ class Wall(Effect):
 
     def bind(self, world: World) -> None:
         """Finds the links in the model."""
-        from cathsim_dmc.collision import carrying  # late, as numba takes long
-
         super().bind(world)
-        carrying.install()
         model, links, count = world.model, world.index.geoms, world.num_simulations
         weight = model.body_invweight0[model.geom_bodyid[links], 0]
-        self._links = links, weight, rigid_stiffness(weight)
+        self._links = Links(links, weight, rigid_stiffness(weight))
         # Of the lumen around each link, 0 where it has never been in one.
         self._radius = np.zeros((count, len(links)))
         self._material = np.ones((count, len(_LIMITS)))
 
     def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
-        """Draws what the wall is made of."""
+        """Draws the material of the wall."""
         self._radius[index] = 0.0
         given = [getattr(self._options, name) for name in _LIMITS]
         self._material[index] = [
@@ -102,9 +97,10 @@ class Wall(Effect):
         self._write(index)
 
     def _write(self, index: int) -> None:
-        fields = [self.world.field(index, name) for name in self.model_fields]
-        vessel = self._radius[index], self._material[index]
-        _contacts(*vessel, *self._links, _LAWS, RELAXATION, *fields)
+        solref, solimp = (self.world.field(index, name) for name in self.model_fields)
+        material = Material._make(self._material[index].tolist())
+        radius, laws = self._radius[index], (RIGID, COMPLIANT)
+        write_contacts(radius, material, self._links, laws, solref, solimp)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Takes the radius of the vessel around each link."""
@@ -119,39 +115,3 @@ def soften(chain: Chain) -> None:
     """Lets the contacts of a chain's links decide over those of the wall."""
     for geom in chain.link_geoms:
         geom.priority = 1
-
-
-@compiled
-def stiffness(radius, modulus, thickness, support):
-    """Stiffness of a tube under a point load, N/m; a NaN thickness is an artery's."""
-    if math.isnan(thickness):
-        thickness = max(_RELATIVE * radius, _THINNEST)
-    plane = 1.0 - POISSON**2
-    held = 4.0 * modulus * thickness**2 / (math.sqrt(3.0 * plane) * radius)
-    free = modulus / plane * thickness**3 / (12.0 * 0.149 * radius**3)
-    free *= radius * math.sqrt(radius / thickness)
-    return free ** (1.0 - support) * held**support
-
-
-@compiled
-def reference(stiffness, weight, first, last, relaxation):
-    """`solref` (2) of a spring, N/m, on a link of an inverse weight, 1/kg."""
-    scale = stiffness * last * (1.0 - first) * weight / first
-    return -scale * last / first, -scale * relaxation
-
-
-@compiled
-def _contacts(radius, material, geoms, weight, rigid, laws, relaxation, solref, solimp):
-    """Writes `solref` and `solimp` of the links of one simulation."""
-    first, last = laws[1, 0], laws[1, 1]
-    for n in range(len(geoms)):
-        geom, found = geoms[n], rigid[n]
-        if radius[n] > 0.0:
-            found = stiffness(radius[n], material[0], material[1], material[2])
-        soft = found < rigid[n]
-        for k in range(5):
-            solimp[geom, k] = laws[1 if soft else 0, k]
-        law = laws[0, 5], laws[0, 6]
-        if soft:
-            law = reference(found, weight[n], first, last, relaxation)
-        solref[geom, 0], solref[geom, 1] = law

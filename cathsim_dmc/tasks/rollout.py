@@ -15,9 +15,9 @@ from numpy.random import RandomState
 from cathsim_dmc.imaging import endoluminal
 from cathsim_dmc.imaging.angiograph import Deviation, Planes
 from cathsim_dmc.imaging.device import Shadow
-from cathsim_dmc.physics import effects, forces
+from cathsim_dmc.physics import forces
 from cathsim_dmc.physics import vessel as vessels
-from cathsim_dmc.physics.effects import World
+from cathsim_dmc.physics.effects import Layout, World, of_kind
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import ModelIndex, Readings
 from cathsim_dmc.physics.sliding import SingleDevice
@@ -47,6 +47,7 @@ class Rollout:
 
     Attributes:
         index: Places of the task's quantities in the compiled model.
+        effects: Effects on the simulations, in the order in which they act.
         objectives: Objectives with their goals of these episodes, and the rows of the
             simulations of each.
         resting_goal: (N, 3) m, goals where they are in the vessel at rest.
@@ -87,15 +88,20 @@ class Rollout:
         )
         self.index = ModelIndex(model, scene.catheter, scene.robot)
         self._read = self.index.reader(state)
-        self._effects = config.effects_on(scene.catheter)
+        self.effects = config.effects_on(scene.catheter)
         stepper.deepest = config.vessel.deepest
-        moving = (effect for effect in self._effects if isinstance(effect, Moving))
-        self.moving = next(moving, None)
-        self._devices = cast(SingleDevice, self._effects[-1])
-        depth = scene.placement.start_depth
-        places = model, scene.catheter, self.index, depth, state, stepper.field
-        world = World(*places, parameters=state.userdata)
-        self._labels = effects.bind(self._effects, world)
+        self.moving = of_kind(self.effects, Moving)
+        self._devices = cast(SingleDevice, of_kind(self.effects, SingleDevice))
+        world = World(
+            model=model,
+            chain=scene.catheter,
+            index=self.index,
+            start_depth=scene.placement.start_depth,
+            arrays=state,
+            field=stepper.field,
+            parameters=state.userdata,
+        )
+        self._layout = Layout(self.effects, world)
         for index in range(count):
             self._enter(index)
         self._routes: list[Route] = []
@@ -128,7 +134,6 @@ class Rollout:
             random_states: N sources of randomness; those of other simulations are left
                 alone.
         """
-        effects.check()
         self._random_states = list(random_states)
         for index in indices:
             self._draw(index, random_states[index])
@@ -167,8 +172,8 @@ class Rollout:
             self._enter(index)
         case = self.case(index)
         case.start.write(self._state.qpos[index], episode, random_state)
-        self._state.userdata[index, list(self._labels)] = list(self._labels.values())
-        for effect in self._effects:
+        self._layout.begin(index)
+        for effect in self.effects:
             effect.restart(index, episode, random_state)
         self.deviations[index] = episode.deviation
         if self._sensors.planes:
@@ -176,7 +181,7 @@ class Rollout:
         self._goal_shift[index] = episode.goal_shift or 0.0
 
     def _enter(self, index: int) -> None:
-        for effect in self._effects:
+        for effect in self.effects:
             effect.enter(index, self.case(index).scene.anatomy)
 
     def _pose_robot(self) -> None:
@@ -190,7 +195,7 @@ class Rollout:
         """
         self._previous_action, self._action = self._action, action
         self._pose_robot()
-        for effect in self._effects:
+        for effect in self.effects:
             action = effect.act(action, self.readings)
             if action is None:
                 raise ValueError(
@@ -226,7 +231,7 @@ class Rollout:
     def finish(self) -> Step:
         """Measures, judges and observes after the physics steps of a control step."""
         force, warned = self._stepper.end()
-        effects.raise_fault()
+        self._layout.raise_fault()
         self.steps += 1
         before = self.resting.head
         self._measure(force)
@@ -259,7 +264,7 @@ class Rollout:
         self.readings, self.wall_force = self._read(), force
         self.devices = self._devices.read(self.readings)
         time, last = CONTROL_TIMESTEP * self.steps, self._stepper.contact_rows[:, -1]
-        self.vessel = vessels.read(self._effects, time, self.readings, last)
+        self.vessel = vessels.read(self.effects, time, self.readings, last)
         self.resting = self._at_rest(self.readings)
 
     def _at_rest(self, state: Readings) -> Readings:

@@ -8,9 +8,8 @@ import numpy as np
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.motion import PULSE_PRESSURE, Motion, distensibility
 from cathsim_dmc.anatomy.motion_loops import MARK, PARAMETERS, courses, pulse
-from cathsim_dmc.collision import carrying
-from cathsim_dmc.collision.own import OWN
 from cathsim_dmc.entities import contact
+from cathsim_dmc.physics import adapters, dispatcher
 from cathsim_dmc.physics.flow import moving_velocities
 from cathsim_dmc.physics.stepper import PHYSICS_TIMESTEP
 from cathsim_dmc.validation.checks import Check
@@ -36,20 +35,21 @@ def parameters(heart: float, breathing: float, soft: float) -> np.ndarray:
 
 def stirred(lumen, lattice: np.ndarray, friction: float = 0.0) -> mujoco.MjSpec:
     """A model of a moving wall alone, geom 0."""
-    carrying.install()
     fixed = {"solref": contact.CONTACT_SOLREF, "solimp": contact.CONTACT_SOLIMP}
     spec = bare(lumen, lattice, friction=(friction, 0, 0), **fixed)
-    spec.nuserdata = 3 + PARAMETERS
+    spec.nuserdata = PARAMETERS
     spec.option.impratio = contact.FRICTION_STIFFNESS
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     return spec
 
 
-def begin(model: mujoco.MjModel, course: np.ndarray) -> mujoco.MjData:
-    """Data of a model whose wall moves by parameters."""
+def begin(model: mujoco.MjModel, course: np.ndarray, bore: int = -1) -> mujoco.MjData:
+    """Data of a model whose wall moves by parameters, past the bore of a sheath."""
     data = mujoco.MjData(model)
-    data.userdata[1] = len(course)
-    data.userdata[2:] = *course, OWN
+    law = dispatcher.Law("motion", "contact", adapters.motion, 1)
+    places = dispatcher.Places(1, np.zeros(0), wall=0, bore=bore)
+    data.userdata[1:9] = course[1:9]
+    data.userdata[-1] = dispatcher.layout(model, places, [law]).label
     return data
 
 
@@ -189,7 +189,7 @@ def ride(
     model = spec.compile()
     data = begin(model, course)
     if inertial:
-        data.userdata[2:-1] = 0.0
+        data.userdata[:] = 0.0
     times, half = np.arange(0.0, _RIDE, PHYSICS_TIMESTEP), 0.5 * PHYSICS_TIMESTEP
     link = []
     for time in times:

@@ -9,10 +9,11 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from cathsim_dmc import suite
-from cathsim_dmc.entities import devices, hinge_loops, posture
+from cathsim_dmc.entities import devices, posture
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.laws import hinges
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation import pressed, rod, theory, two_rods
@@ -131,9 +132,11 @@ def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float,
     twist = (still.inv() * frame).as_rotvec()[2]
     ordered = angles.copy()  # as the hinges lie
     ordered[1::2] = angles[1::2, ::-1]
-    ((x, y),) = hinge_loops.steered(np.array([[1.0, 0.0]]), ordered.reshape(1, -1))
-    _, taken = hinge_loops.bent(ordered.ravel())
-    return float(twist + np.arctan2(y, x)), float(twist - taken[-1])
+    bends = hinges.Bends(np.empty(len(ordered), complex), np.empty(len(ordered)))
+    command, turned = np.array([[1.0, 0.0]]), np.empty((1, 2))
+    hinges.steered(command, ordered.reshape(1, -1), bends, turned)
+    ((x, y),) = turned
+    return float(twist + np.arctan2(y, x)), float(twist - bends.twists[-1])
 
 
 def smoothness() -> Check:

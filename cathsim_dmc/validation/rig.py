@@ -3,7 +3,7 @@
 import dataclasses
 import types
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -23,7 +23,7 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.blood import StillBlood
-from cathsim_dmc.physics.effects import Episode, userdata_size
+from cathsim_dmc.physics.effects import Episode, Layout, World, userdata_size
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import theory
@@ -188,18 +188,27 @@ class Rig:
         if isinstance(self.catheter, DeviceStack):
             chain_fields.write_still(self.catheter, self.model, self.gaps)
         if blood is not None:
-            from cathsim_dmc.collision.own import OWN
-
-            # What blood needs of a `World`, placed in `userdata` as by `effects.bind`.
-            parameters = self.data.userdata[None, 2:-1]
-            self.data.userdata[1], self.data.userdata[-1] = parameters.size, OWN
-            first = slice(int(ids(self.model, self.catheter.links)[0]), None)
-            index = types.SimpleNamespace(links=first)
-            world: Any = types.SimpleNamespace(parameters=parameters, index=index)
-            world.num_simulations = 1
-            blood.bind(world)
-            blood.restart(0, Episode(np.zeros(3)), np.random.RandomState(0))
+            self._fill(blood)
         mujoco.mj_forward(self.model, self.data)
+
+    def _fill(self, blood: StillBlood) -> None:
+        from cathsim_dmc.physics.dispatcher import Places
+
+        chain, nothing = self.catheter, cast(Any, None)
+        places = Places(
+            int(ids(self.model, chain.links)[0]), ids(self.model, chain.link_geoms)
+        )
+        world = World(
+            self.model,
+            chain,
+            index=nothing,
+            start_depth=0.0,
+            arrays=types.SimpleNamespace(qpos=self.data.qpos[None]),
+            field=nothing,
+            parameters=self.data.userdata[None],
+        )
+        Layout([blood], world, places).begin(0)
+        blood.restart(0, Episode(np.zeros(3)), np.random.RandomState(0))
 
     def qpos(self, joint: str) -> float:
         """Position of a joint of the catheter, by its name in the entity."""

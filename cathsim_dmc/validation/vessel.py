@@ -13,9 +13,13 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
+from cathsim_dmc.laws.blood import Blood, beat
+from cathsim_dmc.laws.compliance import Material, reference, stiffness
+from cathsim_dmc.laws.parameters import total
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
+from cathsim_dmc.physics.effects import views
 from cathsim_dmc.physics.flow import EXPONENT, velocities
-from cathsim_dmc.physics.wall import RELAXATION, SOLIMP, reference, stiffness
+from cathsim_dmc.physics.wall import COMPLIANT, SOLIMP
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import damping, motion
 from cathsim_dmc.validation.checks import Check, Report
@@ -41,7 +45,7 @@ def cantilever(speed: float) -> tuple[float, float]:
     blood = StillBlood()
     rig = damping.cantilever(blood)
     one = rig.device
-    blood.velocity[0] = [speed, 0.0, 0.0]
+    blood.world.parameters.velocity[0] = [speed, 0.0, 0.0]
     rig.settle()
     length = float(rig.sections[0].sum())
     bending, diameter = one.shaft.bending_stiffness, 2 * one.outer_radius
@@ -63,22 +67,23 @@ def cantilever(speed: float) -> tuple[float, float]:
 
 def terminal_velocity(force: float) -> tuple[float, float]:
     """Velocity of a free link under a force (N) across its axis, m/s, and expected."""
-    from cathsim_dmc.collision.own import OWN
-    from cathsim_dmc.physics import blood_loops
+    from cathsim_dmc.physics import adapters, dispatcher
 
-    blood_loops.install()
     radius = devices.get("steerable_5f").outer_radius
-    size = blood_loops.HEADER + blood_loops.OF_LINK
+    sizes = {"links": 1, "joints": 0}
     spec = bare()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.nuserdata = 2 + size + 1
+    spec.nuserdata = total(Blood, sizes) + 1
     body, capsule = spec.worldbody.add_body(), mujoco.mjtGeom.mjGEOM_CAPSULE
     body.add_freejoint()
     body.add_geom(type=capsule, size=(radius, LINK / 2, 0), density=BLOOD_DENSITY)
     model = spec.compile()
     data = mujoco.MjData(model)
-    data.userdata[1:6] = size, blood_loops.MARK, BLOOD_DENSITY, BLOOD_VISCOSITY, 1
-    data.userdata[-1] = OWN
+    law = dispatcher.Law("drag", "passive", adapters.blood, 0)
+    places = dispatcher.Places(1, np.zeros(1))
+    data.userdata[-1] = dispatcher.layout(model, places, [law]).label
+    blood = views(Blood, data.userdata[None], sizes)
+    blood.density[:], blood.viscosity[:] = BLOOD_DENSITY, BLOOD_VISCOSITY
     data.xfrc_applied[1, 0] = force
     mujoco.mj_step(model, data, 2000)
     expected = brentq(lambda u: LINK * drag(u, 2 * radius) - force, 1e-6, 10.0)
@@ -87,8 +92,6 @@ def terminal_velocity(force: float) -> tuple[float, float]:
 
 def volume_defect(anatomy: Anatomy) -> float:
     """Largest flow lost at a junction at any phase, over the largest inflow."""
-    from cathsim_dmc.physics.blood_loops import beat
-
     circulation, tree = anatomy.circulation, anatomy.tree
     beats = np.array([beat(phase) for phase in np.linspace(0.0, 1.0, 101)])
     worst = 0.0
@@ -128,23 +131,23 @@ def indentation(
 
     It lies along a tube with a radius, m, and a wall of 1.5 mm with a modulus, Pa.
     """
-    from cathsim_dmc.collision import carrying
-    from cathsim_dmc.collision.own import OWN
+    from cathsim_dmc.physics import adapters, dispatcher
 
-    carrying.install()
     spec = bare(tube(0.2, radius).lumen)
     spec.nuserdata = 1
     half = LINK / 2 if kind == "capsule" else 0.0
     body = {"size": (1e-3, half, 0), "mass": 1e-3, "priority": 1}
     body["type"] = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
     geom = slider(spec, (1, 0, 0), (radius - 1e-3 - 1e-4, 0, 0.1), **body)
-    model, spring = spec.compile(), stiffness(radius, modulus, 1.5e-3, 1.0)
-    law = reference(spring, model.body_invweight0[1, 0], *SOLIMP[:2], RELAXATION)
-    model.geom_solref[geom.id], model.geom_solimp[geom.id] = law, SOLIMP
+    model, spring = spec.compile(), stiffness(radius, Material(modulus, 1.5e-3, 1.0))
+    solref = reference(spring, model.body_invweight0[1, 0], COMPLIANT)
+    model.geom_solref[geom.id], model.geom_solimp[geom.id] = solref, SOLIMP
+    law = dispatcher.Law("wall", "contact", adapters.compliance, 0)
+    layout = dispatcher.layout(model, dispatcher.Places(1, np.zeros(0)), [law])
     depths = []
     for load in loads:
         data = mujoco.MjData(model)
-        data.xfrc_applied[1, 0], data.userdata[0] = load, OWN
+        data.xfrc_applied[1, 0], data.userdata[0] = load, layout.label
         mujoco.mj_step(model, data, 1500)
         depths.append(data.qpos[0] - 1e-4)
     return np.array(depths)
@@ -182,7 +185,7 @@ def _checks() -> Iterator[Check]:
     # A capsule that lies along the tube touches with both ends.
     shapes = (("sphere", 1), ("capsule", 2))
     for (kind, ends), radius, modulus in itertools.product(shapes, RADII, MODULI):
-        expected = ends * stiffness(radius, modulus, 1.5e-3, 1.0)
+        expected = ends * stiffness(radius, Material(modulus, 1.5e-3, 1.0))
         loads = expected * np.array([2e-4, 6e-4])
         slope = np.ptp(loads) / np.ptp(indentation(kind, radius, modulus, loads))
         name = f"{kind} in a tube of {1e3 * radius:g} mm, {1e-6 * modulus:g} MPa"

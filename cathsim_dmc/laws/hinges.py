@@ -1,12 +1,12 @@
 """Joints of two hinges: their bend and twist, and the springs of an isotropic joint.
 
-A joint bends by a complex angle, see `coaxial`. The order of its hinges alternates
-from joint to joint (`posture.x_first`): x is first where the joint's number is even.
+A joint bends by a complex angle, bend_y - i bend_x for small ones, in frames that do
+not twist along the chain (docs/pair_model.md). The order of its hinges alternates from
+joint to joint (`posture.x_first`): x is first where the joint's number is even.
 """
 
 import math
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from cathsim_dmc.compiled import compiled
 
@@ -74,44 +74,52 @@ def _twist_rates(x, y, first):
     return math.sin(twist) / math.sin(x), math.sin(twist) / math.sin(y)
 
 
+class Bends(NamedTuple):
+    """Bends of the J joints of a chain.
+
+    Attributes:
+        bends: (J,) complex, in frames that do not twist, rad.
+        twists: (J,), of the links before the joints, rad.
+    """
+
+    bends: Any
+    twists: Any
+
+
 @compiled
-def bent(angles):
-    """Bends of the joints, and twists of the links before them, see `coaxial`.
+def bent(angles, out):
+    """Writes the bends of the joints, and the twists of the links before them.
 
     Args:
         angles: (2 J,), positions of the hinges in the order of the chain, rad.
-
-    Returns:
-        Bends (J,) complex, and twists (J,), rad.
+        out: `Bends`.
     """
-    joints, twist = len(angles) // 2, 0.0
-    bends, twists = np.empty(joints, np.complex128), np.empty(joints)
-    for j in range(joints):
+    twist = 0.0
+    for j in range(len(angles) // 2):
         first = j % 2
         x, y = angles[2 * j + first], angles[2 * j + 1 - first]
-        bends[j], twists[j] = _bend(x, y, first) * unit(twist), twist
+        out.bends[j], out.twists[j] = _bend(x, y, first) * unit(twist), twist
         twist += _twist(x, y, first)
-    return bends, twists
 
 
 @compiled
-def unloaded_hinges(shape):
-    """Angles (J, 2) of the hinges about x and y of the unloaded chain, rad.
+def unloaded_hinges(shape, free):
+    """Writes the angles (J, 2) of the hinges about x and y of the unloaded chain, rad.
 
     Args:
         shape: (J,) complex, rest angles of the joints, rad.
+        free: (J, 2).
     """
-    free, twist = np.empty((len(shape), 2)), 0.0
+    twist = 0.0
     for j in range(len(shape)):
         x, y = _hinges(shape[j] * unit(-twist), j % 2)
         free[j, 0], free[j, 1] = x, y
         twist += _twist(x, y, j % 2)
-    return free
 
 
 @compiled
-def free_hinges(shape, compliance, angles):
-    """Rest angles (J, 2) about x and y of the hinges of the chain as it is bent, rad.
+def free_hinges(shape, compliance, angles, scratch, free):
+    """Writes the rest angles about x and y of the hinges of the chain as it is bent.
 
     Two hinges measure a bend differently in each direction, and twist. The springs have
     the torques of the isotropic energy Σ|β_j - ΣR_k e_k|²/2C_j, in which β_j depends on
@@ -119,21 +127,23 @@ def free_hinges(shape, compliance, angles):
     angles are θ - C ∂E/∂θ.
 
     Args:
-        shape: (J,) complex, rest angles of the joints, rad.
+        shape: (J,) complex or float64, rest angles of the joints, rad.
         compliance: (J,), rad/(N·m).
         angles: (2 J,), positions of the hinges in the order of the chain, rad.
+        scratch: `Bends`.
+        free: (J, 2), rad.
     """
     joints = len(shape)
-    bends, twists = bent(angles)
-    free, over = np.empty((joints, 2)), np.empty(2, np.complex128)
+    bent(angles, scratch)
+    bends, twists = scratch.bends, scratch.twists
     for j in range(joints):
         first = j % 2
         x, y = angles[2 * j + first], angles[2 * j + 1 - first]
-        over[0] = _difference(x, y, first, _STEP, 0.0)
-        over[1] = _difference(x, y, first, 0.0, _STEP)
-        pull = (shape[j] - bends[j]) * unit(-twists[j])
-        free[j, 0] = x + (over[0].conjugate() * pull).real
-        free[j, 1] = y + (over[1].conjugate() * pull).real
+        over_x = _difference(x, y, first, _STEP, 0.0)
+        over_y = _difference(x, y, first, 0.0, _STEP)
+        pull = (complex(shape[j]) - bends[j]) * unit(-twists[j])
+        free[j, 0] = x + (over_x.conjugate() * pull).real
+        free[j, 1] = y + (over_y.conjugate() * pull).real
     # Torsional moment of all beyond the joint: derivative of the energy by a twist.
     moment = 0.0
     for j in range(joints - 1, -1, -1):
@@ -142,27 +152,24 @@ def free_hinges(shape, compliance, angles):
         turn = _twist_rates(x, y, first)
         for axis in range(2):
             free[j, axis] -= compliance[j] * moment * turn[axis]
-        moment -= (shape[j].conjugate() * 1j * bends[j]).real / compliance[j]
-    return free
+        rest = complex(shape[j]).conjugate()
+        moment -= (rest * 1j * bends[j]).real / compliance[j]
 
 
 @compiled
-def steered(commands, angles):
-    """Commands of motors, turned out of frames that do not twist into those of links.
+def steered(commands, angles, scratch, turned):
+    """Writes commands of motors, turned out of untwisted frames into those of links.
 
     Args:
         commands: (N, 2 M), about x and y of the last M joints of each of N chains.
         angles: (N, 2 J), positions of the hinges in the order of the chains, rad.
-
-    Returns:
-        Commands (N, 2 M).
+        scratch: `Bends`.
+        turned: (N, 2 M).
     """
-    turned = np.empty_like(commands)
-    motors = commands.shape[1] // 2
+    motors, twists = commands.shape[1] // 2, scratch.twists
     for i in range(len(commands)):
-        _, twists = bent(angles[i])
+        bent(angles[i], scratch)
         for m in range(motors):
             torque = complex(commands[i, 2 * m], commands[i, 2 * m + 1])
             torque *= unit(-twists[len(twists) - motors + m])
             turned[i, 2 * m], turned[i, 2 * m + 1] = torque.real, torque.imag
-    return turned

@@ -1,0 +1,56 @@
+"""Parameters of laws in memory, as the NamedTuples that compiled laws take."""
+
+from typing import Any
+
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic, overload
+
+from cathsim_dmc.laws.parameters import Array
+
+# Compiled code calls what this decorates without its first argument.
+_intrinsic: Any = intrinsic
+
+
+@_intrinsic
+def call_law(_, address, model, data, layout, start):
+    """Calls an adapter at an address, see `physics.adapters`."""
+
+    def generate(context, builder, signature, values):
+        kind = ir.FunctionType(ir.VoidType(), [value.type for value in values[1:]])
+        builder.call(builder.inttoptr(values[0], kind.as_pointer()), values[1:])
+        return context.get_dummy_value()
+
+    return types.void(*[types.int64] * 5), generate
+
+
+def unpacked(kind, row, links, joints):
+    """The parameters of a simulation, a NamedTuple of a class, of views.
+
+    Args:
+        kind: The class, see `laws.parameters`.
+        row: (P or more,) float64, the numbers of its fields one after the other.
+        links: Number of links.
+        joints: Number of joints of two hinges.
+    """
+
+
+@overload(unpacked)
+def _unpacked(kind, row, links, joints):
+    if not isinstance(kind, types.NamedTupleClass):
+        return None
+    fields, place = [], "0"
+    for name in kind.instance_class._fields:
+        array = kind.instance_class._field_defaults.get(name)
+        if not isinstance(array, Array):
+            fields.append(f"row[{place}]")
+            place += " + 1"
+            continue
+        shape = ", ".join(map(str, array.shape))
+        size = " * ".join(map(str, array.shape))
+        fields.append(f"row[{place} : {place} + {size}].reshape(({shape},))")
+        place += f" + {size}"
+    source = f"def make(kind, row, links, joints): return kind({', '.join(fields)})"
+    made: dict[str, Any] = {}
+    exec(source, made)  # noqa: S102  numba takes no loop over fields of several types
+    return made["make"]

@@ -1,0 +1,1 @@
+"""Laws of the physics: pure functions of parameters, time and state."""

@@ -1,0 +1,201 @@
+"""Adapters of the laws to MuJoCo: they read its structs, call a law, and write them.
+
+An adapter gets the addresses of `mjModel`, of `mjData` and of the layout of the
+simulation (`collision.own`), and the place of its parameters in `userdata`. Those of
+the package are kept on disk; `made` compiles that of a law of one's own.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, courses, wall_velocity, warp
+from cathsim_dmc.collision import native
+from cathsim_dmc.collision.loops import SOFT
+from cathsim_dmc.collision.native import (
+    address_of,
+    contact_at,
+    contact_field,
+    data_field,
+    model_field,
+    numbers,
+    word,
+)
+from cathsim_dmc.collision.own import FAULT, JOINTS, LINK, LINKS, PLACES, WALL
+from cathsim_dmc.collision.parameters import unpacked
+from cathsim_dmc.collision.table import MOTION_ENTRY, SYMBOL, entry_of, key_of
+from cathsim_dmc.compiled import compiled
+from cathsim_dmc.laws.blood import Blood, drag
+from cathsim_dmc.laws.compliance import share
+from cathsim_dmc.laws.device import Contact, Device, Links
+from cathsim_dmc.laws.hinges import Bends
+from cathsim_dmc.laws.springs import Scratch, Springs, shape_torques
+
+_adapter = native.callback("void(int64, int64, int64, int64)")
+
+
+@compiled
+def _parameters(kind, data, layout, start):
+    """Parameters of a simulation from a place in `userdata` on."""
+    last = data_field(data, "userdata")[start:]
+    return unpacked(kind, last, word(layout + LINKS), word(layout + JOINTS))
+
+
+@compiled
+def links_of(model, data, layout):
+    """The links of a simulation's device."""
+    first = word(layout + LINK)
+    last = first + word(layout + LINKS)
+    return Links(
+        data_field(data, "xipos")[first:last],
+        data_field(data, "ximat")[first:last],
+        data_field(data, "xmat")[first:last],
+        data_field(data, "cvel")[first:last],
+        data_field(data, "subtree_com")[first:last],
+        data_field(data, "xfrc_applied")[first:last],
+    )
+
+
+@compiled
+def device_of(model, data, layout):
+    """The device of a simulation."""
+    first, links = word(layout + LINK), word(layout + LINKS)
+    hinges, last = 2 * word(layout + JOINTS), first + links
+    places, nv = native.longs(word(layout + PLACES)), model_field(model, "nv")
+    return Device(
+        data_field(data, "xipos")[first:last],
+        data_field(data, "xmat")[first:last],
+        data_field(data, "cvel")[first:last],
+        data_field(data, "subtree_com")[first:last],
+        model_field(model, "geom_size")[: model_field(model, "ngeom")],
+        places[:links],
+        model_field(model, "body_dofadr")[first:last],
+        model_field(model, "body_dofnum")[first:last],
+        data_field(data, "cdof")[:nv],
+        data_field(data, "qpos")[: model_field(model, "nq")],
+        data_field(data, "qfrc_passive")[:nv],
+        model_field(model, "jnt_stiffness")[: model_field(model, "njnt")],
+        model_field(model, "qpos_spring")[: model_field(model, "nq")],
+        places[links : links + hinges],
+        places[links + hinges : links + 2 * hinges],
+        places[links + 2 * hinges : links + 3 * hinges],
+    )
+
+
+@compiled
+def _contact(contact):
+    """A contact at an address."""
+    return Contact(
+        contact_field(contact, "pos"),
+        contact_field(contact, "frame"),
+        contact_field(contact, "solimp"),
+        contact_field(contact, "solref"),
+    )
+
+
+@_adapter
+def blood(model, data, layout, start):
+    """Drag of blood, see `laws.blood`."""
+    device = device_of(model, data, layout)
+    given = _parameters(Blood, data, layout, start)
+    drag(given, data_field(data, "time"), device)
+
+
+@_adapter
+def springs(model, data, layout, start):
+    """Springs of a device with a shape, see `laws.springs`."""
+    joints = word(layout + JOINTS)
+    bends = Bends(np.empty(joints, np.complex128), np.empty(joints))
+    scratch = Scratch(np.empty(2 * joints), bends, np.empty((joints, 2)))
+    given = _parameters(Springs, data, layout, start)
+    shape_torques(given, device_of(model, data, layout), scratch)
+
+
+@_adapter
+def compliance(model, data, layout, start):
+    """Halves the springs of contacts that share one, see `laws.compliance`."""
+    for n in range(data_field(data, "ncon")):
+        contact = contact_at(data, n)
+        soft = contact_field(contact, "solimp")[0] == SOFT
+        if soft and native.wholes(contact)[0] & 1:
+            share(_contact(contact))
+
+
+@_adapter
+def motion(model, data, layout, start):
+    """Writes the wall's velocity into the Jacobian of its contacts.
+
+    MuJoCo knows the velocity of a contact as J qvel. The model has one more degree of
+    freedom, the last, whose velocity is 1 m/s in every physics step; its column of J
+    gets the velocity of the wall in the frame of each contact.
+    """
+    nv, wall = model_field(model, "nv"), word(layout + WALL)
+    data_field(data, "qvel")[nv - 1] = 1.0
+    count, jacobian = data_field(data, "ncon"), data_field(data, "efc_J")
+    if count == 0:
+        return
+    # In the middle of the step, so that a device that sticks goes the wall's way.
+    time = data_field(data, "time") + 0.5 * model_field(model, "opt.timestep")
+    course = courses(data_field(data, "userdata")[start - 1 :], time)
+    entry = entry_of(address_of(SYMBOL), key_of(model, wall))
+    lattice = numbers(word(entry + MOTION_ENTRY))
+    scratch = np.empty(WARP + 4 * VALUES)
+    there, values = scratch[:WARP], scratch[WARP:].reshape(VALUES, 4)
+    for n in range(count):
+        contact = contact_at(data, n)
+        first = contact_field(contact, "efc_address")[0]
+        if first < 0 or contact_field(contact, "geom2")[0] != wall:
+            continue
+        place, frame = contact_field(contact, "pos"), contact_field(contact, "frame")
+        warp(lattice, course, place[0], place[1], place[2], values, there)
+        # The frame's first axis points from the device into the wall.
+        u, v, w = wall_velocity(there, (-frame[0], -frame[1], -frame[2]))
+        for row in range(min(contact_field(contact, "dim")[0], 3)):
+            speed = frame[3 * row] * u + frame[3 * row + 1] * v + frame[3 * row + 2] * w
+            jacobian[(first + row) * nv + nv - 1] = speed
+
+
+@functools.cache
+def made(law: Callable, kind: Any, acts_in: str) -> Any:
+    """The adapter of a law of one's own, whose indices are checked.
+
+    Args:
+        law: See `effects.Effect.law`.
+        kind: Class of its parameters.
+        acts_in: "passive", "control" or "contact".
+    """
+    # It refers to a law that changes from process to process: it is not kept on disk.
+    apply = compiled(law, cache=False, checked=True)
+
+    def in_passive(model, data, layout, start):
+        given, time = _parameters(kind, data, layout, start), data_field(data, "time")
+        try:
+            apply(given, time, device_of(model, data, layout))
+        except Exception:  # noqa: BLE001  C cannot be told
+            native.longs(layout + FAULT)[0] = start + 1
+
+    def in_control(model, data, layout, start):
+        given, time = _parameters(kind, data, layout, start), data_field(data, "time")
+        try:
+            apply(given, time, links_of(model, data, layout))
+        except Exception:  # noqa: BLE001  C cannot be told
+            native.longs(layout + FAULT)[0] = start + 1
+
+    def in_contact(model, data, layout, start):
+        given, time = _parameters(kind, data, layout, start), data_field(data, "time")
+        wall = word(layout + WALL)
+        for n in range(data_field(data, "ncon")):
+            contact = contact_at(data, n)
+            if contact_field(contact, "geom2")[0] != wall:
+                continue
+            try:
+                apply(given, time, _contact(contact))
+            except Exception:  # noqa: BLE001  C cannot be told
+                native.longs(layout + FAULT)[0] = start + 1
+
+    found = {"passive": in_passive, "control": in_control, "contact": in_contact}
+    return native.callback("void(int64, int64, int64, int64)", cache=False)(
+        found[acts_in]
+    )

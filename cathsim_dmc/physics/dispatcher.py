@@ -1,0 +1,266 @@
+"""The functions in MuJoCo's callbacks, which call the laws of all effects.
+
+MuJoCo has one `mjcb_passive` and one `mjcb_control` for all models of a process. The
+two functions here call what stood there before them, and then, for a simulation with a
+`Layout`, the adapters of its laws in their order. `stand` puts them there, and back
+where somebody has removed them; what replaces them without calling them is followed.
+"""
+
+import ctypes
+import functools
+import hashlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc import bounds
+from cathsim_dmc.collision import native, own
+from cathsim_dmc.collision.native import address_of, call_before, data_field, word
+from cathsim_dmc.collision.own import CONTROL, PASSIVE, layout_of
+from cathsim_dmc.collision.parameters import call_law
+from cathsim_dmc.compiled import compiled
+from cathsim_dmc.physics import adapters
+from cathsim_dmc.physics.readings import ModelIndex
+
+_BEFORE = {
+    "mjcb_passive": native.symbol("cathsim_before_passive", 1),
+    "mjcb_control": native.symbol("cathsim_before_control", 1),
+}
+ACTS_IN = ("passive", "control", "contact")
+_callback = native.callback("void(int64, int64)")
+
+
+@compiled
+def _run(laws, model, data, layout):
+    """Calls the adapters of a list, see `own.PASSIVE`."""
+    for n in range(word(laws)):
+        entry = laws + 8 + 16 * n
+        call_law(word(entry), model, data, layout, word(entry + 8))
+
+
+@_callback
+def _passive(model, data):
+    """Adds passive forces, and changes contacts before they get a reference."""
+    call_before(address_of("cathsim_before_passive"), model, data)
+    layout = layout_of(model, data)
+    if layout != 0:
+        _run(word(layout + PASSIVE), model, data, layout)
+
+
+@_callback
+def _control(model, data):
+    """Adds forces on the links, which are 0 before the first law."""
+    call_before(address_of("cathsim_before_control"), model, data)
+    layout = layout_of(model, data)
+    if layout != 0 and word(word(layout + CONTROL)) > 0:
+        nbody = native.model_field(model, "nbody")
+        data_field(data, "xfrc_applied")[:nbody] = 0.0
+        _run(word(layout + CONTROL), model, data, layout)
+
+
+@native.callback("void(int64, int64, int64, int64)")
+def _answer(model, data, layout, start):
+    """Counts the callbacks that reach a law, of `_reached`."""
+    data_field(data, "userdata")[0] += 1.0
+
+
+class Law(NamedTuple):
+    """A law of a layout.
+
+    Attributes:
+        name: Of the effect and its law.
+        acts_in: "passive", "control" or "contact".
+        adapter: What a callback calls, see `adapters`.
+        start: Place of its parameters in `userdata`.
+    """
+
+    name: str
+    acts_in: str
+    adapter: Any
+    start: int
+
+
+class Places(NamedTuple):
+    """Where laws find a device and its vessel in a model.
+
+    Attributes:
+        first_link: Number of the first link among the bodies; the others follow it.
+        geoms: (L,), of the links.
+        hinges: (3, 2 J), joints of the hinges in the order of the chain, their
+            positions and their degrees of freedom.
+        wall: Geom of the wall, -1 for none.
+        bore: Geom of the bore of the sheath, -1 for none.
+    """
+
+    first_link: int
+    geoms: np.ndarray
+    hinges: np.ndarray = np.zeros((3, 0))
+    wall: int = -1
+    bore: int = -1
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, index: ModelIndex) -> "Places":
+        """Those of a task's scene."""
+        qpos = np.sort(index.bends_qpos, axis=None)
+        joints = np.searchsorted(model.jnt_qposadr, qpos)
+        hinges = np.array([joints, qpos, model.jnt_dofadr[joints]])
+        kind = mujoco.mjtObj.mjOBJ_GEOM
+        geoms = (mujoco.mj_name2id(model, kind, n) for n in ("wall", "sheath/bore"))
+        return cls(index.links.start, index.geoms, hinges, *geoms)
+
+
+class Layout:
+    """What callbacks know of all simulations of a model with some effects.
+
+    Attributes:
+        label: What the last number of `userdata` is in an episode.
+    """
+
+    def __init__(self, sizes: Sequence[int], places: Places, laws: Sequence[Law]):
+        """Puts the layout into the table of the process, see `layout`.
+
+        Raises:
+            MemoryError: if the process has too many layouts.
+        """
+        self._laws = laws
+        moving = [law.start for law in laws if law.adapter is adapters.motion]
+        where = np.concatenate([places.geoms, *places.hinges]).astype(np.int64)
+        named = [(law.name, law.acts_in, law.start) for law in laws]
+        kind = repr((sizes, places.first_link, places[3:], where.tolist(), named))
+        # The same in every process, as it is part of a state that is saved.
+        number = int.from_bytes(hashlib.sha256(kind.encode()).digest()[:6], "big") + 1
+        taken = own.TABLE[:, 0].view(np.float64)
+        if 2 * np.count_nonzero(taken) >= own.CAPACITY:
+            raise MemoryError(
+                f"a process can hold {own.CAPACITY // 2} layouts of effects; start "
+                "another"
+            )
+        while 1.0 + number / own.SPAN in taken:
+            number += 1
+        self.label, slot = 1.0 + number / own.SPAN, number % own.CAPACITY
+        while taken[slot]:
+            slot = (slot + 1) % own.CAPACITY
+        lists = [self._list("passive", "contact"), self._list("control")]
+        # Addresses in the table refer to these for as long as the process lives.
+        self._kept, self._row = (where, lists), own.TABLE[slot]
+        self._row[1 : 1 + len(sizes)] = sizes
+        self._row[1 + len(sizes) :] = (
+            *(each.ctypes.data for each in lists),
+            *(places.first_link, len(places.geoms), places.hinges.shape[1] // 2),
+            *(where.ctypes.data, places.wall, places.bore),
+            *(moving[0] if moving else -1, 0),
+        )
+        # Last: threads may look for other layouts meanwhile.
+        taken[slot] = self.label
+
+    def _list(self, *callbacks: str) -> np.ndarray:
+        """Number of the laws of a callback, then adapter and parameters of each."""
+        found = [law for name in callbacks for law in self._laws if law.acts_in == name]
+        rows = [(law.adapter.address, law.start) for law in found]
+        return np.array([len(rows), *np.ravel(rows)], np.int64)
+
+    def raise_fault(self) -> None:
+        """Raises RuntimeError if a law has raised an error since the last call."""
+        fault = own.FAULT // 8
+        if not self._row[fault]:
+            return
+        start, self._row[fault] = int(self._row[fault]) - 1, 0
+        (name,) = (law.name for law in self._laws if law.start == start)
+        raise RuntimeError(
+            f"the law of {name} has raised an error in a physics step, most likely an "
+            "index beyond an array of its parameters or of the device; compare its "
+            "indices with the lengths of the arrays"
+        )
+
+
+def laws(effect: Any, kind: Any, start: int) -> list[Law]:
+    """The law of an `effects.Effect`, none or one.
+
+    Args:
+        effect: It.
+        kind: Class of its parameters.
+        start: Their place in `userdata`.
+
+    Raises:
+        ValueError: if the effect does not say where its law acts.
+    """
+    name, adapter = type(effect).__qualname__, None
+    if effect.adapter is not None:
+        adapter = getattr(adapters, effect.adapter)
+    elif effect.law is not None:
+        bounds.choice(f"{name}.acts_in", effect.acts_in, ACTS_IN)
+        adapter = adapters.made(effect.law, kind, effect.acts_in)
+    return [] if adapter is None else [Law(name, effect.acts_in, adapter, start)]
+
+
+_layouts: dict[Any, Layout] = {}
+
+
+def layout(model: mujoco.MjModel, places: Places, laws: Sequence[Law]) -> Layout:
+    """The layout of a model with some laws, the same for equal ones.
+
+    Raises:
+        RuntimeError: if a Python function stands in a callback.
+    """
+    sizes = tuple(int(getattr(model, name)) for name in own.SIZES)
+    arrays = [np.asarray(each, np.int64).tobytes() for each in places[1:3]]
+    key = (sizes, places.first_link, *arrays, *places[3:], tuple(laws))
+    if key not in _layouts:
+        _layouts[key] = Layout(sizes, places, tuple(laws))
+    stand()
+    return _layouts[key]
+
+
+def _standing(name: str) -> int:
+    """Address of the function in a callback, 0 for none.
+
+    Raises:
+        RuntimeError: if a Python function stands there.
+    """
+    stood = getattr(mujoco, f"get_{name}")()
+    if stood is not None and not hasattr(stood, "argtypes"):
+        raise RuntimeError(
+            f"{name} is the Python function {stood!r}, which compiled functions cannot "
+            "call, so the effects of this package would be missing; remove it with "
+            f"mujoco.set_{name}(None), then load or reset the environment"
+        )
+    return 0 if stood is None else ctypes.cast(stood, ctypes.c_void_p).value or 0
+
+
+def stand() -> None:
+    """Puts the functions of this module into MuJoCo's callbacks where they are not.
+
+    Whatever stands there and does not call them is called before them.
+
+    Raises:
+        RuntimeError: if a Python function stands in a callback.
+    """
+    for name, function in (("mjcb_passive", _passive), ("mjcb_control", _control)):
+        stood = _standing(name)
+        if stood == function.address or (stood and _reaches(name)):
+            continue
+        _BEFORE[name][0] = stood
+        getattr(mujoco, f"set_{name}")(function.ctypes)
+
+
+@functools.cache
+def _probe() -> dict[str, tuple[mujoco.MjModel, mujoco.MjData, Layout]]:
+    """For each callback, a simulation whose only law answers."""
+    text = "<mujoco><size nuserdata='2'/></mujoco>"
+    model = mujoco.MjModel.from_xml_string(text)
+    sizes = [int(getattr(model, name)) for name in own.SIZES]
+    places, found = Places(0, np.zeros(0)), {}
+    for name in _BEFORE:
+        law = Law("answer", name.removeprefix("mjcb_"), _answer, 0)
+        found[name] = model, mujoco.MjData(model), Layout(sizes, places, (law,))
+    return found
+
+
+def _reaches(name: str) -> bool:
+    """Whether what stands in a callback calls the function of this module."""
+    model, data, layout = _probe()[name]
+    data.userdata[:] = 0.0, layout.label
+    mujoco.mj_forward(model, data)
+    return bool(data.userdata[0])
