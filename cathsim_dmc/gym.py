@@ -1,6 +1,7 @@
 """Gymnasium ids of the tasks, registered when this module is imported.
 
-`gymnasium.make("cathsim_dmc.gym:cathsim/type1_bca-v0")` imports it by itself.
+`gymnasium.make("cathsim_dmc.gym:cathsim/type1_bca-v0")` imports it by itself, and
+`gymnasium.make_vec` with the same id makes many simulations in one batch.
 """
 
 from cathsim_dmc import extras, suite
@@ -16,8 +17,13 @@ VERSION = 0  # the same as in simulation.gymnasium, which is imported late
 # Ids with the names of their tasks.
 IDS = {f"{suite.DOMAIN}/{task}-v{VERSION}": task for task in suite.SUITE}
 
-_ENTRY = "cathsim_dmc.simulation.gymnasium:CathSimEnv"
+_MODULE = "cathsim_dmc.simulation.gymnasium"
 
 for _id, _task in IDS.items():
     if _id not in gymnasium.registry:
-        gymnasium.register(_id, _ENTRY, kwargs={"task": _task})
+        gymnasium.register(
+            _id,
+            f"{_MODULE}:CathSimEnv",
+            vector_entry_point=f"{_MODULE}:CathSimVectorEnv",
+            kwargs={"task": _task},
+        )

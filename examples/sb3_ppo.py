@@ -1,4 +1,4 @@
-"""PPO of Stable-Baselines3, evaluated and recorded as the package's own policies are.
+"""PPO of Stable-Baselines3 on the batch, evaluated and recorded as the package's own.
 
     pip install -c constraints.txt -e '.[gym]' stable-baselines3
     python examples/sb3_ppo.py --frames 150000 --out runs/sb3
@@ -21,8 +21,7 @@ import tyro
 from safetensors import safe_open
 from safetensors.torch import save_file
 from stable_baselines3 import PPO
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 import cathsim_dmc
 import cathsim_dmc.gym
@@ -51,17 +50,59 @@ PPO_SETTINGS = {
 }
 
 
-def groups_of(env: gymnasium.Env) -> np.ndarray:
-    """Output of the policy that each entry of an action takes."""
-    return np.array(env.unwrapped.environment.task.scene.catheter.action_groups)
+def flat(observation: dict, axes: int = 0) -> np.ndarray:
+    """Entries behind some leading axes as one vector, in the order of their names."""
+    entries = [observation[name] for name in sorted(observation)]
+    return np.concatenate([x.reshape(*x.shape[:axes], -1) for x in entries], axis=-1)
 
 
-def wrapped(env: gymnasium.Env) -> gymnasium.Env:
-    """The environment with one vector to observe and one action for each group."""
-    groups = groups_of(env)
-    space = gymnasium.spaces.Box(-1.0, 1.0, (groups.max() + 1,), np.float32)
-    env = gymnasium.wrappers.FlattenObservation(env)
-    return gymnasium.wrappers.TransformAction(env, lambda a: a[groups], space)
+class Batch(VecEnv):
+    """Gymnasium's vector environment of a task as Stable-Baselines3 takes it.
+
+    One vector to observe, one action for each group of motors.
+    """
+
+    def __init__(self, task: str, envs: int, **options):
+        name = f"cathsim/{task}-v{cathsim_dmc.gym.VERSION}"
+        # The next episode begins in the step that ends one.
+        mode = {"autoreset_mode": "SameStep"}
+        self.env = gymnasium.make_vec(name, envs, **mode, **options)
+        catheter = self.env.unwrapped.simulation.task.scene.catheter
+        self.groups = np.array(catheter.action_groups)  # of each entry of an action
+        action = gymnasium.spaces.Box(-1.0, 1.0, (self.groups.max() + 1,), np.float32)
+        seen = gymnasium.spaces.flatten_space(self.env.single_observation_space)
+        super().__init__(envs, seen, action)
+
+    def reset(self):
+        seeds = None if self._seeds[0] is None else self._seeds
+        observation, _ = self.env.reset(seed=seeds)
+        self._reset_seeds()
+        return flat(observation, 1)
+
+    def step_async(self, actions):
+        self._actions = actions[:, self.groups]
+
+    def step_wait(self):
+        observation, reward, terminated, truncated, seen = self.env.step(self._actions)
+        done = terminated | truncated
+        infos = [{"TimeLimit.truncated": bool(cut)} for cut in truncated & ~terminated]
+        for i in np.flatnonzero(done):
+            infos[i]["terminal_observation"] = flat(seen["final_obs"][i])
+        return flat(observation, 1), reward.astype(np.float32), done, infos
+
+    def close(self):
+        self.env.close()
+
+    def env_is_wrapped(self, wrapper_class, indices=None):
+        return [False] * self.num_envs
+
+    def get_attr(self, attr_name, indices=None):
+        return [getattr(self.env, attr_name)] * self.num_envs
+
+    def set_attr(self, attr_name, value, indices=None):
+        raise NotImplementedError("the simulations are one batch")
+
+    env_method = set_attr
 
 
 def policy_of(model: PPO, normalise: VecNormalize, groups: np.ndarray):
@@ -77,8 +118,7 @@ def policy_of(model: PPO, normalise: VecNormalize, groups: np.ndarray):
 
 def untrained(task: str, envs: int, seed: int) -> tuple[PPO, VecNormalize]:
     """PPO with new networks, and the environments that it trains in."""
-    name = f"cathsim/{task}-v{cathsim_dmc.gym.VERSION}"
-    env = make_vec_env(name, envs, seed, env_kwargs=TRAINING, wrapper_class=wrapped)
+    env = VecMonitor(Batch(task, envs, **TRAINING))
     normalise = VecNormalize(env, norm_reward=False)
     return PPO("MlpPolicy", normalise, seed=seed, verbose=1, **PPO_SETTINGS), normalise
 
@@ -127,7 +167,7 @@ def main(
         steps = model.num_timesteps
         save(out / "policy.safetensors", model, normalise, task=task, steps=steps,
              seed=seed, stable_baselines3=stable_baselines3.__version__)  # fmt: skip
-    play = policy_of(model, normalise, groups_of(normalise.venv.envs[0]))
+    play = policy_of(model, normalise, normalise.venv.venv.groups)
     for protocol in ("published", "varied"):
         result = agents.evaluate(
             play, task, episodes, protocol=protocol, observation=OBSERVATION,

@@ -1,5 +1,6 @@
 """The tasks as Gymnasium environments."""
 
+import re
 import runpy
 import warnings
 from pathlib import Path
@@ -12,7 +13,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 import cathsim_dmc.gym  # noqa: E402
 from cathsim_dmc import suite  # noqa: E402
-from cathsim_dmc.simulation.gymnasium import CathSimEnv  # noqa: E402
+from cathsim_dmc.simulation.gymnasium import CathSimEnv, CathSimVectorEnv  # noqa: E402
 
 TASK = "cathsim/simple1_bca-v0"
 EXAMPLE = Path(__file__).parents[1] / "examples" / "sb3_ppo.py"
@@ -126,6 +127,131 @@ def test_render_shows_the_device_as_it_goes():
     assert biplane.render().shape == (32, 64, 3)
 
 
+def vector(mode, vectorization="vector_entry_point", count=3, **options):
+    sync = vectorization == "sync"
+    return gymnasium.make_vec(
+        TASK, count, vectorization, {"autoreset_mode": mode} if sync else None,
+        **({} if sync else {"autoreset_mode": mode}), **options,
+    )  # fmt: skip
+
+
+def assert_alike(found, expected, path=""):
+    """Nested dictionaries and arrays of the same values and kinds."""
+    if isinstance(expected, dict):
+        assert found.keys() == expected.keys(), path
+        for key, value in expected.items():
+            assert_alike(found[key], value, f"{path}/{key}")
+    elif isinstance(expected, tuple) or (
+        isinstance(expected, np.ndarray) and expected.dtype.kind == "O"
+    ):
+        for one, other in zip(found, expected, strict=True):
+            assert_alike(one, other, path)
+    else:
+        assert type(found) is type(expected), path
+        np.testing.assert_array_equal(found, expected, err_msg=path, strict=True)
+
+
+LIVELY = {"randomisation": True, "observation": ["internal", "force"], "max_steps": 4}
+
+
+@pytest.mark.parametrize("mode", list(gymnasium.vector.AutoresetMode))
+def test_make_vec_is_the_batch_and_equals_the_single_environments(mode):
+    many, single = vector(mode, **LIVELY), vector(mode, "sync", **LIVELY)
+    assert isinstance(many, CathSimVectorEnv)
+    assert many.metadata["autoreset_mode"] is mode
+    for name in ("observation_space", "action_space", "single_observation_space"):
+        assert getattr(many, name) == getattr(single, name)
+    assert_alike(many.reset(seed=5), single.reset(seed=5))
+    many.action_space.seed(0)
+    ended = np.zeros(3, bool)
+    for index in range(11):
+        masks = []
+        if index == 2:  # episodes that end at different times
+            masks = [np.array([True, True, False])]
+        elif mode is gymnasium.vector.AutoresetMode.DISABLED and ended.any():
+            masks = [ended]
+            text = str(np.flatnonzero(ended).tolist())
+            with pytest.raises(gymnasium.error.ResetNeeded, match=re.escape(text)):
+                many.step(many.action_space.sample())
+        for mask in masks:
+            seed = [7, None, 9] if index == 2 else None
+            options = [{"reset_mask": mask.copy()} for _ in range(2)]
+            results = [
+                env.reset(seed=seed, options=own)
+                for env, own in zip((many, single), options, strict=True)
+            ]
+            assert_alike(*results)
+        action = many.action_space.sample()
+        results = [env.step(action) for env in (many, single)]
+        assert_alike(*results)
+        assert many.observation_space.contains(results[0][0])
+        ended = results[0][2] | results[0][3]
+
+
+def test_a_physics_error_ends_an_episode_of_a_vector_as_of_a_single_one():
+    nxt = gymnasium.vector.AutoresetMode.NEXT_STEP
+    many, single = vector(nxt, count=2), vector(nxt, "sync", 2)
+    many.reset(seed=0), single.reset(seed=0)
+    many.simulation.batch.qvel[1] = np.nan
+    single.envs[1].unwrapped.environment.physics.data.qvel[:] = np.nan
+    ends = []
+    for _ in range(3):
+        action = many.action_space.sample()
+        results = [env.step(action) for env in (many, single)]
+        assert_alike(*results)
+        ends.append(results[0][2].tolist())
+    assert ends == [[False, True], [False, False], [False, False]]
+
+
+@pytest.mark.parametrize(
+    "options, word",
+    [
+        ({"render_mode": "human"}, "render_mode"),
+        ({"autoreset_mode": "Never"}, "SameStep"),
+        ({"dtype": "int8"}, "dtype"),
+        ({"num_envs": 0}, "num_simulations"),
+    ],
+)
+def test_wrong_arguments_of_a_vector_are_refused(options, word):
+    with pytest.raises(ValueError, match=word):
+        CathSimVectorEnv(**{"num_envs": 2, "task": "simple1_bca", **options})
+
+
+def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
+    many = CathSimVectorEnv(
+        2, "simple1_bca", "rgb_array", fluoroscopy={"size": 32, "biplane": "LATERAL"}
+    )
+    with pytest.raises(RuntimeError, match="reset"):
+        many.step(many.action_space.sample())
+    for seed in (-1, [1], [1, "a"], 1.5):
+        with pytest.raises(ValueError, match="seed"):
+            many.reset(seed=seed)
+    for mask in ([True], np.zeros(2, bool), np.ones(2)):
+        with pytest.raises(ValueError, match="reset_mask"):
+            many.reset(options={"reset_mask": mask})
+    first = many.reset(seed=1)[0]["position"]
+    assert not np.array_equal(first, many.reset()[0]["position"])
+    view = {"size": 32, "biplane": "LATERAL"}
+    one = CathSimEnv("simple1_bca", "rgb_array", fluoroscopy=view)
+    many.reset(seed=4)
+    one.reset(seed=5)
+    shown = many.render()
+    assert len(shown) == 2 and shown[0].shape == (32, 64, 3)
+    np.testing.assert_array_equal(shown[1], one.render())
+    many.close()
+
+
+def test_gymnasiums_vector_wrappers_take_the_batch():
+    wrappers = gymnasium.wrappers.vector
+    env = gymnasium.make_vec(TASK, 2, max_steps=3)
+    env = wrappers.RecordEpisodeStatistics(wrappers.FlattenObservation(env))
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (2, *env.single_observation_space.shape)
+    for _ in range(3):
+        *_, info = env.step(env.action_space.sample())
+    assert info["episode"]["l"].tolist() == [3, 3]
+
+
 def test_torchrl_takes_the_id():
     torchrl_envs = pytest.importorskip("torchrl.envs")
     from torchrl.envs.utils import check_env_specs
@@ -155,6 +281,24 @@ def example():
     return runpy.run_path(str(EXAMPLE))
 
 
+def test_the_batch_of_the_example_tells_stable_baselines_where_episodes_end(example):
+    batch = example["Batch"]("simple1_bca", 2, max_steps=2, observation="internal")
+    batch.seed(3)
+    first, (size,) = batch.reset(), batch.observation_space.shape
+    assert first.shape == (2, size) and batch.action_space.shape == (3,)
+    alone = gymnasium.make(TASK, observation="internal", max_steps=2)
+    flat = gymnasium.wrappers.FlattenObservation(alone)
+    np.testing.assert_array_equal(first[1], flat.reset(seed=4)[0])
+    actions = np.full((2, 3), 0.5, np.float32)
+    for last in (False, True):
+        observation, _, done, infos = batch.step(actions)
+        row = flat.step(actions[1][batch.groups])
+        assert done.tolist() == [last, last]
+    np.testing.assert_array_equal(infos[1]["terminal_observation"], row[0])
+    assert infos[1]["TimeLimit.truncated"]
+    np.testing.assert_array_equal(observation[1], flat.reset()[0])
+
+
 @pytest.mark.slow
 def test_the_example_of_stable_baselines_trains_and_keeps_its_policy(example, tmp_path):
     from cathsim_dmc import agents
@@ -163,10 +307,11 @@ def test_the_example_of_stable_baselines_trains_and_keeps_its_policy(example, tm
     settings |= {"n_steps": 64, "batch_size": 64}
     model, normalise = example["untrained"]("type1_bca", 2, 0)
     model.learn(256)
-    single = normalise.venv.envs[0]
-    policy = example["policy_of"](model, normalise, example["groups_of"](single))
+    batch = normalise.venv.venv
+    assert isinstance(batch.env.unwrapped, CathSimVectorEnv)
+    policy = example["policy_of"](model, normalise, batch.groups)
     # What the network reads is in the order in which it was trained.
-    entries = single.unwrapped.observation_space.spaces
+    entries = batch.env.unwrapped.single_observation_space.spaces
     assert list(entries) == sorted(entries)
     result = agents.evaluate(
         policy, "simple1_bca", 2, observation=example["OBSERVATION"],
@@ -190,8 +335,7 @@ def test_the_policy_beside_the_example_of_stable_baselines_reaches_its_goal(exam
     path = EXAMPLE.with_suffix(".safetensors")
     assert path.stat().st_size < 2**20
     model, normalise, about = example["load"](path)
-    groups = example["groups_of"](normalise.venv.envs[0])
-    policy = example["policy_of"](model, normalise, groups)
+    policy = example["policy_of"](model, normalise, normalise.venv.venv.groups)
     result = agents.evaluate(
         policy, about["task"], 2, observation=example["OBSERVATION"],
         task_kwargs={"max_steps": 200},

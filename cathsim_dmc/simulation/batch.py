@@ -111,6 +111,11 @@ class BatchSimulation:
         seeds = bounds.seeds("seeds", seeds, self.num_simulations)
         self._random_states = [np.random.RandomState(seed) for seed in seeds]
 
+    @property
+    def random_states(self) -> tuple[np.random.RandomState, ...]:
+        """Source of randomness of each simulation."""
+        return tuple(self._random_states)
+
     def reset(self, indices: np.ndarray | None = None) -> Step:
         """Starts new episodes.
 

@@ -1,16 +1,20 @@
-"""The tasks as Gymnasium environments."""
+"""The tasks as Gymnasium environments: one simulation, or many in a batch."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 from dm_env import specs
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.imaging import angiograph
+from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.rollout import Rollout
 
 RENDER_MODES = ("rgb_array",)
 VERSION = 0  # of the ids
@@ -43,6 +47,25 @@ def _converted(observation, dtype: np.dtype) -> dict[str, np.ndarray]:
     }
 
 
+def _float_type(dtype: str) -> np.dtype:
+    return np.dtype(bounds.choice("dtype", dtype, ("float32", "float64")))
+
+
+def _render_mode(mode: str | None) -> str | None:
+    return mode and bounds.choice("render_mode", mode, RENDER_MODES)
+
+
+def _fluoroscopy(rollout: Rollout) -> np.ndarray:
+    """RGB images (N, rows, columns, 3) uint8, two planes side by side."""
+    machines = [
+        rollout.around(rollout.case(i).angiograph.planes(deviation), i)
+        for i, deviation in enumerate(rollout.deviations)
+    ]
+    image = angiograph.images(machines, rollout.shadows)
+    row = np.concatenate(list(np.moveaxis(image, -1, 0)), axis=2)
+    return np.repeat(row[..., None], 3, axis=-1)
+
+
 class CathSimEnv(gymnasium.Env):
     """One simulation of a task.
 
@@ -73,12 +96,10 @@ class CathSimEnv(gymnasium.Env):
             dtype: of the numbers observed and of the action, float32 or float64.
             **task_kwargs: options of the task, such as `observation`.
         """
-        if render_mode is not None:
-            bounds.choice("render_mode", render_mode, RENDER_MODES)
+        self.render_mode = _render_mode(render_mode)
         if "frameskip" in task_kwargs:  # TorchRL goes on without it
             raise TypeError("unexpected keyword argument 'frameskip'")
-        self.render_mode = render_mode
-        self._dtype = np.dtype(bounds.choice("dtype", dtype, ("float32", "float64")))
+        self._dtype = _float_type(dtype)
         self.environment = suite.load(suite.DOMAIN, task, task_kwargs)
         entries = self.environment.task.observation_specs
         self.observation_space = space_of(entries, self._dtype)
@@ -118,18 +139,184 @@ class CathSimEnv(gymnasium.Env):
             return None
         if self._ended is None:
             raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")
-        rollout = self.environment.task.rollout
-        machine = rollout.case().angiograph
-        planes = rollout.around(machine.planes(rollout.deviations[0]))
-        image = angiograph.images([planes], rollout.shadows)[0]
-        row = np.concatenate(list(np.moveaxis(image, -1, 0)), axis=1)
-        return np.repeat(row[..., None], 3, axis=-1)
+        return _fluoroscopy(self.environment.task.rollout)[0]
 
     def close(self) -> None:
         """Frees the simulator; closing twice does nothing."""
         if not self._closed:
             self.environment.close()
         self._closed = True
+
+
+class CathSimVectorEnv(gymnasium.vector.VectorEnv):
+    """N simulations of a task in one batch.
+
+    Simulation i gives what `CathSimEnv` gives for its seed and actions, bit for bit.
+    Episodes that have ended begin anew as `autoreset_mode` says; infos are arrays
+    (N, ...) with a mask "_name" (N,) each, as those of Gymnasium's `SyncVectorEnv`.
+
+    Attributes:
+        simulation: The batch.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        task: str = "type1_bca",
+        render_mode: str | None = None,
+        dtype: str = "float32",
+        num_threads: int = 0,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **task_kwargs: Any,
+    ):
+        """Starts the simulations.
+
+        Args:
+            num_envs: N.
+            render_mode: "rgb_array" renders fluoroscopy of each, without OpenGL.
+            dtype: Of the numbers observed and of the action, float32 or float64.
+            num_threads: Number of worker threads, 0 for one per core.
+            autoreset_mode: "NextStep" as Gymnasium's wrappers of observations expect,
+                "SameStep", or "Disabled", where `reset(options={"reset_mask": mask})`
+                begins some episodes.
+            **task_kwargs: Options of the task, such as `observation`.
+        """
+        self.render_mode = _render_mode(render_mode)
+        self._dtype = _float_type(dtype)
+        modes = [mode.value for mode in AutoresetMode]
+        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        self._mode = AutoresetMode(bounds.choice("autoreset_mode", mode, modes))
+        self.metadata = {**CathSimEnv.metadata, "autoreset_mode": self._mode}
+        self.simulation = BatchSimulation(
+            suite.make_task(task, **task_kwargs), num_envs, num_threads=num_threads
+        )
+        self.num_envs = self.simulation.num_simulations
+        for state in self.simulation.random_states:
+            state.seed(None)
+        entries = self.simulation.task.observation_specs
+        self.single_observation_space = space_of(entries, self._dtype)
+        size = self.simulation.num_actions
+        action = specs.BoundedArray((size,), self._dtype, -1.0, 1.0)
+        self.single_action_space = space(action, self._dtype)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._ended = np.zeros(self.num_envs, bool)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: Mapping[str, Any] | None = None,
+    ):
+        """Starts episodes; see `gymnasium.vector.VectorEnv.reset`.
+
+        Args:
+            seed: Seed of the first simulation, from which the others count up, or one
+                seed, or None, for each; None goes on from their random states.
+            options: {"reset_mask": mask} resets simulations where the mask (N,) bool
+                is true; the others stay.
+        """
+        mask = _reset_mask(options, self.num_envs)
+        if seed is not None:
+            seeds = _seeds(seed, self.num_envs)
+            super().reset(seed=seeds[0])
+            for i, state in enumerate(self.simulation.random_states):
+                if mask[i] and seeds[i] is not None:
+                    state.seed(seeds[i])
+        step = self.simulation.reset(np.flatnonzero(mask))
+        self._ended &= ~mask
+        return _converted(step.observation, self._dtype), _masked(step.info(), mask)
+
+    def step(self, actions: np.ndarray):
+        """Advances all by one control step; see `gymnasium.vector.VectorEnv.step`.
+
+        The last observation and the figures of an episode that has ended are in
+        "final_obs" (N objects) and "final_info" of infos, where the next one begins in
+        the same step ("SameStep").
+        """
+        waiting = self._ended
+        if waiting.any() and self._mode is AutoresetMode.DISABLED:
+            raise gymnasium.error.ResetNeeded(
+                f"the episodes of {np.flatnonzero(waiting).tolist()} have ended; call "
+                'reset(options={"reset_mask": mask})'
+            )
+        # Those that wait for their next episode are stepped too, and draw nothing.
+        states = self.simulation.random_states
+        kept = {i: states[i].get_state() for i in np.flatnonzero(waiting)}
+        step = self.simulation.step(actions)
+        for i, state in kept.items():
+            states[i].set_state(state)
+        terminated, truncated = step.terminated & ~waiting, step.truncated & ~waiting
+        reward = np.where(waiting, 0.0, step.outcome.reward)
+        self._ended, final = terminated | truncated, {}
+        if self._mode is AutoresetMode.SAME_STEP and self._ended.any():
+            waiting, self._ended = self._ended, np.zeros(self.num_envs, bool)
+            final = _final(
+                _converted(step.observation, self._dtype), step.info(), waiting
+            )
+        if waiting.any():
+            step = self.simulation.reset(np.flatnonzero(waiting))
+        observation = _converted(step.observation, self._dtype)
+        infos = {**_masked(step.info(), np.ones(self.num_envs, bool)), **final}
+        return observation, reward, terminated, truncated, infos
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Fluoroscopy of each simulation, see `CathSimEnv.render`."""
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                'render() without a render_mode; make the environment with "rgb_array"'
+            )
+            return None
+        return tuple(_fluoroscopy(self.simulation.rollout))
+
+
+def _seeds(seed: Any, count: int) -> Sequence[int | None]:
+    """One seed, or None, for each of `count` simulations; ValueError for others."""
+    if not isinstance(seed, Sequence | np.ndarray):
+        return bounds.seeds("seed", seed, count)
+    known = bounds.seeds("seed", [0 if one is None else one for one in seed], count)
+    return [
+        None if one is None else value for one, value in zip(seed, known, strict=True)
+    ]
+
+
+def _reset_mask(options: Mapping[str, Any] | None, count: int) -> np.ndarray:
+    """The simulations (count,) bool that "reset_mask" names, all without it."""
+    mask = (options or {}).get("reset_mask")
+    if mask is None:
+        return np.ones(count, bool)
+    found = np.asarray(mask)
+    if found.shape != (count,) or found.dtype != bool or not found.any():
+        allowed = f"an array ({count},) of bool with a true entry"
+        bounds.refuse("reset_mask", mask, allowed)
+    return found
+
+
+def _masked(info: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
+    """Figures (N,) where a mask (N,) is true, else zero, and "_name", the mask."""
+    masked = {}
+    for name, value in info.items():
+        masked[name] = np.where(mask, value, np.zeros_like(value))
+        masked[f"_{name}"] = mask.copy()
+    return masked
+
+
+def _final(
+    observation: Mapping[str, np.ndarray],
+    info: Mapping[str, np.ndarray],
+    mask: np.ndarray,
+) -> dict[str, Any]:
+    """The ends of episodes as Gymnasium puts them into infos."""
+    last = np.full(len(mask), None, dtype=object)
+    for i in np.flatnonzero(mask):
+        last[i] = {name: value[i] for name, value in observation.items()}
+    figures = _masked(info, mask)
+    return {
+        "final_obs": last,
+        "_final_obs": mask.copy(),
+        "final_info": figures,
+        "_final_info": mask.copy(),
+    }
 
 
 def env_spec(task: str, **options: Any) -> EnvSpec:
