@@ -1,6 +1,7 @@
 """Looking at a state or an episode in one call, on a machine without OpenGL."""
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -45,6 +46,40 @@ def test_forces_are_those_of_the_task(pushed):
     text = repr(readout)
     assert f"{1e3 * readout.wall_max:.2f} mN" in text
     assert len(text.splitlines()) == 3 + len(readout)
+
+
+def test_a_film_as_mp4_plays_the_episode(pushed, tmp_path):
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra video")
+    import imageio.v2 as imageio
+
+    env, episode = pushed
+    surface = env.task.scene.anatomy.surface
+    path = animate(episode, surface, tmp_path / "film.mp4", frames=4, width=321)
+    with imageio.get_reader(path) as film:
+        about = film.get_meta_data()
+        frames = [np.asarray(frame).astype(int) for frame in film]
+    assert about["codec"] == "h264" and about["pix_fmt"].startswith("yuv420p")
+    columns, rows = about["size"]
+    assert rows % 2 == columns % 2 == 0 and abs(columns - 321) < 4
+    # Four pictures, and the last one for a while.
+    seconds = episode.time[-1] - episode.time[0]
+    assert len(frames) == 4 + int(1500 // (1000 * seconds / 4))
+    assert about["duration"] == pytest.approx(seconds / 4 * len(frames), abs=0.1)
+    moved = np.abs(frames[0] - frames[3]).mean()
+    still = np.abs(frames[3] - frames[-1]).mean()
+    assert moved > 1 > 3 * still
+
+
+def test_without_an_encoder_no_work_is_lost(pushed, tmp_path, monkeypatch):
+    env, _ = pushed
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+
+    def never(observation):
+        raise AssertionError("it was played")
+
+    with pytest.raises(ImportError, match=r"\.\[video\]"):
+        cathsim_dmc.record(env, never, tmp_path / "film.mp4")
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_fluoroscopy_of_a_state_shows_where_the_head_is(pushed):

@@ -158,6 +158,9 @@ class TrainingConfig:
             time, so that a killed run loses no more.
         keep_checkpoints: Number of the newest checkpoints that stay on disk.
         metrics_frames: Number of frames between two rows of metrics.csv.
+        logger: Logger that gets these rows too: csv (a file for each column),
+            tensorboard, trackio or wandb, offline unless WANDB_MODE is online; each
+            but csv is an extra of that name. None takes metrics.csv alone.
         torch_device: Torch device of the networks, such as "cpu" or "cuda"; the
             simulation is always on the CPU.
         torch_threads: Number of threads of one torch operation. One is fastest for
@@ -174,7 +177,7 @@ class TrainingConfig:
     # depends on, apart from how long it lasts and where its dataset is.
     resumable: ClassVar[frozenset[str]] = frozenset(
         {"total_frames", "checkpoint_frames", "checkpoint_seconds", "keep_checkpoints"}
-        | {"metrics_frames", "num_threads", "torch_threads", "torch_device"}
+        | {"metrics_frames", "logger", "num_threads", "torch_threads", "torch_device"}
         | {"demonstrations"}
     )
 
@@ -207,6 +210,7 @@ class TrainingConfig:
     checkpoint_seconds: float = positive(120.0)
     keep_checkpoints: int = positive(3)
     metrics_frames: int = positive(2_048)
+    logger: Literal["csv", "tensorboard", "trackio", "wandb"] | None = None
     torch_device: str = "cpu"
     torch_threads: int = positive(1)
 

@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 
 from cathsim_dmc import files
+from cathsim_dmc.agents import loggers
 from cathsim_dmc.agents.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -70,6 +71,7 @@ def train(
     progress: bool = True,
     make_env: EnvFactory = environments.make_env,
     without_replay: bool = False,
+    on_checkpoint: Callable[[Path], Any] | None = None,
 ) -> TrainingResult:
     """Train an agent, or continue a run from its newest checkpoint.
 
@@ -86,6 +88,8 @@ def train(
         make_env: As for `evaluate`.
         without_replay: Whether a run that is resumed starts with an empty replay
             (SAC, DAgger), as when its files are lost.
+        on_checkpoint: Function that is called with the directory of each checkpoint
+            when it is complete; torch's random numbers are kept from it.
 
     Raises:
         ConfigError: the directory holds a run that was not to be resumed, or one with
@@ -100,6 +104,7 @@ def train(
     text = f"torch_device={config.torch_device!r} cannot be used here, 'cpu' always can"
     with files.refused(ConfigError, text, RuntimeError, AssertionError):
         torch.zeros(1, device=config.torch_device)
+    loggers.require(config.logger)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_only_process(run))
         checkpoint = _prepare(run, config, resume)
@@ -127,9 +132,10 @@ def train(
         else:
             torch.manual_seed(config.seed + 1)
         log = TrainingLog(run, learner, state, progress)
-        stack.callback(log.bar.close)
+        stack.callback(log.close)
         interruption = stack.enter_context(_interruption())
-        return _loop(run, iter(collector), learner, log, interruption)
+        call = on_checkpoint or (lambda checkpoint: None)
+        return _loop(run, iter(collector), learner, log, interruption, call)
 
 
 @contextlib.contextmanager
@@ -269,6 +275,7 @@ def _loop(
     learner: Learner,
     log: TrainingLog,
     interruption: threading.Event,
+    on_checkpoint: Callable[[Path], Any],
 ) -> TrainingResult:
     """Collect, learn, log and save, to the last frame or until an event is set."""
     config = learner.config
@@ -280,7 +287,12 @@ def _loop(
             "episodes": log.episodes,
             "window": list(log.window),
         }
-        return save_checkpoint(run, learner, log.frames, log.seconds, learning)
+        before = checkpoints_in(run)
+        newest = save_checkpoint(run, learner, log.frames, log.seconds, learning)
+        if newest not in before:
+            with torch.random.fork_rng(devices=[]):
+                on_checkpoint(newest)
+        return newest
 
     tracker = EpisodeTracker(config.num_envs)
     saved, since = log.frames, time.monotonic()

@@ -1,4 +1,4 @@
-"""Figures of a training run: metrics.csv and progress."""
+"""Figures of a training run: metrics.csv, a logger and progress."""
 
 import csv
 import io
@@ -17,6 +17,7 @@ from cathsim_dmc import files
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.learner import Learner
+from cathsim_dmc.agents.loggers import FigureLogger
 
 # Seconds between two lines of progress in a log file, where no terminal redraws them.
 LINE_INTERVAL = 15.0
@@ -70,10 +71,16 @@ class TrainingLog:
         rows = read_metrics(self._path)
         self._rows = [r for r in rows if (r["frames"] or 0) <= self.frames]
         self._write()
+        self._logger = FigureLogger(config.logger, run, self._rows)
         label, total = f"{config.algorithm} {config.task}", config.total_frames
         done = {"initial": self.frames, "disable": not progress}
         self.bar = progress_bar(label, " frames", total=total, **done)
         self._before, self._began = state, time.monotonic()
+
+    def close(self) -> None:
+        """Close the logger and the progress bar."""
+        self.bar.close()
+        self._logger.close()
 
     @property
     def seconds(self) -> float:
@@ -111,6 +118,7 @@ class TrainingLog:
             }
             self._rows.append(self.row)
             self._write()
+            self._logger.show(self.row)
         known = {name: value for name, value in means.items() if value is not None}
         self.bar.set_postfix(known, refresh=False)
         self.bar.update(frames)

@@ -26,8 +26,9 @@ from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons, recorde
 from cathsim_dmc.cli.options import Json, Task, Threads, print_json, say
 from cathsim_dmc.cli.task_options import TaskOptions, task_kind
 from cathsim_dmc.pictures import recorded
-from cathsim_dmc.pictures.animation import SUFFIXES
+from cathsim_dmc.pictures.films import SUFFIXES, check_film
 from cathsim_dmc.policies import in_environment
+from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
@@ -218,7 +219,7 @@ def record(
     policy: PolicyName,
     /,
     out: Path | None = None,
-    gif: Path | None = None,
+    gif: Annotated[Path | None, conf.arg(aliases=("--mp4", "--film"))] = None,
     task: PolicysTask = None,
     seed: int = evaluation.EVALUATION_SEED,
     fluoroscopy: bool = True,
@@ -232,7 +233,8 @@ def record(
 
     Args:
         out: Path of the .rrd file.
-        gif: Path of a film for slides, .gif or .webp; needs no OpenGL.
+        gif: Path of a film for slides, .gif, .webp or, with the extra `video`, .mp4;
+            needs no OpenGL.
         seed: Seed of the episode.
         fluoroscopy: Whether to include X-ray images.
         options: Options of the task, over those that the policy was trained with.
@@ -243,6 +245,8 @@ def record(
     for path, endings in (out, (".rrd",)), (gif, SUFFIXES):
         if path is not None and path.suffix not in endings:
             raise ValueError(f"{path} does not end in {' or '.join(endings)}")
+    if gif is not None:
+        check_film(gif)
     bounds.seed("seed", seed)
     player = agents.load_policy(policy, seed)
     task, task_kwargs = task_and_options(player, task, options.given)
@@ -250,11 +254,7 @@ def record(
     # Now: an episode that cannot be written would be lost.
     for path in targets:
         files.require_file(path, make=True)
-    if player.observation is not None:
-        task_kwargs["observation"] = player.observation
-    env = suite.load(suite.DOMAIN, task, {**task_kwargs, "random": seed})
-    recorder = EpisodeRecorder(env, task, task_kwargs)
-    episode = recorder.record_episode(in_environment(player, env), seed)
+    episode, env = _played(player, task, task_kwargs, seed)
     if out is not None:
         recorded.write(episode, env, out, fluoroscopy)
         episode.save(out.with_suffix(".npz"))
@@ -268,6 +268,33 @@ def record(
             f"force {millinewtons(forces.max_force)} mN (largest single contact)"
         )
     return 0
+
+
+def _played(
+    player: Any, task: str, task_kwargs: Mapping[str, Any], seed: int
+) -> tuple[Episode, Any]:
+    """An episode of a policy, and the environment that it was played in."""
+    options = dict(task_kwargs)
+    if player.observation is not None:
+        options["observation"] = player.observation
+    env = suite.load(suite.DOMAIN, task, {**options, "random": seed})
+    recorder = EpisodeRecorder(env, task, options)
+    return recorder.record_episode(in_environment(player, env), seed), env
+
+
+def film_checkpoint(checkpoint: Path, folder: Path, suffix: str) -> Path:
+    """Film an episode of a checkpoint's policy, on the task as it is evaluated.
+
+    Args:
+        folder: Directory of the films; the file has the name of the checkpoint.
+        suffix: Ending of the file, of `pictures.films.SUFFIXES`.
+    """
+    seed = evaluation.EVALUATION_SEED
+    player = agents.load_policy(str(checkpoint), seed)
+    task, task_kwargs = task_and_options(player, None, {})
+    episode, env = _played(player, task, task_kwargs, seed)
+    folder.mkdir(exist_ok=True)
+    return recorded.write(episode, env, folder / f"{checkpoint.name}{suffix}")
 
 
 def demos(

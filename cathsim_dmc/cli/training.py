@@ -7,8 +7,9 @@ import functools
 import json
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro import conf
 
@@ -37,6 +38,8 @@ class _Run:
         without_replay: Whether a run that is resumed starts with an empty replay (SAC,
             DAgger), as when its files are lost.
         quiet: Whether to show no progress.
+        films: Kind of the film of an episode that is made of each checkpoint, in the
+            folder films of OUT: gif, webp or, with the extra `video`, mp4.
     """
 
     out: Path
@@ -45,6 +48,7 @@ class _Run:
     resume: bool = False
     without_replay: bool = False
     quiet: bool = False
+    films: Literal["gif", "webp", "mp4"] | None = None
 
 
 def command(arguments: list[str]) -> Any:
@@ -78,7 +82,9 @@ def command(arguments: list[str]) -> Any:
             **vars(options.settings),
             task_kwargs={**settings.task_kwargs, **options.options.given},
         )
-        how = {"resume": run.resume, "without_replay": run.without_replay}
+        how: Any = {"resume": run.resume, "without_replay": run.without_replay}
+        if run.films:
+            how["on_checkpoint"] = _filming(run.out / "films", f".{run.films}")
         result = agents.train(config, run.out, progress=not run.quiet, **how)
         if result.interrupted:
             again = ["cathsim", "train", config.task, "--out", str(run.out), "--resume"]
@@ -94,6 +100,16 @@ def command(arguments: list[str]) -> Any:
     # The class of the options is made here, so no annotation can name it.
     train.__annotations__["options"] = Annotated[options, conf.arg(name="")]
     return train
+
+
+def _filming(folder: Path, suffix: str) -> Callable[[Path], Any]:
+    """What films a checkpoint, if films of that kind can be written."""
+    # Imported late: trainings without films draw nothing.
+    from cathsim_dmc.cli.agents import film_checkpoint
+    from cathsim_dmc.pictures.films import check_film
+
+    check_film(folder / f"film{suffix}")
+    return lambda checkpoint: film_checkpoint(checkpoint, folder, suffix)
 
 
 def _settings(arguments: list[str]) -> tuple[agents.TrainingConfig, bool]:

@@ -11,11 +11,11 @@ from PIL import Image
 
 from cathsim_dmc.files import atomic_path, require_file
 from cathsim_dmc.pictures import figure as drawing
+from cathsim_dmc.pictures.films import MP4, check_film, write_mp4
 from cathsim_dmc.pictures.moment import Moment, on_screen
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 
-SUFFIXES = (".gif", ".webp")
 FRAMES = 90
 _LENGTH = 2.0, 12.0  # s of a film, without its last pause
 # The last frame stays for so long before it begins again, ms.
@@ -37,14 +37,14 @@ def animate(
     width: int = 860,
     quality: int = 80,
 ) -> Path:
-    """Write an episode as an animated GIF or WebP, whole or not at all.
+    """Write an episode as an animated GIF or WebP or an MP4, whole or not at all.
 
     On the left the vessel as glass with device, goal and contact forces, on the right
     the X-ray image over the force on the wall.
 
     Args:
         surface: Lumen surface, `anatomy.surface`.
-        path: File to write, `.gif` or `.webp`.
+        path: File to write, `.gif`, `.webp` or, with the extra `video`, `.mp4`.
         frames: Number of pictures at most; an episode has one state every 40 ms.
         width: Width of the film, pixels.
         quality: Quality of a WebP, 0 to 100.
@@ -55,17 +55,19 @@ def animate(
     Raises:
         ValueError: on another suffix, or an episode without a goal.
         FileNotFoundError: if the folder does not exist.
+        ImportError: if an MP4 is asked for and cannot be encoded.
     """
     path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise ValueError(f"a film is a {' or '.join(SUFFIXES)} file, not {path.name}")
+    check_film(path)
     require_file(path)
     seconds = np.clip(episode.time[-1] - episode.time[0], *_LENGTH)
     count = min(frames, episode.steps + 1)
     chosen = np.unique(np.linspace(0, episode.steps, count).round().astype(int))
-    made = _frames(episode, surface, width, chosen)
+    made = list(_frames(episode, surface, width, chosen))
+    tick = max(round(1000 * seconds / len(made)), _TICK_MS)
+    if path.suffix == MP4:
+        return write_mp4(path, made, tick, _HOLD_MS)
     pictures = [Image.fromarray(picture) for picture in made]
-    tick = max(round(1000 * seconds / len(pictures)), _TICK_MS)
     times = [tick] * (len(pictures) - 1) + [_HOLD_MS]
     options: dict[str, Any] = {"quality": quality, "method": 4}
     if path.suffix == ".gif":

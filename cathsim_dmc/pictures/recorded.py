@@ -11,6 +11,7 @@ from cathsim_dmc import bounds, files, policies
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.pictures.films import SUFFIXES, check_film
 from cathsim_dmc.pictures.moment import on_screen
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
@@ -19,7 +20,7 @@ from cathsim_dmc.recording.records import MESH_EVERY, VesselRecord, XRayRecord
 # A name of `policies.POLICIES`, a policy, or a function from the observation (a
 # dictionary of arrays) to the action (A,).
 AnyPolicy = str | policies.Policy | Callable[[Any], np.ndarray]
-FORMATS = (".rrd", ".npz", ".gif", ".webp")
+FORMATS = (".rrd", ".npz", *SUFFIXES)
 _FILM_SIZE = 512  # pixels along a side of the X-ray images of a recording
 
 
@@ -38,8 +39,8 @@ def record(
         env: What `cathsim_dmc.suite.load` returns; it stays usable.
         policy: Name in `policies.POLICIES`, a `Policy`, or a function from the
             observation to the action.
-        path: File to write: `.rrd` (Rerun), `.npz` (arrays), `.gif` or `.webp`
-            (moving picture); None writes none.
+        path: File to write: `.rrd` (Rerun), `.npz` (arrays), `.gif`, `.webp` or
+            `.mp4` (moving picture); None writes none.
         seed: Seed of the episode; None goes on from the environment's random state.
         max_steps: Number of control steps after which the episode is cut off.
         task_name: Name of the task in the record; that of the environment otherwise.
@@ -52,6 +53,7 @@ def record(
         ValueError: the policy's name or the file's kind does not exist, or the policy
             returns no action of the environment.
         OSError: the file's folder does not exist or is read-only.
+        ImportError: an MP4 is asked for without the extra `video`.
     """
     if path is not None:
         _checked(path)
@@ -70,6 +72,8 @@ def _checked(path: str | os.PathLike[str]) -> Path:
             f"the recording is to be written to {target}; give a file that ends in "
             f"{', '.join(FORMATS)}"
         )
+    if target.suffix in SUFFIXES:
+        check_film(target)
     return files.require_file(target)
 
 
