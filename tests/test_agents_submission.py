@@ -3,13 +3,22 @@
 import hashlib
 import importlib.util
 import json
+import shutil
+from html import unescape
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
 from cathsim_dmc import __version__
-from cathsim_dmc.agents import evaluation, pretrained, submission
+from cathsim_dmc.agents import (
+    entries,
+    evaluation,
+    pretrained,
+    protocols,
+    submission,
+)
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, Statistics
 
@@ -25,11 +34,11 @@ def played(monkeypatch):
         statistics = Statistics(mean=0.1, mean_in_contact=0.2, maximum=0.6)
         forces = EpisodeForces(*[statistics] * 4)
         outcomes = tuple(
-            EpisodeOutcome(n, 1.0, 50, True, n % 2 == 0, forces, False, 1.0)
+            EpisodeOutcome(n, float(n), 50, True, n % 2 == 0, forces, False, 1.0)
             for n in range(100)
         )
-        settings = {"protocol": protocol, "task_kwargs": {}}
-        seeds = tuple(range(100))
+        settings = {"protocol": protocol, "task_kwargs": {}, "observation": "internal"}
+        seeds = tuple(submission.protocol_seeds(task, {}, 100))
         return evaluation.EvaluationResult(task, policy, seeds, outcomes, settings)
 
     monkeypatch.setattr(evaluation, "evaluate", evaluate)
@@ -47,38 +56,224 @@ def script(monkeypatch):
     return module
 
 
+def sealed(path, values):
+    """Write a submission as a forger would, with a digest that fits."""
+    path.write_text(json.dumps({**values, "sha256": submission.seal(values)}))
+    return path
+
+
+def summed(values):
+    """A submission whose summary is that of its episodes."""
+    episodes = tuple(entries._episode(n, e) for n, e in enumerate(values["episodes"]))
+    seeds = tuple(row["seed"] for row in values["episodes"])
+    result = evaluation.EvaluationResult("", "", seeds, episodes, {})
+    return {**values, "summary": json.loads(json.dumps(result.summary()))}
+
+
 def test_a_submission_holds_hashes_and_every_episode(played, script, tmp_path):
     name = "pretrained:type1_lcca"
     path = tmp_path / "sub" / "one.json"
     submission.submit(name, path, "type1_lcca")
-    found = script.read(path)
+    entry = entries.read(path)
+    found = entry.values
     lines = len(path.read_text().splitlines())
     assert lines == 100 + len(found) + 3  # a line for each episode and entry
     card = json.loads(pretrained.pretrained_path(name).with_suffix(".json").read_text())
     assert found["policy_sha256"] == card["sha256"]
     assert found["package"] == __version__ and found["commit"]
+    assert found["versions"]["cathsim-dmc"] == __version__
+    assert found["versions"]["mujoco"] == mujoco.__version__
     assert len(found["episodes"]) == 100 and found["summary"]["success"] == 0.5
     assert found["summary"]["safe_success"] == {"0.5 N": 0, "1 N": 0.5, "2 N": 0.5}
-    *_, row = script.table([found])
+    *_, row = script.table([(entry, None)])
     assert "| 50 (40–60) | 0 | 2.0 | 100.0 |" in row and card["sha256"][:12] in row
+    assert row.endswith("| no |")
 
 
-def test_an_edited_or_a_short_submission_is_refused(played, script, tmp_path):
+def copied(values):
+    values["episodes"] = [
+        {**values["episodes"][0], "seed": row["seed"]} for row in values["episodes"]
+    ]
+
+
+# What a forger changes, beside the digest, and what is said of it.
+FORGERIES = {
+    "its summary is not": lambda v: v["summary"].update(success=1.0),
+    "summary is not that": lambda v: v["episodes"][1].update(success=True),
+    "copies of others": copied,
+    "its seeds are not": lambda v: v["episodes"].reverse(),
+    "seeds are not those": lambda v: v["episodes"][3].update(seed=7),
+    "changes the options": lambda v: v["settings"].update(
+        task_kwargs={"goal_radius": 0.02}
+    ),
+    "it has 3 episodes": lambda v: v.update(episodes=v["episodes"][:3]),
+    "protocol is 'published'": lambda v: v["settings"].update(protocol="published"),
+    "task is 'easy'": lambda v: v.update(task="easy"),
+    "length is 0": lambda v: v["episodes"][0].update(length=0),
+    "reward is inf": lambda v: v["episodes"][0].update(reward=float("inf")),
+    "sum.mean is nan": lambda v: v["episodes"][0]["forces"]["sum"].update(
+        mean=float("nan")
+    ),
+    "episode 0 succeeds, but": lambda v: v["episodes"][0].update(physics_error=True),
+    "episode 1 is cut off": lambda v: v["episodes"][1].update(terminated=False),
+    "policy is": lambda v: v.update(policy="a" * 300),
+    "commit is 3": lambda v: v.update(commit=3),
+    "'versions'|'package'": lambda v: v.pop("package"),
+    "settings is": lambda v: v.update(settings=[]),
+}
+
+
+@pytest.mark.parametrize("message", FORGERIES)
+def test_a_forged_submission_is_refused(played, tmp_path, message):
     path = tmp_path / "one.json"
     values = submission.submit("push", path, "type1_lcca")
     assert values["policy_sha256"] is None
-    values["summary"]["success"] = 1.0
+    entries.read(path)
+    FORGERIES[message](values)
     path.write_text(json.dumps(values))
-    with pytest.raises(ValueError, match="changed after"):
-        script.read(path)
-    values["settings"]["task_kwargs"] = {"goal_radius": 0.02}
-    path.write_text(json.dumps({**values, "sha256": submission.seal(values)}))
-    with pytest.raises(ValueError, match="changes the options"):
-        script.read(path)
-    values["episodes"] = values["episodes"][:3]
-    path.write_text(json.dumps({**values, "sha256": submission.seal(values)}))
-    with pytest.raises(ValueError, match="not the 100 episodes"):
-        script.read(path)
+    with pytest.raises(ValueError, match="one.json is not listed: it was changed"):
+        entries.read(path)
+    with pytest.raises(ValueError, match=f"one.json is not listed: .*{message}"):
+        entries.read(sealed(path, values))
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", "[" * 10**6, " " * 2**22 + "{}"])
+def test_what_is_no_submission_is_refused_in_one_line(tmp_path, text):
+    (tmp_path / "one.json").write_text(text)
+    with pytest.raises(ValueError, match="one.json is not listed") as caught:
+        entries.read(tmp_path / "one.json")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "<script>alert(1)</script>",
+        "a` | 100 | `b",
+        "[a](javascript:alert(1))",
+        "![a](https://a.b/c.png)",
+        "a\n\n# b",
+        "a \u202e b",
+        "*a*",
+    ],
+)
+def test_a_name_is_no_markup(played, script, tmp_path, name):
+    path = tmp_path / "one.json"
+    values = submission.submit("push", path, "type1_lcca")
+    plain, forged = values, {**values, "policy": name, "commit": name}
+    rows = [
+        script.table([(entries.read(sealed(path, one)), None)])[-1]
+        for one in (plain, forged)
+    ]
+    assert rows[0].count("|") == rows[1].count("|")
+    assert not set("<>[]()*`!\n\u202e") & set(rows[1].split("|")[2])
+    markdown = pytest.importorskip("markdown")
+    table = [*script.table([])[:2], rows[1]]
+    html = markdown.markdown("\n".join(table), extensions=["tables"])
+    assert html.count("<td") == 9
+    assert not any(f"<{tag}" in html for tag in ("script", "a ", "img", "em", "h1"))
+    if name.isprintable():
+        assert name in unescape(html)
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """The protocol has four episodes."""
+    own = protocols.PROTOCOLS["varied"]._replace(episodes=4)
+    monkeypatch.setitem(protocols.PROTOCOLS, "varied", own)
+
+
+def test_a_replay_finds_what_was_not_played(short, script, tmp_path):
+    path = tmp_path / "one.json"
+    values = submission.submit("push", path, "type1_bca")
+    entry = entries.read(path)
+    again = entries.replay(entry)
+    assert again.equal == 4 and again.source == "policy"
+    *_, row = script.table([(entry, again)])
+    assert (
+        row.endswith("| policy: 4 of 4 equal |")
+        and not path.with_suffix(".npz").exists()
+    )
+    for episode in values["episodes"]:
+        episode["forces"]["peak_sum"]["maximum"] = 0.01
+    forged = entries.read(sealed(path, summed(values)))
+    assert forged.result.safe_success(0.5) == 1.0
+    with pytest.raises(ValueError, match="4 of its 4 episodes are others .*seed 10000"):
+        entries.replay(forged)
+    # Of other versions the figures are those of the replay.
+    values["versions"]["mujoco"] = "3.0.0"
+    forged = entries.read(sealed(path, summed(values)))
+    again = entries.replay(forged)
+    assert again.equal == 0
+    assert script.table([(forged, again)])[-1] == row.replace("4 of 4", "0 of 4")
+    values["policy_sha256"] = "a" * 64
+    with pytest.raises(ValueError, match="its weights are not those of push"):
+        entries.replay(entries.read(sealed(path, summed(values))))
+
+
+def test_a_policy_that_does_not_ship_is_replayed_by_its_actions(short, tmp_path):
+    mine, out = tmp_path / "mine.npz", tmp_path / "one.json"
+    submission.record_actions("push", mine, "type1_bca")
+    values = submission.submit(str(mine), out)
+    beside = out.with_suffix(".npz")
+    assert beside.read_bytes() == mine.read_bytes()
+    entry = entries.read(out)
+    again = entries.replay(entry)
+    assert again.equal == 4 and again.source == "actions"
+    changed = {**np.load(mine)}
+    changed["actions"] = -changed["actions"]
+    np.savez_compressed(beside, **changed)
+    with pytest.raises(ValueError, match="one.npz is not the file of actions"):
+        entries.replay(entry)
+    values["actions_sha256"] = submission.file_digest(beside)
+    with pytest.raises(ValueError, match="4 of its 4 episodes are others"):
+        entries.replay(entries.read(sealed(out, values)))
+    wrong = {
+        "seeds": (np.arange(4), "not the 4 of the varied"),
+        "actions": (changed["actions"][..., :7], "has 7 numbers in an action"),
+        "header": (
+            json.dumps({**json.loads(str(changed["header"])), "task": "type1_lcca"}),
+            "not the 4 of the varied protocol on type1_bca",
+        ),
+    }
+    for name, (value, message) in wrong.items():
+        np.savez_compressed(beside, **{**changed, name: value})
+        values["actions_sha256"] = submission.file_digest(beside)
+        with pytest.raises(ValueError, match=message):
+            entries.replay(entries.read(sealed(out, values)))
+    beside.unlink()
+    assert entries.replay(entry) is None
+
+
+def test_weights_that_do_not_ship_leave_their_actions(short, tmp_path):
+    for path in pretrained.DIRECTORY.glob("navigator.*"):
+        shutil.copy(path, tmp_path)
+    card = tmp_path / "navigator.json"
+    card.write_text(json.dumps({**json.loads(card.read_text()), "name": "mine"}))
+    out = tmp_path / "one.json"
+    submission.submit(str(tmp_path / "navigator.safetensors"), out, "type1_bca")
+    entry = entries.read(out)
+    assert out.with_suffix(".npz").is_file()
+    again = entries.replay(entry)
+    assert again.equal == 4 and again.source == "actions"
+
+
+def without_figures(row):
+    cells = row.split("|")
+    return cells[1:3] + cells[7:9]
+
+
+def test_the_page_lists_the_submissions(script):
+    """Rows that were replayed with other versions have the figures of the replay."""
+    found = [(entries.read(path), None) for path in script.FOLDER.glob("*.json")]
+    text = script.PAGE.read_text()
+    rows = [row for row in text.splitlines() if row.startswith("| `")]
+    told = " in docs/leaderboard.md: run docs/scripts/leaderboard.py"
+    assert len(rows) == len(found), f"{len(rows)} rows{told}"
+    for line in script.table(found)[2:]:
+        (row,) = [r for r in rows if without_figures(r) == without_figures(line)]
+        if row.rstrip(" |").endswith(("no", "100 of 100 equal")):
+            assert row.split("|")[:-2] == line.split("|")[:-2], row + told
 
 
 @pytest.mark.parametrize(
@@ -88,12 +283,6 @@ def test_an_edited_or_a_short_submission_is_refused(played, script, tmp_path):
 def test_bad_submissions_are_refused_before_they_are_played(out, task, message):
     with pytest.raises(ValueError, match=message):
         submission.submit("push", out, task)
-
-
-def test_the_page_lists_the_submissions(script):
-    rows = script.table([script.read(path) for path in script.FOLDER.glob("*.json")])
-    text = script.PAGE.read_text()
-    assert all(row in text for row in rows), "run docs/scripts/leaderboard.py"
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +308,7 @@ def test_recorded_actions_give_the_same_episodes(recorded, tmp_path):
 @pytest.mark.parametrize(
     "changed, given, message",
     [
-        ({}, {"episodes": None}, "holds 4 episodes, not the 100 of the varied"),
+        ({}, {"episodes": None}, "are 4 episodes, not the 100 of the varied"),
         ({}, {"task": "type1_bca"}, "actions of type1_lcca, not of type1_bca"),
         ({"actions": np.full((4, 12, 21), np.nan, np.float32)}, {}, "finite numbers"),
         ({"actions": np.zeros(48)}, {}, "float64 of shape"),

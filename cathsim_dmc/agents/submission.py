@@ -1,8 +1,11 @@
 """Submissions to the leaderboard: a policy under the varied protocol, with hashes."""
 
+import functools
 import hashlib
 import json
 import subprocess
+from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +16,11 @@ from cathsim_dmc.agents import evaluation, pretrained, protocols
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.policies import PolicyLike, load_policy
 from cathsim_dmc.policies import POLICIES, Policy, View
+from cathsim_dmc.tasks.config import MAX_STEPS
 
 PROTOCOL = "varied"
 RECORDED = ".npz"  # ending of a file of actions
+_DECIDING = ("mujoco", "dm-control", "numpy", "numba", "torch")
 
 
 def submit(
@@ -28,13 +33,14 @@ def submit(
 ) -> dict[str, Any]:
     """Plays a policy under the varied protocol and writes its submission.
 
-    The protocol and its seeds are fixed, so whoever has the policy, the package and
-    the commit gets the same episodes.
+    The protocol and its seeds are fixed, so whoever has the policy, or its actions,
+    and the same versions gets the same episodes. The actions of a policy that does not
+    ship with the package are written beside the submission, as .npz.
 
     Args:
         policy: Name of a policy, "pretrained:NAME", file of a pretrained policy or of
             `record_actions`, or directory of a run.
-        out: File to write, ending in .json.
+        out: File to write, ending in .json; the actions go into a file beside it.
         task: Name of the task; None takes the one that the policy was trained on.
         episodes: Number of episodes, fewer than those of the protocol to try it out.
         num_threads: Number of threads of the simulation; None takes one per core.
@@ -53,25 +59,27 @@ def submit(
     if task is not None:
         bounds.choice("task", task, suite.SUITE)
     weights = digest_of(policy)
-    player: str | RecordedActions = policy
+    player: str | RecordedActions | _Recorder = policy
     if policy.endswith(RECORDED):
         player = RecordedActions(policy)
         if task not in (None, player.task):
             raise ValueError(f"{policy} holds actions of {player.task}, not of {task}")
-        own = bounds.choice("task", player.task, suite.SUITE), player.task_kwargs or {}
-        conditions, seed = protocols.get(PROTOCOL), evaluation.EVALUATION_SEED
-        count = episodes or conditions.episodes
-        parts = protocols.parts(conditions, *own, count, seed)
-        if player.seeds != [seed for part in parts for seed in part.seeds]:
-            raise ValueError(
-                f"{policy} holds {len(player.seeds)} episodes, not the {count} of "
-                f"the {PROTOCOL} protocol; record them with agents.record_actions"
-            )
+        player.require(bounds.choice("task", player.task, suite.SUITE), episodes)
+    elif not ships(policy):
+        player = _Recorder(load_policy(policy, evaluation.EVALUATION_SEED))
     files.require_file(out, make=True)
     result = evaluation.evaluate(
         player, task, episodes, protocol=PROTOCOL, num_threads=num_threads
     )
-    ours = {"policy_sha256": weights, "package": __version__, "commit": _commit()}
+    ours: dict[str, Any] = {"policy_sha256": weights, "package": __version__}
+    ours |= {"commit": _commit(), "versions": versions()}
+    if not isinstance(player, str):
+        beside = out.with_suffix(RECORDED)
+        if isinstance(player, _Recorder):
+            player.write(beside, result)
+        elif not (beside.exists() and beside.samefile(policy)):
+            files.write_bytes(beside, Path(policy).read_bytes())
+        ours["actions_sha256"] = file_digest(beside)
     values = {**ours, **result.to_dict()}
     submission = json.loads(json.dumps(values, default=str))
     submission["sha256"] = seal(submission)
@@ -94,6 +102,36 @@ def seal(submission: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
+def ships(policy: str) -> bool:
+    """Whether a policy comes with the package, under a name."""
+    shipped = pretrained.pretrained_names()
+    return policy in POLICIES or policy in [pretrained.PREFIX + n for n in shipped]
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides an episode; other ones may give other episodes."""
+    others = {name: version(name) for name in _DECIDING}
+    return {"cathsim-dmc": __version__, **others}
+
+
+def protocol_seeds(task: str, options: Mapping[str, Any], episodes: int) -> list[int]:
+    """Seeds of the episodes of the protocol, in the order in which they are played."""
+    return list(_protocol_seeds(task, json.dumps(options, sort_keys=True), episodes))
+
+
+@functools.lru_cache(256)
+def _protocol_seeds(task: str, options: str, episodes: int) -> tuple[int, ...]:
+    conditions, seed = protocols.get(PROTOCOL), evaluation.EVALUATION_SEED
+    parts = protocols.parts(conditions, task, json.loads(options), episodes, seed)
+    return tuple(seed for part in parts for seed in part.seeds)
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def digest_of(policy: str) -> str | None:
     """SHA-256 of a policy's weights or recorded actions; None without a file."""
     if policy in POLICIES:
@@ -102,7 +140,7 @@ def digest_of(policy: str) -> str | None:
     if policy.endswith(RECORDED):
         path = Path(policy)
     if path is not None:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        return file_digest(path)
     sums = json.dumps(dict(Checkpoint.open(policy).sha256), sort_keys=True)
     return hashlib.sha256(sums.encode()).hexdigest()
 
@@ -139,13 +177,31 @@ class RecordedActions(Policy):
             self.seeds = bounds.array("seeds", seeds, "i", (-1,)).tolist()
             shape = len(self.seeds), -1, -1
             self.actions = bounds.array("actions", actions, "f", shape)
+            bounds.whole("steps", self.actions.shape[1], 1, MAX_STEPS)
         self._rows, self._step = slice(0, 0), 0
 
     def reset(self, view: View, which: np.ndarray) -> None:
         """Begin episodes; those of other simulations follow those before."""
+        if self.actions.shape[-1] != view.num_actions:
+            raise ValueError(
+                f"{self.name} has {self.actions.shape[-1]} numbers in an action, the "
+                f"task {self.task} takes {view.num_actions}"
+            )
         if which.all():
             first = self._rows.stop
             self._rows, self._step = slice(first, first + view.num_simulations), 0
+
+    def require(self, task: str, episodes: int | None = None) -> None:
+        """ValueError unless the actions are those of the protocol on a task."""
+        options = self.task_kwargs or {}
+        count = episodes or protocols.get(PROTOCOL).episodes
+        bounds.whole("max_steps", options.get("max_steps", MAX_STEPS), 1, MAX_STEPS)
+        if self.task != task or self.seeds != protocol_seeds(task, options, count):
+            raise ValueError(
+                f"{self.name} of {self.task} are {len(self.seeds)} episodes, not the "
+                f"{count} of the {PROTOCOL} protocol on {task}; record them with "
+                "agents.record_actions"
+            )
 
     def act(self, observation: Any) -> np.ndarray:
         """Actions (N, A) of the step."""
@@ -160,6 +216,7 @@ class _Recorder(Policy):
     def __init__(self, policy: Policy):
         self._policy, self.name, self.task = policy, policy.name, policy.task
         self.observation, self.task_kwargs = policy.observation, policy.task_kwargs
+        self.checkpoint = getattr(policy, "checkpoint", None)
         self.batches: list[list[np.ndarray]] = []
 
     def reset(self, view: View, which: np.ndarray) -> None:
@@ -171,6 +228,20 @@ class _Recorder(Policy):
         action = self._policy.act(observation)
         self.batches[-1].append(np.array(action, np.float32))
         return action
+
+    def write(self, path: Path, result: evaluation.EvaluationResult) -> None:
+        """Writes the actions of the episodes, with zeros behind their ends."""
+        length = max(map(len, self.batches))
+        found = [np.stack(batch, axis=1) for batch in self.batches]  # (N, steps, A)
+        rest = [((0, 0), (0, length - one.shape[1]), (0, 0)) for one in found]
+        actions = np.concatenate(list(map(np.pad, found, rest)))
+        for episode, one in zip(result.episodes, actions, strict=True):
+            one[episode.length :] = 0.0
+        own = {name: result.settings[name] for name in ("observation", "task_kwargs")}
+        header = json.dumps({"policy": result.policy, "task": result.task, **own})
+        arrays = {"header": header, "seeds": result.seeds, "actions": actions}
+        with files.atomic_path(path, RECORDED) as part, open(part, "wb") as stream:
+            np.savez_compressed(stream, **arrays)
 
 
 def record_actions(
@@ -189,17 +260,8 @@ def record_actions(
         What the policy reached.
     """
     recorder = _Recorder(load_policy(policy, evaluation.EVALUATION_SEED))
-    with files.atomic_path(out, RECORDED) as path:
-        result = evaluation.evaluate(recorder, task, protocol=PROTOCOL, **options)
-        length = max(map(len, recorder.batches))
-        found = [np.stack(batch, axis=1) for batch in recorder.batches]  # (N, steps, A)
-        rest = [((0, 0), (0, length - one.shape[1]), (0, 0)) for one in found]
-        actions = np.concatenate(list(map(np.pad, found, rest)))
-        for episode, one in zip(result.episodes, actions, strict=True):
-            one[episode.length :] = 0.0
-        own = {name: result.settings[name] for name in ("observation", "task_kwargs")}
-        header = json.dumps({"policy": result.policy, "task": result.task, **own})
-        arrays = {"header": header, "seeds": result.seeds, "actions": actions}
-        with open(path, "wb") as stream:
-            np.savez_compressed(stream, **arrays)
+    if files.require_file(out).suffix != RECORDED:
+        raise ValueError(f"the actions are to be written to {out}; give a .npz file")
+    result = evaluation.evaluate(recorder, task, protocol=PROTOCOL, **options)
+    recorder.write(Path(out), result)
     return result

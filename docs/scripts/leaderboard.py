@@ -1,63 +1,92 @@
 """Writes docs/leaderboard.md from the submissions in docs/data/leaderboard.
 
 cathsim submit POLICY --task TASK --out docs/data/leaderboard/NAME.json
-python docs/scripts/leaderboard.py
+python docs/scripts/leaderboard.py              # plays all episodes again, for an hour
+python docs/scripts/leaderboard.py --no-replay  # believes them, and says so
 """
 
-import json
+import argparse
+import re
 import sys
 
 import figures
 
-from cathsim_dmc.agents import protocols, submission
-from cathsim_dmc.tasks.config import MAX_STEPS
+from cathsim_dmc.agents import entries
 
 PAGE = figures.ROOT / "docs" / "leaderboard.md"
 FOLDER = figures.DATA / "leaderboard"
 SAFE = "0.5 N"
+_PLAIN = re.compile(r"[\w:./+-]([\w:./+, -]{0,58}[\w:./+-])?", re.ASCII)
 
 
-def read(path):
-    """A submission; ValueError where it does not count."""
-    found = json.loads(path.read_text())
-    if found.get("sha256") != submission.seal(found):
-        raise ValueError(f"{path.name} was changed after it was written")
-    wanted = protocols.get(submission.PROTOCOL).episodes
-    if len(found["episodes"]) != wanted:
-        raise ValueError(f"{path.name} has not the {wanted} episodes of the protocol")
-    options = found["settings"]["task_kwargs"]
-    if options not in ({}, {"max_steps": MAX_STEPS}):
-        raise ValueError(f"{path.name} changes the options of its task: {options}")
-    return found
+def cell(value):
+    """A text of a submission for a table: code, or without any markup."""
+    text = str(value)
+    if _PLAIN.fullmatch(text):
+        return f"`{text}`"
+    shown = [one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text]
+    # As references, so that neither Markdown nor HTML is read in it.
+    return "".join(one if one.isalnum() else f"&#{ord(one)};" for one in shown[:60])
 
 
 def table(found):
-    """Rows by task and safe success."""
+    """Rows by task and safe success.
+
+    Args:
+        found: (entry, replay) of each submission; None for a replay that there is not.
+    """
     rows = [
         f"| task | policy | success, % (95 %) | safe, {SAFE}, % | time, s "
-        "| mean force, mN | version, commit | policy SHA-256 |",
-        "|---|---|---|---|---|---|---|---|",
+        "| mean force, mN | version, commit | policy SHA-256 | played again |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
-    order = {id(one): -(one["summary"]["safe_success"][SAFE] or 0) for one in found}
-    for one in sorted(found, key=lambda one: (one["task"], order[id(one)])):
-        summary = one["summary"]
+    lines = []
+    for entry, again in found:
+        values = entry.values
+        summary = (entry if again is None else again).result.summary()
         low, high = summary["success_ci95"]
-        digest = one["policy_sha256"]
-        rows.append(
-            f"| `{one['task']}` | `{one['policy']}` | {100 * summary['success']:.0f} "
+        digest, commit = values["policy_sha256"], values["commit"]
+        safe = summary["safe_success"][SAFE]
+        line = (
+            f"| `{entry.result.task}` | {cell(entry.result.policy)} "
+            f"| {100 * summary['success']:.0f} "
             f"({100 * low:.0f}–{100 * high:.0f}) "
-            f"| {100 * summary['safe_success'][SAFE]:.0f} "
+            f"| {100 * safe:.0f} "
             f"| {0.04 * summary['length']:.1f} "
             f"| {1e3 * summary['forces']['sum']['mean']['mean']:.1f} "
-            f"| {one['package']}, {one['commit'] or '–'} "
-            f"| {f'`{digest[:12]}`' if digest else '–'} |"
+            f"| {cell(values['package'])}, {cell(commit) if commit else '–'} "
+            f"| {cell(digest[:12]) if digest else '–'} | {replayed(again)} |"
         )
-    return rows
+        lines.append((entry.result.task, -safe, line))
+    return [*rows, *(line for *_, line in sorted(lines, key=lambda one: one[:2]))]
+
+
+def replayed(again):
+    """What the replay of a row shows."""
+    if again is None:
+        return "no"
+    return f"{again.source}: {again.equal} of {len(again.result.episodes)} equal"
 
 
 def main():
-    found = [read(path) for path in sorted(FOLDER.glob("*.json"))]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--no-replay", action="store_true", help="believe the files")
+    parser.add_argument("--threads", type=int, help="of the simulation")
+    options = parser.parse_args()
+    found, refused = [], 0
+    for path in sorted(FOLDER.glob("*.json")):
+        try:
+            entry = entries.read(path)
+            again = None
+            if not options.no_replay:
+                again = entries.replay(entry, options.threads)
+                print(f"{path.name}: {replayed(again)}", file=sys.stderr)
+            found.append((entry, again))
+        except ValueError as error:
+            print(error, file=sys.stderr)
+            refused += 1
     figures.put(PAGE, leaderboard=table(found))
+    return int(refused > 0)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,216 @@
+"""Entries of the leaderboard: submissions that are checked and played again."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cathsim_dmc import bounds, files, suite
+from cathsim_dmc.agents import evaluation, protocols, submission
+from cathsim_dmc.agents.checkpoint import CheckpointError
+from cathsim_dmc.agents.episodes import EpisodeOutcome
+from cathsim_dmc.agents.evaluation import EvaluationResult
+from cathsim_dmc.agents.submission import PROTOCOL, RECORDED, RecordedActions
+from cathsim_dmc.analysis.force_statistics import (
+    QUANTITIES,
+    STATISTICS,
+    EpisodeForces,
+    Statistics,
+)
+from cathsim_dmc.tasks.config import MAX_STEPS
+
+MOST_BYTES = 2**22  # of a submission; those of 100 episodes have 110 kB
+_WRONG = (
+    OSError, LookupError, TypeError, ValueError, AttributeError, RecursionError,
+    CheckpointError,
+)  # fmt: skip
+
+
+class Entry(NamedTuple):
+    """A submission that keeps the rules.
+
+    Attributes:
+        path: Its file.
+        values: What is in it.
+        result: Its episodes, from which all figures are computed.
+    """
+
+    path: Path
+    values: Mapping[str, Any]
+    result: EvaluationResult
+
+
+class Replay(NamedTuple):
+    """Episodes of an entry that were played again.
+
+    Attributes:
+        result: The episodes as they are here.
+        equal: Number of them that are those of the entry, bit for bit.
+        source: What was played, "policy" or "actions".
+    """
+
+    result: EvaluationResult
+    equal: int
+    source: str
+
+
+def read(path: str | Path) -> Entry:
+    """Reads a submission; nothing that it says of itself is taken for granted.
+
+    The digest must fit, the protocol, its seeds and the options of the task must be
+    those of the leaderboard, no two episodes may be equal, and the summary must be that
+    of the episodes. This finds errors and careless changes; that the episodes took
+    place is shown by `replay` alone.
+
+    Raises:
+        ValueError: the file cannot be listed; says why.
+    """
+    path = Path(path)
+    with files.refused(ValueError, f"{path.name} is not listed", *_WRONG):
+        if path.stat().st_size > MOST_BYTES:
+            raise ValueError(f"it is larger than {MOST_BYTES / 1e6:.0f} MB")
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if values["sha256"] != submission.seal(values):
+            raise ValueError("it was changed after it was written")
+        return Entry(path, values, _result(values))
+
+
+def replay(entry: Entry, num_threads: int | None = None) -> Replay | None:
+    """Plays the episodes of an entry again.
+
+    A policy that ships with the package is played itself, another one by the actions
+    in the `.npz` file beside the submission.
+
+    Args:
+        entry: What `read` returned.
+        num_threads: Number of threads of the simulation; None takes one per core.
+
+    Returns:
+        The episodes, or None if neither policy nor actions are there.
+
+    Raises:
+        ValueError: the actions are not those that were submitted, or an episode is
+            another one though the versions are the same.
+    """
+    with files.refused(ValueError, f"{entry.path.name} is not listed", *_WRONG):
+        player = _player(entry)
+        if player is None:
+            return None
+        settings, own = entry.values["settings"], None
+        if isinstance(player, RecordedActions):
+            own = settings["observation"]
+        result = evaluation.evaluate(
+            player, entry.result.task, protocol=PROTOCOL, observation=own,
+            task_kwargs=settings["task_kwargs"], num_threads=num_threads,
+        )  # fmt: skip
+        pairs = zip(entry.result.episodes, result.episodes, strict=True)
+        equal = [_same(*pair) for pair in pairs]
+        if entry.values.get("versions") == submission.versions() and not all(equal):
+            seeds = [s for s, one in zip(result.seeds, equal, strict=True) if not one]
+            raise ValueError(
+                f"{len(seeds)} of its {len(equal)} episodes are others when they are "
+                f"played again, such as that of seed {seeds[0]}; submit it again"
+            )
+        source = "policy" if isinstance(player, str) else "actions"
+        return Replay(result, sum(equal), source)
+
+
+def _player(entry: Entry) -> str | RecordedActions | None:
+    values, name = entry.values, entry.result.policy
+    if submission.ships(name):
+        if submission.digest_of(name) != values["policy_sha256"]:
+            raise ValueError(f"its weights are not those of {name}")
+        return name
+    path = entry.path.with_suffix(RECORDED)
+    if not path.is_file():
+        return None
+    if submission.file_digest(path) != values.get("actions_sha256"):
+        raise ValueError(f"{path.name} is not the file of actions that was submitted")
+    player = RecordedActions(path)
+    player.require(entry.result.task)
+    if player.task_kwargs != values["settings"]["task_kwargs"]:
+        raise ValueError(f"{path.name} has other options of the task")
+    return player
+
+
+def _same(one: EpisodeOutcome, other: EpisodeOutcome) -> bool:
+    return json.dumps(_plain(one)) == json.dumps(_plain(other))
+
+
+def _plain(episode: EpisodeOutcome) -> dict[str, Any]:
+    found = EvaluationResult("", "", (0,), (episode,), {}).to_dict()["episodes"][0]
+    return {name: value for name, value in found.items() if name not in ("seed", "env")}
+
+
+def _result(values: Mapping[str, Any]) -> EvaluationResult:
+    settings = bounds.instance("settings", values["settings"], dict)
+    task = bounds.choice("task", values["task"], suite.SUITE)
+    bounds.choice("protocol", settings["protocol"], [PROTOCOL])
+    options = settings["task_kwargs"]
+    if options not in ({}, {"max_steps": MAX_STEPS}):
+        raise ValueError(f"it changes the options of its task: {bounds.shown(options)}")
+    rows = bounds.instance("episodes", values["episodes"], list)
+    count = protocols.get(PROTOCOL).episodes
+    if len(rows) != count:
+        raise ValueError(
+            f"it has {len(rows)} episodes; the protocol has {count}"
+        )
+    seeds = submission.protocol_seeds(task, options, count)
+    if [row["seed"] for row in rows] != seeds:
+        raise ValueError(f"its seeds are not those of the {PROTOCOL} protocol")
+    episodes = tuple(_episode(index, row) for index, row in enumerate(rows))
+    if len({(one.reward, one.forces) for one in episodes}) < count:
+        raise ValueError("some of its episodes are copies of others")
+    for name in ("policy", "package"):
+        bounds.text(name, values[name])
+    for name in ("commit", "policy_sha256"):
+        if values[name] is not None:
+            bounds.text(name, values[name])
+    result = EvaluationResult(task, values["policy"], tuple(seeds), episodes, settings)
+    if not _close(json.loads(json.dumps(result.summary())), values["summary"]):
+        raise ValueError("its summary is not that of its episodes")
+    return result
+
+
+def _episode(index: int, row: Mapping[str, Any]) -> EpisodeOutcome:
+    """An episode of a submission; ValueError names what cannot be."""
+
+    def force(quantity: str, statistic: str) -> float | None:
+        value = row["forces"][quantity][statistic]
+        if value is None and statistic == "mean_in_contact":
+            return None
+        return bounds.number(f"forces.{quantity}.{statistic}", value, 0.0)
+
+    forces = {
+        quantity: Statistics(**{name: force(quantity, name) for name in STATISTICS})  # type: ignore[arg-type]
+        for quantity in QUANTITIES
+    }
+    switches = "terminated", "success", "physics_error"
+    found = {name: bounds.switch(name, row[name]) for name in switches}
+    length = bounds.whole("length", row["length"], 1, MAX_STEPS)
+    if found["success"] and (found["physics_error"] or not found["terminated"]):
+        raise ValueError(f"episode {index} succeeds, but was not ended by the task")
+    if not found["terminated"] and length != MAX_STEPS:
+        raise ValueError(f"episode {index} is cut off after {length} steps")
+    return EpisodeOutcome(
+        env=index,
+        reward=bounds.number("reward", row["reward"]),
+        length=length,
+        forces=EpisodeForces(**forces),
+        path_ratio=bounds.number("path_ratio", row["path_ratio"], 0.0),
+        **found,
+    )
+
+
+def _close(one: Any, other: Any) -> bool:
+    """Whether two JSON values are equal but for the last digits of numbers."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(
+            _close(value, other[key]) for key, value in one.items()
+        )
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_close, one, other))
+    if isinstance(one, float) and isinstance(other, float | int):
+        return math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-12)
+    return bool(one == other)
