@@ -5,6 +5,7 @@ TorchRL's `DMControlEnv` know it too.
 """
 
 import dataclasses
+import difflib
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -102,6 +103,36 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
     _register_domain()
 
 
+def known(name: Any, modules: Sequence[str] | None = None) -> str:
+    """The name of a task that is registered.
+
+    Args:
+        name: What may be one.
+        modules: Modules that the settings of a run name, which may register it. They
+            are not imported here: a file from elsewhere must not choose what runs.
+
+    Raises:
+        ValueError: there is no such task; says which are like it, or what to import.
+    """
+    if isinstance(name, str) and name in TASKS:
+        return name
+    absent = [one for one in modules or () if one not in sys.modules]
+    if absent:
+        options = " ".join(f"--import {one}" for one in absent)
+        raise ValueError(
+            f"the run was made with the task {bounds.shown(name)} and the modules "
+            f"{', '.join(modules or ())}; if you trust them, import them ({options}, "
+            f"in Python: import {', '.join(absent)})"
+        )
+    like = difflib.get_close_matches(str(name), TASKS, 4) or list(TASKS)[:4]
+    return bounds.refuse(
+        "task",
+        name,
+        f"one of the {len(TASKS)} of `cathsim list`, such as {', '.join(like)}; a task "
+        "of your own is known once its module is imported (--import MODULE)",
+    )
+
+
 def make_task(
     name: str, random: np.random.RandomState | int | None = None, **options: Any
 ) -> Navigation:
@@ -118,7 +149,7 @@ def make_task(
     Raises:
         ValueError: if the task or an option does not exist; lists those that do.
     """
-    definition = TASKS[bounds.choice(f"task of {DOMAIN}", name, TASKS)]
+    definition = TASKS[known(name)]
     options = {**definition.options, **options}
     if unknown := sorted(set(options) - {*task_options(name)}):
         raise ValueError(
@@ -200,10 +231,10 @@ def load(
         visualize_reward: Has no effect.
 
     Raises:
-        ValueError: if domain, task or an option does not exist; lists those that do.
+        ValueError: if domain, task or an option does not exist; says which do.
     """
     if domain_name == DOMAIN:
-        bounds.choice(f"task of {DOMAIN}", task_name, TASKS)
+        known(task_name)
     if domain_name not in dm_suite._DOMAINS:  # noqa: SLF001
         raise ValueError(
             f"no domain {domain_name!r}; there are {DOMAIN} and those of "

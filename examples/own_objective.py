@@ -2,7 +2,8 @@
 
 `python examples/own_objective.py` registers a task with this objective and trains PPO
 on it for 20,000 frames. In this process the task works like every other task of
-`cathsim_dmc.suite`; the command line does not know it.
+`cathsim_dmc.suite`; in the folder of this file, `cathsim eval RUN --import
+own_objective` makes it known to the command line.
 """
 
 import argparse
@@ -43,5 +44,8 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("runs/own_objective"))
     parser.add_argument("--frames", type=int, default=20_000)
     options = parser.parse_args()
-    config = agents.make_config("ppo", "demo", task=TASK, total_frames=options.frames)
+    # The run keeps the name of this module, for whoever evaluates it.
+    config = agents.make_config(
+        "ppo", "demo", task=TASK, total_frames=options.frames, modules=["own_objective"]
+    )
     print(agents.train(config, options.out))

@@ -286,3 +286,19 @@ def test_the_table_says_which_force_is_which(capsys, monkeypatch):
     mean, deviation = result.mean_sd("forces.sum.mean")
     assert mean > 0.1
     assert f"│ {1e3 * mean:.0f} ± {1e3 * deviation:.0f}" in text
+
+
+def test_a_function_of_one_observation_is_told_what_to_do():
+    def one(observation):
+        return torch.zeros(21)
+
+    options = {"task_kwargs": {"max_steps": 3}}
+    with pytest.raises(ValueError, match=r"one answered with shape \(21,\); it must"):
+        evaluate(one, "type1_bca", 2, **options)
+    with pytest.raises(ValueError, match=r"shape \(1, 21\); it must be \(2, 21\)"):
+        evaluate(lambda many: one(many)[None], "type1_bca", 2, **options)
+
+    def each(many):
+        return torch.stack([one(single) for single in many])
+
+    assert evaluate(each, "type1_bca", 2, **options).summary()["length"] == 3

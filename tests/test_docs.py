@@ -1,5 +1,7 @@
 """What the documentation says runs, and its pages fit together."""
 
+import ast
+import builtins
 import importlib.util
 import os
 import re
@@ -43,6 +45,42 @@ def test_snippets_run_as_printed(page, tmp_path):
     if page != "README.md":  # which draws the same film
         code = code.replace(".webp", ".npz").replace(".gif", ".npz")
     run(["-c", code], tmp_path)
+
+
+# Pages whose blocks are parts of the files that the text before them names.
+PARTS = "CONTRIBUTING.md"
+
+
+@pytest.mark.parametrize(
+    "page", sorted(str(path.relative_to(ROOT)) for path in DOCS.glob("*.md"))
+)
+def test_every_block_has_its_imports(page):
+    for code in _BLOCK.findall((ROOT / page).read_text()):
+        assert not undefined(code), f"{page}: {code}"
+
+
+def test_blocks_that_stand_by_themselves_have_their_imports():
+    text = (ROOT / PARTS).read_text()
+    for section in re.split(r"^### ", text, flags=re.MULTILINE)[1:]:
+        if section.splitlines()[0].endswith("your own"):
+            for code in _BLOCK.findall(section):
+                assert not undefined(code), section
+
+
+def undefined(code):
+    """Names that a block uses and does not define, by its own functions and classes."""
+    compile(code, "block", "exec")
+    used, known = set(), set(dir(builtins))
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Name):
+            (used if isinstance(node.ctx, ast.Load) else known).add(node.id)
+        elif isinstance(node, ast.alias):
+            known.add((node.asname or node.name).partition(".")[0])
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            known.add(node.name)
+        elif isinstance(node, ast.arg):
+            known.add(node.arg)
+    return used - known
 
 
 @pytest.mark.slow

@@ -47,10 +47,35 @@ def test_no_display_is_an_error_that_names_the_way_out(recording, monkeypatch):
     assert command[1:] == [str(recording.resolve()), "--bind", "127.0.0.1", "--new"]
 
 
-def test_a_browser_gets_a_page_until_the_command_ends(recording):
+def test_both_ports_of_the_page_can_be_chosen(recording, monkeypatch):
+    started = []
+    monkeypatch.setattr(viewer.os, "execve", lambda *given: started.append(given))
+    with socket.socket() as one, socket.socket() as two:
+        for probe in (one, two):
+            probe.bind(("127.0.0.1", 0))
+        ports = one.getsockname()[1], two.getsockname()[1]
+        two.listen()
+        with pytest.raises(ViewerError, match=f"data_port {ports[1]} cannot be used"):
+            open_viewer(recording, web=True, port=free_port(), data_port=ports[1])
+        with pytest.raises(ViewerError, match=f"port {ports[1]} cannot be used"):
+            open_viewer(recording, web=True, port=ports[1])
+    assert not started
+    open_viewer(recording, web=True, port=ports[0], data_port=ports[1])
+    command = started[0][1]
+    assert command[-5:] == [
+        *("--port", str(ports[1]), "--serve-web"),
+        *("--web-viewer-port", str(ports[0])),
+    ]
+
+
+def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+        return probe.getsockname()[1]
+
+
+def test_a_browser_gets_a_page_until_the_command_ends(recording):
+    port = free_port()
     code = (
         "from cathsim_dmc.recording.viewer import open_viewer; "
         f"open_viewer({str(recording)!r}, web=True, port={port})"

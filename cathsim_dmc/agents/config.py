@@ -165,6 +165,9 @@ class TrainingConfig:
             simulation is always on the CPU.
         torch_threads: Number of threads of one torch operation. One is fastest for
             the small published MLP; images profit from all cores.
+        modules: Modules that define what the run uses, such as a task of your own. They
+            are kept with the run, named where they are missing, and imported by you
+            alone: `--import` on the command line.
     """
 
     algorithm: ClassVar[str] = ""
@@ -178,7 +181,7 @@ class TrainingConfig:
     resumable: ClassVar[frozenset[str]] = frozenset(
         {"total_frames", "checkpoint_frames", "checkpoint_seconds", "keep_checkpoints"}
         | {"metrics_frames", "logger", "num_threads", "torch_threads", "torch_device"}
-        | {"demonstrations"}
+        | {"demonstrations", "modules"}
     )
 
     task: str = "type1_bca"
@@ -213,6 +216,7 @@ class TrainingConfig:
     logger: Literal["csv", "tensorboard", "trackio", "wandb"] | None = None
     torch_device: str = "cpu"
     torch_threads: int = positive(1)
+    modules: tuple[str, ...] | None = None
 
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""

@@ -153,9 +153,7 @@ def _result(values: Mapping[str, Any]) -> EvaluationResult:
     rows = bounds.instance("episodes", values["episodes"], list)
     count = protocols.get(PROTOCOL).episodes
     if len(rows) != count:
-        raise ValueError(
-            f"it has {len(rows)} episodes; the protocol has {count}"
-        )
+        raise ValueError(f"it has {len(rows)} episodes; the protocol has {count}")
     seeds = submission.protocol_seeds(task, options, count)
     if [row["seed"] for row in rows] != seeds:
         raise ValueError(f"its seeds are not those of the {PROTOCOL} protocol")

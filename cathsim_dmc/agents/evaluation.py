@@ -241,7 +241,7 @@ def _first_episodes(
         state = env.maybe_reset(state)
         if begun.any():
             policy.reset(view, begun)
-        state["action"] = torch.as_tensor(policy.act(state)).to(torch.float32)
+        state["action"] = _checked(policy, policy.act(state), env)
         stepped = env.step(state)
         if observer is not None:
             observer(env, running)
@@ -251,6 +251,20 @@ def _first_episodes(
         running = running & ~begun
         state = step_mdp(stepped)
     return tuple(outcomes[number] for number in range(count))
+
+
+def _checked(policy: Policy, given: Any, env: EnvBase) -> torch.Tensor:
+    """Actions (N, A) float32 of a policy; ValueError for those of another shape."""
+    actions = torch.as_tensor(given).to(torch.float32)
+    if actions.shape != env.action_spec.shape:
+        count, entries = env.action_spec.shape
+        raise ValueError(
+            f"the policy {policy.name} answered with shape {tuple(actions.shape)}; it "
+            f"must be ({count}, {entries}), a row for each of the {count} episodes, "
+            "which are played side by side. A function f of one observation is called "
+            "for each: lambda many: torch.stack([f(one) for one in many])"
+        )
+    return actions
 
 
 class ContactLog:

@@ -151,7 +151,8 @@ def task_and_options(
         behind where the task is another one.
 
     Raises:
-        ValueError: `task` is None, and the policy was trained on none.
+        ValueError: `task` is None, and the policy was trained on none; or it is one of
+            modules that are not imported, see `suite.known`.
     """
     options, trained = dict(options or {}), dict(policy.task_kwargs or {})
     own = suite.TASKS[policy.task].own_options if policy.task in suite.TASKS else ()
@@ -161,8 +162,11 @@ def task_and_options(
     if task is None:
         raise ValueError(
             f"the policy {policy.name!r} was not trained on a task, so it needs a "
-            f"task to play: one of {', '.join(suite.SUITE)}"
+            "task to play, such as type1_lcca; `cathsim list` has all"
         )
+    config = getattr(policy, "config", None)
+    if task == policy.task and config is not None and config.modules:
+        suite.known(task, config.modules)
     if task != policy.task:
         trained = {name: value for name, value in trained.items() if name not in own}
     return task, {**trained, **options}

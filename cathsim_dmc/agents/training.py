@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
 
-from cathsim_dmc import files
+from cathsim_dmc import files, suite
 from cathsim_dmc.agents import loggers
 from cathsim_dmc.agents.checkpoint import (
     Checkpoint,
@@ -101,6 +101,8 @@ def train(
         OSError: the disk is full, or the directory cannot be written to.
     """
     run = Path(out_dir)
+    if config.modules:
+        suite.known(config.task, config.modules)
     text = f"torch_device={config.torch_device!r} cannot be used here, 'cpu' always can"
     with files.refused(ConfigError, text, RuntimeError, AssertionError):
         torch.zeros(1, device=config.torch_device)

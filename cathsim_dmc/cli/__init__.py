@@ -9,6 +9,7 @@ from tyro import conf
 from tyro.extras import SubcommandApp
 
 from cathsim_dmc import __version__
+from cathsim_dmc.cli import modules
 from cathsim_dmc.cli.opengl import import_command
 from cathsim_dmc.cli.options import BAD_INPUT, INTERRUPTED
 
@@ -63,7 +64,9 @@ def _run(arguments: list[str]) -> int:
         command: Any = _line(summary)
         if arguments[:1] == [name]:
             module, _, function = where.partition(":")
+            own = modules.Own.of(arguments)
             found = import_command(f"cathsim_dmc.cli.{module}", arguments)
+            own.load()
             command = getattr(found, function)
             if name == "train":  # its options depend on its arguments
                 command = command(arguments[1:])

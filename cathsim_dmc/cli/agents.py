@@ -23,7 +23,7 @@ from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.agents.policies import task_and_options
 from cathsim_dmc.agents.training_log import LINE_INTERVAL, progress_bar
 from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons, recorded_forces
-from cathsim_dmc.cli.options import Json, Task, Threads, print_json, say
+from cathsim_dmc.cli.options import Json, Modules, Task, Threads, print_json, say
 from cathsim_dmc.cli.task_options import TaskOptions, task_kind
 from cathsim_dmc.pictures import recorded
 from cathsim_dmc.pictures.films import SUFFIXES, check_film
@@ -69,6 +69,7 @@ def evaluate(
     threads: Threads = None,
     report: bool = False,
     json: Json = False,
+    modules: Modules = (),
     *,
     options: Options,
 ) -> int:
@@ -90,7 +91,7 @@ def evaluate(
     began = time.monotonic()
     player = agents.load_policy(policy, seed)
     task, task_kwargs = task_and_options(player, task, options.given)
-    bounds.choice("task", task, suite.SUITE)
+    suite.known(task)
     task_kwargs = protocols.get(protocol).beside(task_kwargs, options.given)
     contacts = evaluation.ContactLog()
 
@@ -223,6 +224,7 @@ def record(
     task: PolicysTask = None,
     seed: int = evaluation.EVALUATION_SEED,
     fluoroscopy: bool = True,
+    modules: Modules = (),
     *,
     options: Annotated[
         TaskOptions,
@@ -250,7 +252,7 @@ def record(
     bounds.seed("seed", seed)
     player = agents.load_policy(policy, seed)
     task, task_kwargs = task_and_options(player, task, options.given)
-    bounds.choice("task", task, suite.SUITE)
+    suite.known(task)
     # Now: an episode that cannot be written would be lost.
     for path in targets:
         files.require_file(path, make=True)
@@ -307,6 +309,7 @@ def demos(
     seed: int = DEMONSTRATION_SEED,
     threads: Threads = None,
     json: Json = False,
+    modules: Modules = (),
     *,
     options: Options,
 ) -> int:
@@ -346,6 +349,7 @@ def play(
     episodes: int | None = None,
     speed: float = 1.0,
     policy: str | None = None,
+    modules: Modules = (),
     *,
     options: Options,
 ) -> int:

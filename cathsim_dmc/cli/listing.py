@@ -8,12 +8,12 @@ from rich.console import Console
 from rich.table import Table
 
 from cathsim_dmc import suite
-from cathsim_dmc.cli.options import Json, print_json
+from cathsim_dmc.cli.options import Json, Modules, print_json
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.devices import DEVICES
 
 
-def show(devices: bool = False, json: Json = False) -> int:
+def show(devices: bool = False, json: Json = False, modules: Modules = ()) -> int:
     """List the tasks, or the devices with their properties.
 
     Args:

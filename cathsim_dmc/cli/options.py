@@ -14,6 +14,16 @@ _TASK = "Task of `cathsim list`."
 Task = Annotated[str, conf.Positional, conf.arg(help=_TASK)]
 Json = Annotated[bool, conf.arg(help="Whether to print one JSON object alone.")]
 _THREADS = "Number of threads of the simulation; one per core by default."
+_MODULES = (
+    "Module to import first, repeated for several: of a task, device, observation, "
+    "algorithm or policy of your own. It is looked for where Python looks, and in the "
+    "present folder."
+)
+Modules = Annotated[
+    tuple[str, ...],
+    conf.UseAppendAction,
+    conf.arg(name="import", metavar="MODULE", help=_MODULES),
+]
 Threads = Annotated[int | None, conf.arg(help=_THREADS)]
 
 

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from tyro import conf
 
+from cathsim_dmc import bounds
 from cathsim_dmc.cli.options import Json, print_json, say
 from cathsim_dmc.recording import viewer
 from cathsim_dmc.recording.image_set import ImageSetOptions, write
@@ -35,7 +36,11 @@ def dataset(
 
 
 def replay(
-    recording: Annotated[Path, conf.Positional], /, web: bool = False, port: int = 9090
+    recording: Annotated[Path, conf.Positional],
+    /,
+    web: bool = False,
+    port: int = viewer.WEB_PORT,
+    data_port: int | None = None,
 ) -> int:
     """Open a recording in the Rerun viewer.
 
@@ -43,6 +48,12 @@ def replay(
         recording: Path of an .rrd file.
         web: Whether to serve it to a browser instead of opening a window.
         port: Port of the web page.
+        data_port: Port that the page reads the recording from; by default 9876, or
+            another one if it is taken. A browser on another machine needs both ports:
+            ssh -L 9090:localhost:9090 -L 9876:localhost:9876 MACHINE
     """
-    viewer.open_viewer(recording, web=web, port=port)
+    for name, one in {"port": port, "data_port": data_port}.items():
+        if one is not None:
+            bounds.whole(name, one, 1, 65535)
+    viewer.open_viewer(recording, web=web, port=port, data_port=data_port)
     return 0

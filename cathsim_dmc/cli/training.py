@@ -18,7 +18,7 @@ from cathsim_dmc import agents  # isort: skip
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.learners import config_from_dict
-from cathsim_dmc.cli.options import INTERRUPTED
+from cathsim_dmc.cli.options import INTERRUPTED, Modules
 from cathsim_dmc.cli.task_options import field_helps, task_kind
 
 # Shorter names of settings.
@@ -77,9 +77,11 @@ def command(arguments: list[str]) -> Any:
         that is resumed keeps its own.
         """
         run = options.run
+        chosen = vars(options.settings)
+        chosen = {**chosen, "modules": [*dict.fromkeys(chosen["modules"])] or None}
         config = settings.replace(
             task=options.task,
-            **vars(options.settings),
+            **chosen,
             task_kwargs={**settings.task_kwargs, **options.options.given},
         )
         how: Any = {"resume": run.resume, "without_replay": run.without_replay}
@@ -136,6 +138,11 @@ def _setting_kind(settings: agents.TrainingConfig) -> type:
     helps, fields = field_helps(type(settings)), []
     for item in dataclasses.fields(settings):
         if item.name in ("task", "task_kwargs"):
+            continue
+        if item.name == "modules":  # None does not repeat
+            default = functools.partial(tuple, settings.modules or ())
+            field = dataclasses.field(default_factory=default)
+            fields.append((item.name, Modules, field))
             continue
         about = conf.arg(help=helps[item.name], aliases=_ALIASES.get(item.name))
         # A mapping may not be a default; every option gets one of its own.

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import socket
 import sys
 from pathlib import Path
 
@@ -34,18 +35,25 @@ def check_recording(path: str | os.PathLike[str]) -> Path:
 
 
 def open_viewer(
-    path: str | os.PathLike[str], *, web: bool = False, port: int = WEB_PORT
+    path: str | os.PathLike[str],
+    *,
+    web: bool = False,
+    port: int = WEB_PORT,
+    data_port: int | None = None,
 ) -> None:
     """Become the Rerun viewer of a recording; this process does not return.
 
     Args:
         path: of the .rrd file.
         web: serve it to a browser, whose address the viewer prints.
-        port: of the web page; another one is taken for the data.
+        port: of the web page.
+        data_port: that the page reads the data from; a browser on another machine needs
+            both, see docs/how-to.md. None takes 9876, or another one if it is taken;
+            the address that is printed names it.
 
     Raises:
         FileNotFoundError, ValueError: see `check_recording`.
-        ViewerError: there is no viewer, or no display for its window.
+        ViewerError: there is no viewer, no display for its window, or a port is taken.
     """
     recording = check_recording(path)
     named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
@@ -62,6 +70,24 @@ def open_viewer(
     viewer = next((folder / one for one in names if (folder / one).is_file()), None)
     if not found or viewer is None:
         raise ViewerError("the Rerun viewer is missing; pip install rerun-sdk")
-    serve = ("--serve-web", "--web-viewer-port", str(port)) if web else ()
-    command = [str(viewer), str(recording), "--bind", LOOPBACK, "--new", *serve]
+    how = ["--new"] if data_port is None else ["--port", str(data_port)]
+    if web:
+        how += ["--serve-web", "--web-viewer-port", str(port)]
+        _require_free("port", port)
+        if data_port is not None:
+            _require_free("data_port", data_port)
+    command = [str(viewer), str(recording), "--bind", LOOPBACK, *how]
     os.execve(viewer, command, {"RUST_LOG": "warn,re_sdk=info", **os.environ})
+
+
+def _require_free(name: str, port: int) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError as error:
+            option = name.replace("_", "-")
+            raise ViewerError(
+                f"{name} {port} cannot be used ({error.strerror}); give another one "
+                f"(--{option} {port + 1})"
+            ) from error
