@@ -11,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc import suite
+from cathsim_dmc.agents.protocols import VARIED_RANGES
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Inlet
 from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.posture import bends_of, nodes_of
 from cathsim_dmc.physics.effects import Episode
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import placement
@@ -243,6 +245,106 @@ def test_episodes_may_start_farther_in_and_off_the_line():
     environment = suite.environment(suite.make_task("type1_lcca", random=5, **options))
     first = environment.reset().observation["tracking_points"]
     np.testing.assert_array_equal(first, start.observation["tracking_points"][5])
+
+
+def test_nodes_follow_from_bends():
+    bends = 0.3 * np.random.RandomState(0).normal(size=(30, 2))
+    lengths = np.linspace(3e-3, 9e-3, 31)
+    nodes = nodes_of(lengths, bends)
+    np.testing.assert_allclose(
+        bends_of(np.diff(nodes, axis=0) / lengths[:, None]), bends
+    )
+
+
+# Seeds whose first displacement lays the device into the rim of the hole by which the
+# sheath comes in, or past the vessel's wall, and seeds whose displacement fits.
+FAULTY, GOOD = (9023, 9059, 9245, 9224, 9035, 9276), (9000, 9001, 9002, 9003)
+
+
+def test_a_displaced_device_stands_in_no_wall():
+    """Without an action nothing presses on the wall; good draws stay what they are."""
+    plain = dataclasses.replace(VARIED_RANGES, tracking_noise=0.0)
+    task = suite.make_task("type1_lcca", randomisation=plain)
+    seeds = (*FAULTY, *GOOD)
+    batch = BatchSimulation(task, len(seeds), num_threads=1, seeds=seeds)
+    start = batch.reset()
+    assert start.wall_force.peak_sum.max() < 0.1
+    places = start.readings.centreline
+    depth = task.scene.anatomy.lumen(places[:, -5:])
+    assert depth.min() > task.scene.catheter.device.outer_radius - 0.3e-3
+    drawn = []
+    for index, seed in enumerate(seeds):
+        expected = np.random.RandomState(seed)
+        episode = plain.draw(expected)
+        used = batch._random_states[index]
+        # Whatever is drawn next, such as a second displacement.
+        drawn.append(expected.uniform() != used.uniform())
+        assert np.linalg.norm(episode.displacement) <= 0.01
+    assert drawn == [True] * len(FAULTY) + [False] * len(GOOD)
+    for _ in range(6):
+        step = batch.step(np.zeros((len(seeds), batch.num_actions)))
+        assert not any(step.errors) and step.wall_force.peak_sum.max() < 0.3
+    environment = suite.environment(
+        suite.make_task("type1_lcca", randomisation=plain, random=FAULTY[0])
+    )
+    environment.reset()
+    np.testing.assert_array_equal(environment.task.readings.centreline, places[0])
+
+
+def test_an_ill_conditioned_displacement_is_not_written(shared_environment):
+    """Joints that miss the place of the head by far leave the device at rest."""
+    environment = shared_environment("type1_lcca")
+    environment.reset()
+    task, data = environment.task, environment.physics.data
+    start = task.rollout.case().start
+    (posture,) = start._starts
+
+    def written(steps, displacement=(8e-4, 0.0, 0.0)):
+        with mock.patch.object(posture, "_steps", steps):
+            qpos = data.qpos.copy()
+            start.write(qpos, Episode(np.array(displacement)), np.random.RandomState(0))
+        return qpos
+
+    rest, steps = written(posture._steps, (0.0, 0.0, 0.0)), posture._steps
+    assert np.abs(written(steps) - rest).max() > 5e-3
+    # As of a Jacobian that is nearly singular, or is.
+    for wrong in (10.0 * steps, 500.0 * steps, np.zeros((3, 3))):
+        np.testing.assert_array_equal(written(wrong), rest)
+    tilted = steps.copy()
+    tilted[0] += 30.0  # a base that moves 24 mm for 0.8 mm of the head
+    moved = written(tilted) - rest
+    assert abs(moved[task.rollout.index.insertion_qpos]) < 4e-3
+
+
+def test_the_depth_of_a_posture_is_that_of_its_contacts():
+    """The check before an episode and MuJoCo's collision see the same walls."""
+    ranges = {"start_radius": 0.01, "start_insertion": (0.0, 0.06)}
+    task = suite.make_task("femoral_type1_lcca", randomisation=ranges, random=0)
+    environment = suite.environment(task)
+    model = environment.physics.model.ptr
+    data, index = mujoco.MjData(model), task.rollout.index
+    deep = []
+    for posture in task.rollout.case().start._starts[1::2]:
+        for displacement in np.random.RandomState(1).uniform(-8e-3, 8e-3, (40, 3)):
+            joints = posture.joints(displacement, None)
+            data.qpos[:] = model.qpos0
+            posture.write(data.qpos, joints)
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            points = posture._shape.points(joints)
+            np.testing.assert_allclose(
+                points[-1], data.site_xpos[index.head_site], atol=1e-9
+            )
+            walls = np.isin(data.contact.geom, index.walls).any(axis=-1)
+            seen = [
+                -data.contact.dist[chosen].min(initial=0.0)
+                for chosen in (walls, ~walls)
+            ]
+            found = posture._shape.depths(points).clip(min=0.0)
+            if max(seen) < 1.0e-3:  # of deeper ones MuJoCo sees the nearest wall
+                np.testing.assert_allclose(found, seen, atol=1.5e-4)
+            deep.append(seen)
+    assert (np.max(deep, axis=0) > 5e-4).all() and len(deep) > 200
 
 
 @pytest.mark.parametrize("given", [0.5, (0.5,), (0.5, 0.2), (0, 2), ("0", 1), (-1, 0)])

@@ -19,7 +19,8 @@ _STRATA, _CANDIDATES = 10, 20
 _STEPS = dict.fromkeys(
     ("friction", "stiffness", "loss", "viscosity", "goal_shift", "roll"), 1e-9
 ) | {"delay": 1, "start_insertion": START_SPACING}
-_REDUCED = "displacement", "insertion"  # what a start may have less of than drawn
+# What a start may have less of than drawn; a displacement may be drawn anew.
+_REDUCED = "displacement", "insertion"
 
 
 class Protocol(NamedTuple):

@@ -75,6 +75,43 @@ def bends_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     return angles
 
 
+def nodes_of(link_lengths: ArrayLike, bends: ArrayLike) -> NDArray[np.float64]:
+    """Nodes of a chain with given angles of its bending hinges.
+
+    Torsion hinges stand at zero.
+
+    Args:
+        link_lengths: (n,) lengths of the links from proximal to distal, m.
+        bends: (n - 1, 2) angles about x and about y of joints 1 to n - 1, rad.
+
+    Returns:
+        (n + 1, 3) float64, m, frame of link 0: proximal ends of the links and the
+        distal end of the last one.
+    """
+    lengths, angles = np.asarray(link_lengths), np.asarray(bends)
+    turns = _turns(angles)
+    frame, directions = np.eye(3), np.empty((len(lengths), 3))
+    directions[0] = frame[:, 2]
+    for index, turn in enumerate(turns, 1):
+        frame = frame @ turn
+        directions[index] = frame[:, 2]
+    nodes = np.zeros((len(lengths) + 1, 3))
+    np.cumsum(directions * lengths[:, None], axis=0, out=nodes[1:])
+    return nodes
+
+
+def _turns(angles: np.ndarray) -> np.ndarray:
+    """Rotations (n - 1, 3, 3) of joints 1 to n - 1 with angles (n - 1, 2) rad."""
+    (cx, cy), (sx, sy) = np.cos(angles).T, np.sin(angles).T
+    zero = np.zeros_like(cx)
+    # About x and then about the turned y, and the other way round.
+    first_x = [cy, zero, sy, sx * sy, cx, -sx * cy, -cx * sy, sx, cx * cy]
+    first_y = [cy, sx * sy, cx * sy, zero, cx, -sx, -sy, sx * cy, cx * cy]
+    order = [x_first(joint) for joint in range(1, len(angles) + 1)]
+    chosen = np.where(order, np.array(first_x), np.array(first_y))
+    return chosen.T.reshape(-1, 3, 3)
+
+
 def _nodes(lengths: np.ndarray, points: np.ndarray, advance: float) -> np.ndarray:
     """Nodes (n + 1, 3) on the line, a link length apart."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)

@@ -20,7 +20,7 @@ from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import GOAL_RADIUS
 
 # Wall of the sheath, m: what a tilted one needs of the hole by which it comes in.
-_AROUND_SHEATH = 2e-3
+AROUND_SHEATH = 2e-3
 # Joints of the shaft that twist, where the base turns.
 _TORSION_JOINTS = 4
 # Chains of so many links are faster with dense Jacobians: 1.1 to 1.4 times in free
@@ -132,7 +132,7 @@ class Scene:
             )
             self.arena.attach(entity, site)
         self.phantom.add_wall(
-            self.catheter.links[0], self.sheath.bore_radius + _AROUND_SHEATH, moving
+            self.catheter.links[0], self.sheath.bore_radius + AROUND_SHEATH, moving
         )
         if moving:
             add_clock(self.arena.mjcf_model)

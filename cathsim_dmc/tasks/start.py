@@ -4,17 +4,20 @@ import contextlib
 import functools
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from cathsim_dmc.entities.posture import bends_of, joints_along
+from cathsim_dmc.anatomy.field_loops import FREE
+from cathsim_dmc.entities.posture import bends_of, joints_along, nodes_of
+from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.effects import Episode
-from cathsim_dmc.physics.randomisation import START_JITTER
+from cathsim_dmc.physics.randomisation import START_JITTER, start_displacement
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.scene import AROUND_SHEATH, Scene
 
 _SETTLING_TIME = 2.0  # s, after which the device rests
 STARTS_ALONG_ROUTE = 16
@@ -35,6 +38,22 @@ _SMALLER = tuple(sign * 0.5**half for half in range(1, 6) for sign in (1.0, -1.0
 _OUTSIDE = 0.5e-3
 # Deepest contact that a device at rest makes with a wall that it does not stand in, m.
 _DEEPEST = 1.0e-3
+# Deepest place of a displaced device in the wall of the sheath, m. From 2 mm on, the
+# shaft stands in the rim of the hole by which the sheath comes in, and throws the tip.
+_DEEPEST_IN_SHEATH = AROUND_SHEATH - 0.1e-3
+# A base that moves so many times as far as the head, or a head that misses its place by
+# so much of the displacement: the Jacobian is nearly singular, or the stroke ends.
+_LARGEST_SLIDE, _LARGEST_MISS = 4.0, 0.9
+_DRAWS = 20  # of a displacement, until the posture stands free
+_SAMPLES = 0.5e-3  # m, between places of a posture whose depth is looked up
+_GUIDED = 0.02  # m of the shaft in the sheath that a displacement may turn
+
+
+class _Joints(NamedTuple):
+    """Insertion, m, and angles (n - 1, 2) of the bending hinges of a device, rad."""
+
+    insertion: float
+    bends: np.ndarray
 
 
 class StartPosture:
@@ -62,7 +81,7 @@ class StartPosture:
             ValueError: if the device comes to rest outside the lumen or in its wall.
         """
         # The base cannot go back behind its start, so the stroke begins 1 mm later.
-        settle = functools.partial(_settle, scene, model, index)
+        settle = functools.partial(_settle, scene, model, index, _Shape(scene))
         rest = settle(0.0)
         place = scene.placement
         way = np.linalg.norm(np.diff(place.line, axis=0), axis=-1).sum()
@@ -78,8 +97,8 @@ class StartPosture:
                     f"{scene.catheter.device.name!r} can be laid nowhere there in "
                     f"{scene.anatomy.name!r}; give smaller shares"
                 )
-        self._starts = [rest]
-        self._scale = 1.0
+        self._starts, self._scale = [rest], 1.0
+        self._radius = config.randomisation.start_radius
         if farthest := config.randomisation.farthest_insertion:
             reach = min(farthest, _LARGEST_START * way)
             count = math.ceil(reach / START_SPACING)
@@ -92,22 +111,32 @@ class StartPosture:
         """Writes the start configuration of one simulation.
 
         A displacement that would press the device on the wall is reversed, then
-        halved until it does not.
+        halved until it does not. Where the posture then stands in a wall or misses its
+        place, another displacement is drawn.
 
         Args:
             qpos: (nq,), written in place; joints of other entities are left alone.
             episode: What was drawn for it.
             random_state: Draws where along the route a device lies, which is then not
-                displaced.
+                displaced, and further displacements.
         """
         if self._ahead:
             number = random_state.randint(len(self._ahead))
-            self._ahead[number].write(qpos, np.zeros(3), episode.roll)
+            posture = self._ahead[number]
+            posture.write(qpos, posture.joints(np.zeros(3), episode.roll))
             return
         wanted = self._scale * (episode.insertion or 0.0)
         posture = min(self._starts, key=lambda one: abs(one.advance - wanted))
-        displacement = posture.clear_of_wall(episode.displacement)
-        posture.write(qpos, displacement, episode.roll)
+        displacement = episode.displacement
+        for _ in range(_DRAWS):
+            asked = posture.clear_of_wall(displacement)
+            joints = posture.joints(asked, episode.roll)
+            if posture.stands_free(asked, joints, episode.roll):
+                break
+            displacement = start_displacement(random_state, self._radius)
+        else:
+            joints = posture.joints(np.zeros(3), episode.roll)
+        posture.write(qpos, joints)
 
 
 class _Posture:
@@ -118,10 +147,11 @@ class _Posture:
         scene: Scene,
         model: mujoco.MjModel,
         index: ModelIndex,
+        shape: "_Shape",
         data: mujoco.MjData,
         advance: float,
     ):
-        self.advance = advance
+        self.advance, self._shape = advance, shape
         self._bends, self._insertion = index.bends_qpos, index.insertion_qpos
         data.qvel[:] = 0.0
         mujoco.mj_kinematics(model, data)
@@ -141,7 +171,9 @@ class _Posture:
         places = [self._insertion, *self._bends[self._free]]
         dofs = [model.jnt_dofadr[model.jnt_qposadr == place].item() for place in places]
         # Joint steps for a displacement in the frame of the inlet.
-        self._steps = np.linalg.inv(self._frame.T @ jacobian[:, dofs])
+        self._steps = np.zeros((3, 3))
+        with contextlib.suppress(np.linalg.LinAlgError):
+            self._steps = np.linalg.inv(self._frame.T @ jacobian[:, dofs])
         # The joints that the first free one moves and the head, as far as they move.
         swinging = slice(index.links.start + self._free + 2, index.links.stop)
         self._nodes = np.vstack([data.xpos[swinging], data.site_xpos[index.head_site]])
@@ -151,6 +183,9 @@ class _Posture:
         depth = scene.anatomy.lumen(self._nodes)
         self._least = np.minimum(depth, scene.catheter.device.outer_radius)
         self._least[:-1] -= _PRESSED
+        resting = shape.points(_Joints(self._inserted, self._angles))
+        self._head, deepest = resting[-1], shape.depths(resting) + _PRESSED
+        self._deepest = np.maximum(deepest, (forces.DEEPEST, _DEEPEST_IN_SHEATH))
 
     def clear_of_wall(self, displacement: np.ndarray) -> np.ndarray:
         """The displacement (3,), m, reversed or halved where it would press."""
@@ -161,27 +196,99 @@ class _Posture:
                 return factor * displacement
         return np.zeros(3)
 
-    def write(
-        self, qpos: np.ndarray, displacement: np.ndarray, roll: float | None
-    ) -> None:
-        """Writes the posture (nq,), the head displaced by (3,) m in the inlet's frame.
+    def joints(self, displacement: np.ndarray, roll: float | None) -> _Joints:
+        """Joints that displace the head by (3,) m in the inlet's frame.
 
-        A device that is turned about its axis has other angles and the same shape.
+        They are exact for small displacements. A device that is turned about its axis
+        has other angles and the same shape.
         """
-        angles, step = self._angles, self._steps @ displacement
+        angles, step = self._angles.copy(), self._steps @ displacement
         if roll:
             c, s = np.cos(-roll), np.sin(-roll)
             turn, directions = np.array([[c, -s], [s, c]]), self._directions.copy()
             directions[:, :2] = self._directions[:, :2] @ turn.T
             angles = bends_of(directions)
             step = np.concatenate([step[:1], turn @ step[1:]])
-        qpos[self._bends] = angles
-        qpos[self._bends[self._free]] += step[1:]
-        qpos[self._insertion] = max(self._inserted + step[0], 0.0)
+        angles[self._free] += step[1:]
+        return _Joints(max(self._inserted + step[0], 0.0), angles)
+
+    def stands_free(
+        self, displacement: np.ndarray, joints: _Joints, roll: float | None
+    ) -> bool:
+        """Whether joints displace the head as asked, and the device is in no wall."""
+        size = np.linalg.norm(displacement)
+        slide = abs(joints.insertion - self._inserted)
+        points = self._shape.points(joints, roll or 0.0)
+        miss = points[-1] - self._head - self._frame @ displacement
+        if size and not (
+            slide <= _LARGEST_SLIDE * size
+            and np.linalg.norm(miss) <= _LARGEST_MISS * size
+        ):
+            return False
+        return bool((self._shape.depths(points) <= self._deepest).all())
+
+    def write(self, qpos: np.ndarray, joints: _Joints) -> None:
+        """Writes joints into the configuration (nq,)."""
+        qpos[self._insertion], qpos[self._bends] = joints
+
+
+class _Shape:
+    """Places of a device with given joints, and how deep it stands in walls there."""
+
+    def __init__(self, scene: Scene):
+        """Takes the device, the field of the vessel and the bore of the sheath."""
+        place, lengths = scene.placement, scene.catheter.link_lengths
+        self._lengths, self._inlet = lengths, place.inlet
+        self._base = place.start_depth - float(np.sum(lengths))
+        self._frame = np.empty(9)
+        mujoco.mju_quat2Mat(self._frame, place.quaternion)
+        self._frame = self._frame.reshape(3, 3)
+        counts = np.ceil(lengths / _SAMPLES).astype(int)
+        shares = [np.arange(count) / count for count in counts]
+        self._links = np.repeat(np.arange(len(lengths)), counts)
+        self._shares = np.concatenate(shares)[:, None]
+        self._radius = scene.catheter.device.outer_radius
+        self._bore, self._lumen = scene.sheath.bore_radius, scene.anatomy.lumen
+        self._hole = self._bore + AROUND_SHEATH
+        self._walled = self._lumen.with_hole(self._hole)
+
+    def points(self, joints: _Joints, roll: float = 0.0) -> np.ndarray:
+        """Points (m, 3) m of the axis in the world, the head last.
+
+        Args:
+            joints: Of the device.
+            roll: Of the base about its axis, rad.
+        """
+        nodes = nodes_of(self._lengths, joints.bends)
+        c, s = np.cos(roll), np.sin(roll)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        nodes = nodes @ turn.T + (0.0, 0.0, self._base + joints.insertion)
+        along = np.diff(nodes, axis=0)[self._links]
+        points = np.vstack([nodes[self._links] + self._shares * along, nodes[-1:]])
+        return self._inlet + points @ self._frame.T
+
+    def depths(self, points: np.ndarray) -> np.ndarray:
+        """Depths (2,) m in the walls of vessel and sheath at the deepest of points."""
+        local = (points - self._inlet) @ self._frame
+        near = local[:, 2] > -_GUIDED
+        points, (x, y, level) = points[near], local[near].T
+        clear, guided = self._walled(points, free=True), level <= 0.0
+        bore = self._bore - np.hypot(x[guided], y[guided])
+        # A vessel may bend back beside the sheath.
+        inside = self._lumen(points[guided])
+        bore = np.where(inside > 0.0, np.maximum(bore, inside), bore)
+        # What lies outside, beside the sheath, is free to the physics.
+        outside = (clear >= FREE) & (level > self._hole)
+        clear[outside] = self._lumen(points[outside])
+        return self._radius - np.array([clear.min(), bore.min(initial=np.inf)])
 
 
 def _settle(
-    scene: Scene, model: mujoco.MjModel, index: ModelIndex, advance: float
+    scene: Scene,
+    model: mujoco.MjModel,
+    index: ModelIndex,
+    shape: _Shape,
+    advance: float,
 ) -> _Posture:
     """Lays the device along the line, so far advanced (m), and lets it go."""
     data = mujoco.MjData(model)
@@ -194,7 +301,7 @@ def _settle(
     for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
         mujoco.mj_step(model, data)
     _refuse_outside(scene, model, index, data)
-    return _Posture(scene, model, index, data, advance)
+    return _Posture(scene, model, index, shape, data, advance)
 
 
 def _settled(
