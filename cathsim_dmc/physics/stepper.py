@@ -21,6 +21,7 @@ PHYSICS_TIMESTEP = TIMESTEP
 CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 _ACTUATION = mujoco.mjtDisableBit.mjDSBL_ACTUATION.value
+_ALL = slice(None)
 
 
 class Stepper(abc.ABC):
@@ -45,6 +46,7 @@ class Stepper(abc.ABC):
         """Finds the wall, its sensor and what touches it in the compiled scene."""
         self.num_simulations, self.substeps = num_simulations, substeps
         self.repeated = np.zeros(num_simulations, np.int64)
+        self._shortened = False  # whether a time step has ever been
         self.deepest: float | None = None
         self._contacts = readings.sensor(model, "wall_contacts")
         self._before = self._warnings_before = np.empty(0)
@@ -66,8 +68,8 @@ class Stepper(abc.ABC):
         """Has a `tasks.cases.Case` write itself into the model of one simulation."""
 
     @abc.abstractmethod
-    def states(self) -> np.ndarray:
-        """States (N, nstate) of all simulations, mjSTATE_INTEGRATION, a copy."""
+    def states(self, indices: np.ndarray | slice = _ALL) -> np.ndarray:
+        """States (K, nstate) of some simulations, mjSTATE_INTEGRATION, a copy."""
 
     @abc.abstractmethod
     def set_states(self, indices: np.ndarray, states: np.ndarray) -> None:
@@ -140,11 +142,19 @@ class Stepper(abc.ABC):
         self._keep_still(indices)
         return forces.wall_force(self.contact_rows)[0]
 
+    def restore(self, indices: np.ndarray) -> None:
+        """Restores options that an interrupted reset or control step leaves changed."""
+        self._change(indices, "disableflags", lambda flags: flags & ~_ACTUATION)
+        if self._shortened:
+            self._change(indices, "timestep", lambda _: self._timestep)
+
     def forward_unactuated(self, indices: np.ndarray) -> None:
         """What dm_control does at a reset, when there is no control yet."""
-        self._change(indices, "disableflags", lambda flags: flags | _ACTUATION)
-        self._forward(indices)
-        self._change(indices, "disableflags", lambda flags: flags & ~_ACTUATION)
+        try:
+            self._change(indices, "disableflags", lambda flags: flags | _ACTUATION)
+            self._forward(indices)
+        finally:
+            self._change(indices, "disableflags", lambda flags: flags & ~_ACTUATION)
 
     def _depth_at_end(
         self, depth: np.ndarray, warned: np.ndarray, limit: float
@@ -158,9 +168,10 @@ class Stepper(abc.ABC):
             self._views = tuple(getattr(self.arrays, name) for name in names)
         way = self._timestep * _fastest(*self._views, *self._links)
         suspect = (depth + way > limit) & (depth <= limit) & ~warned
-        for index in np.flatnonzero(suspect).tolist():
+        indices = np.flatnonzero(suspect)
+        states = self.states(indices) if indices.size else ()
+        for index, state in zip(indices.tolist(), states, strict=True):
             model, data = self._model_of(index), self._scratch
-            state = self.states()[index]
             mujoco.mj_setState(model, data, state, _STATE)
             mujoco.mj_kinematics(model, data)
             mujoco.mj_collision(model, data)
@@ -173,11 +184,12 @@ class Stepper(abc.ABC):
         """Does the control step of some simulations again, in steps so much shorter."""
         self.repeated[indices] += 1
         self.set_states(indices, self._before[indices])
-        self._change(indices, "timestep", lambda timestep: timestep / parts)
+        self._shortened = True
         try:
+            self._change(indices, "timestep", lambda _: self._timestep / parts)
             return self._run(indices, parts)
         finally:
-            self._change(indices, "timestep", lambda timestep: timestep * parts)
+            self._change(indices, "timestep", lambda _: self._timestep)
 
     def _warned(self) -> np.ndarray:
         """Whether MuJoCo has warned in each simulation (N,) in the control step."""
@@ -230,12 +242,13 @@ class SingleStepper(Stepper):
     def load(self, index: int, case: Any) -> None:
         """Puts an anatomy into the model; the data begin anew."""
         if case is not self._case:
+            self._case = None  # until it is written whole
             case.write(self._model)
             self._case = case
         # Without what a pass in the last anatomy has left.
         mujoco.mj_resetData(self._model, self._data)
 
-    def states(self) -> np.ndarray:
+    def states(self, indices: np.ndarray | slice = _ALL) -> np.ndarray:
         """State (1, nstate), mjSTATE_INTEGRATION, a copy."""
         state = np.empty((1, self._size))
         mujoco.mj_getState(self._model, self._data, state[0], _STATE)

@@ -131,11 +131,13 @@ class BatchSimulation:
         """
         self._refuse_fork()
         indices = bounds.indices("indices", indices, self.num_simulations)
-        self._begun[indices] = True
+        self._begun[indices] = False
         self.stepper.reset(indices)
         self.rollout.begin(indices, self._random_states)
         self.stepper.forward_unactuated(indices)
-        return _own(self.rollout.start(indices))
+        step = self.rollout.start(indices)
+        self._begun[indices] = True
+        return _own(step)
 
     def step(self, action: np.ndarray) -> Step:
         """Advances every simulation by one control step.
@@ -146,7 +148,8 @@ class BatchSimulation:
         Raises:
             ValueError: if the action has the wrong shape or is not finite, or the
                 objective's outcome is none.
-            RuntimeError: if a simulation has not been reset, or the process has forked.
+            RuntimeError: if a simulation has not been reset, an error has interrupted
+                its last step, or the process has forked.
         """
         self._refuse_fork()
         if not self._begun.all():
@@ -215,8 +218,8 @@ class _BatchStepper(Stepper):
     def load(self, index: int, case: Case) -> None:
         """There is one anatomy."""
 
-    def states(self) -> np.ndarray:
-        return self.batch.state.copy()
+    def states(self, indices: np.ndarray | slice = slice(None)) -> np.ndarray:
+        return np.array(self.batch.state[indices])
 
     def set_states(self, indices: np.ndarray, states: np.ndarray) -> None:
         self.batch.state[indices] = states
@@ -264,6 +267,7 @@ class _PoolStepper(_BatchStepper):
     def load(self, index: int, case: Case) -> None:
         if self._own:
             if self._loaded.get(index) is not case:
+                self._loaded.pop(index, None)  # until it is written whole
                 case.write(self._models[index])
                 self._loaded[index] = case
             return

@@ -27,6 +27,7 @@ class Environment(composer.Environment):
         Returns:
             The first time step.
         """
+        self._reset_next_step = True  # until it has ended
         before = self._hooks._initialize_episode_mjcf  # noqa: SLF001
         changes = _overridden(self.task, "initialize_episode_mjcf")
         if not (changes or before.entity_hooks or before.extra_hooks):

@@ -208,6 +208,7 @@ class Navigation(composer.Task):
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
         del physics, random_state
+        self._current()  # measures the start where nothing has been observed
         self.rollout.command(bounds.actions(action, (self.num_actions,))[None])
 
     @property

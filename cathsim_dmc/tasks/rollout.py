@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc import bounds
 from cathsim_dmc.imaging import endoluminal
 from cathsim_dmc.imaging.angiograph import Deviation, Planes
 from cathsim_dmc.imaging.device import Shadow
@@ -113,6 +114,8 @@ class Rollout:
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
         self._goal_shift = np.zeros(count)
+        # Whether an episode's beginning or control step has begun and not ended.
+        self._open = np.zeros(count, dtype=bool)
         self.deviations = [Deviation()] * count
         self.steps = np.zeros(count, dtype=int)
         self._action = np.zeros((count, len(scene.catheter.action_names)))
@@ -134,7 +137,9 @@ class Rollout:
             random_states: N sources of randomness; those of other simulations are left
                 alone.
         """
+        self._open[indices] = True
         self._random_states = list(random_states)
+        self._stepper.restore(indices)
         for index in indices:
             self._draw(index, random_states[index])
         self._pose_robot()
@@ -192,7 +197,18 @@ class Rollout:
 
         Args:
             action: (N, A) float64 as `bounds.actions` returns it.
+
+        Raises:
+            RuntimeError: if an error or an interrupt has left the last control step,
+                or the beginning of an episode, half done.
         """
+        if self._open.any():
+            raise RuntimeError(
+                "an error or an interrupt has left the last step or reset of "
+                f"simulations {bounds.shown(np.flatnonzero(self._open).tolist())} half "
+                "done; call reset() first"
+            )
+        self._open[:] = True
         self._previous_action, self._action = self._action, action
         self._pose_robot()
         for effect in self.effects:
@@ -226,6 +242,7 @@ class Rollout:
         self._errors = (None,) * len(self.steps)
         step = self._step(indices, begins=True)
         observations.check(step.observation, self._specs)
+        self._open[indices] = False
         return step
 
     def finish(self) -> Step:
@@ -241,7 +258,9 @@ class Rollout:
         for error, last, steps in zip(self._errors, old, self.steps, strict=True):
             if error is not None and last is None:
                 _LOG.error("%s after %d steps", error, steps)
-        return self._step(np.arange(len(self.steps)))
+        step = self._step(np.arange(len(self.steps)))
+        self._open[:] = False
+        return step
 
     def _find_errors(
         self, warned: np.ndarray, force: np.ndarray
