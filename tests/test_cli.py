@@ -20,6 +20,7 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.cli import agents as commands
 from cathsim_dmc.cli import checks, task_options, training
+from cathsim_dmc.recording.episode import Episode
 
 # What works.
 
@@ -321,3 +322,15 @@ def test_bad_input(cathsim, tmp_path, monkeypatch, case):
     for word in words:
         assert word in flat, f"{word!r} not in: {flat}"
     assert not list(tmp_path.iterdir()), "work was begun"
+
+
+def test_record_writes_the_formats_that_python_writes(tmp_path, capsys):
+    arrays, film = tmp_path / "push.npz", tmp_path / "push.webp"
+    for path in (arrays, film):
+        options = task_options.task_kind()(max_steps=3)
+        assert commands.record("push", path, task="simple1_bca", options=options) == 0
+    assert str(arrays) in capsys.readouterr().out
+    assert Episode.load(arrays).steps == 3 and film.stat().st_size > 1000
+    assert sorted(tmp_path.iterdir()) == [arrays, film]
+    with pytest.raises(ValueError, match=r"x.csv does not end in .rrd or .npz or .gif"):
+        commands.record("push", tmp_path / "x.csv", task="simple1_bca", options=options)

@@ -10,6 +10,8 @@ from recording_samples import make_tube, same
 
 import cathsim_dmc
 from cathsim_dmc import suite
+from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
+from cathsim_dmc.pictures import recorded
 from cathsim_dmc.pictures.animation import animate
 from cathsim_dmc.pictures.figure import Picture, draw_fluoroscopy, scene_figure
 from cathsim_dmc.pictures.moment import Moment, on_screen, xray
@@ -120,6 +122,25 @@ def test_x_ray_pictures_show_what_the_task_observes(task, options):
     (arm,) = on_screen(own).carms(surface.vertices, angles)
     ring = axes.patches[0].center
     np.testing.assert_allclose(ring, arm.project(moment.goal)[0])
+
+
+def test_a_film_is_drawn_a_few_states_at_a_time(pushed, monkeypatch):
+    """Images of all states at once take gigabytes: half of a minute in the system."""
+    env, episode = pushed
+    own = env.task.config.fluoroscopy
+    options, surface = on_screen(own, size=32), env.task.scene.anatomy.surface
+    drawn, render = [], Fluoroscope.render
+
+    def count(self, shadows, *random_states):
+        images = render(self, shadows, *random_states)
+        drawn.append(len(images))
+        return images
+
+    monkeypatch.setattr(Fluoroscope, "render", count)
+    film = xray_film(episode, surface, options)
+    assert sum(drawn) == episode.steps + 1 > max(drawn) * 4
+    monkeypatch.setattr(recorded, "_TOGETHER", 1000)
+    np.testing.assert_array_equal(xray_film(episode, surface, options), film)
 
 
 def test_an_episode_is_drawn_in_its_own_anatomy(pushed, tmp_path):

@@ -257,3 +257,21 @@ def test_a_living_vessel_is_kept_and_its_wall_moves_in_the_file(tmp_path):
     np.testing.assert_array_equal(drawn.goal, goal[8])
     film = xray_film(episode, surface, FluoroscopyOptions(size=64))
     assert (film[0] != film[4]).mean() > 0.01
+
+
+def test_a_body_has_its_pose_before_its_shape(tmp_path):
+    """A viewer that is still reading shows what it has, wherever it is."""
+    from rerun.chunk import RrdReader
+
+    geoms = [
+        geom._replace(body=1 + number % 2, body_name=f"robot/part_{number % 2}")
+        for number, geom in enumerate(40 * make_geoms())
+    ]
+    path = write_rrd(
+        make_recorded(), make_tube(), tmp_path / "order.rrd", robot_geoms=geoms
+    )
+    order = [str(chunk.entity_path) for chunk in RrdReader(path).stream()]
+    shapes = [name for name in order if name.count("/") == 4 and "/robot/" in name]
+    assert len(shapes) == 6
+    for shape in shapes:
+        assert order.index(shape.rpartition("/")[0]) < order.index(shape)

@@ -234,7 +234,8 @@ def record(
     """Record one episode: as a Rerun file, and as .npz beside it; or as a film.
 
     Args:
-        out: Path of the .rrd file.
+        out: File to write: .rrd (Rerun, with an .npz beside it), .npz (arrays), or a
+            film as `gif`.
         gif: Path of a film for slides, .gif, .webp or, with the extra `video`, .mp4;
             needs no OpenGL.
         seed: Seed of the episode.
@@ -244,11 +245,12 @@ def record(
     targets = [path for path in (out, gif) if path is not None]
     if not targets:
         raise ValueError("nothing is to be written; give --out, an .rrd file, or --gif")
-    for path, endings in (out, (".rrd",)), (gif, SUFFIXES):
+    for path, endings in (out, recorded.FORMATS), (gif, SUFFIXES):
         if path is not None and path.suffix not in endings:
             raise ValueError(f"{path} does not end in {' or '.join(endings)}")
-    if gif is not None:
-        check_film(gif)
+    for path in targets:
+        if path.suffix in SUFFIXES:
+            check_film(path)
     bounds.seed("seed", seed)
     player = agents.load_policy(policy, seed)
     task, task_kwargs = task_and_options(player, task, options.given)
@@ -259,7 +261,8 @@ def record(
     episode, env = _played(player, task, task_kwargs, seed)
     if out is not None:
         recorded.write(episode, env, out, fluoroscopy)
-        episode.save(out.with_suffix(".npz"))
+        if out.suffix == ".rrd":
+            episode.save(out.with_suffix(".npz"))
     if gif is not None:
         recorded.write(episode, env, gif)
     print(f"{episode.steps} steps, {episode.termination}:", *targets)

@@ -22,6 +22,7 @@ from cathsim_dmc.recording.records import MESH_EVERY, VesselRecord, XRayRecord
 AnyPolicy = str | policies.Policy | Callable[[Any], np.ndarray]
 FORMATS = (".rrd", ".npz", *SUFFIXES)
 _FILM_SIZE = 512  # pixels along a side of the X-ray images of a recording
+_TOGETHER = 8  # states whose X-ray images are drawn together
 
 
 def record(
@@ -157,18 +158,23 @@ def xray_film(
         the brightest of each plane's grey levels are black and white. A vessel that
         moves is drawn anew in every fourth state.
     """
-    record, states, films = VesselRecord.of(episode), episode.steps + 1, []
+    record, states = VesselRecord.of(episode), episode.steps + 1
     x_ray = XRayRecord.of(episode)
     moved = None if record is None or record.motion is None else record
-    span = MESH_EVERY if moved else states
-    for plane in Angiograph(surface, options).planes(x_ray.deviation):
-        film = np.empty((states, *plane.carm.resolution, 1), np.uint8)
-        for first in range(0, states, span):
-            rows = slice(first, first + span)
+    # Few at a time: images of thousands of states take gigabytes while they are drawn.
+    span = MESH_EVERY if moved else _TOGETHER
+    parts = [slice(first, first + span) for first in range(0, states, span)]
+    planes = Angiograph(surface, options).planes(x_ray.deviation)
+    films = np.empty((states, *planes[0].carm.resolution, len(planes)), np.uint8)
+    for number, plane in enumerate(planes):
+        film = films[..., number]
+        for rows in parts:
             if moved:
-                plane = plane.around(moved.surface(surface, first))
-            film[rows] = plane.render(x_ray.shadows(episode, rows))
+                plane = plane.around(moved.surface(surface, rows.start))
+            film[rows] = plane.render(x_ray.shadows(episode, rows))[..., 0]
         darkest, brightest = int(film.min()), int(film.max())
         levels = 255 * (np.arange(256.0) - darkest) / max(brightest - darkest, 1)
-        films.append(np.clip(levels, 0, 255).round().astype(np.uint8)[film])
-    return np.concatenate(films, axis=-1)
+        levels = np.clip(levels, 0, 255).round().astype(np.uint8)
+        for rows in parts:
+            film[rows] = levels[film[rows]]
+    return films

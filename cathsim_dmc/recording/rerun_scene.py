@@ -49,6 +49,10 @@ class Log:
         """Logs what never changes."""
         self._stream.log(entity, archetype, static=True, strict=True)
 
+    def flush(self) -> None:
+        """Puts all that has been logged before what follows; Rerun keeps no order."""
+        self._stream.flush()
+
     def columns(self, entity: str, columns: Any, rows: Any = EVERY) -> None:
         """Sends one row per state in ``rows``; nothing at all for no rows."""
         times, steps = self._times[rows], np.arange(len(self._times))[rows]
@@ -219,13 +223,13 @@ def body_geoms(physics: Any) -> Iterator[BodyGeom]:
 
 
 def log_bodies(log: Log, geoms: Iterable[BodyGeom]) -> None:
-    """Log the shapes of the bodies and how they move."""
+    """Log how the bodies move, and then their shapes.
+
+    A shape that a viewer reads before its pose stands at the origin, in the arch.
+    """
     by_body = sorted(geoms, key=lambda geom: (geom.body, geom.kind))
     for body, parts in itertools.groupby(by_body, lambda geom: geom.body):
-        parts = list(parts)
-        entity = f"world/{parts[0].body_name.strip('/')}"
-        for kind, same in itertools.groupby(parts, lambda geom: geom.kind):
-            log.static(f"{entity}/{kind}", _shape(kind, list(same)))
+        entity = f"world/{next(parts).body_name.strip('/')}"
         place = log.episode.body_pos[:, body]
         turn = np.roll(log.episode.body_quat[:, body], -1, axis=-1)  # xyzw
         if np.ptp(place, axis=0).any() or np.ptp(turn, axis=0).any():
@@ -234,6 +238,11 @@ def log_bodies(log: Log, geoms: Iterable[BodyGeom]) -> None:
         else:
             still = rr.Quaternion(xyzw=turn[0])
             log.static(entity, rr.Transform3D(translation=place[0], quaternion=still))
+    log.flush()
+    for _, parts in itertools.groupby(by_body, lambda geom: (geom.body, geom.kind)):
+        same = list(parts)
+        name, kind = same[0].body_name.strip("/"), same[0].kind
+        log.static(f"world/{name}/{kind}", _shape(kind, same))
 
 
 def _shape(kind: str, parts: list[BodyGeom]) -> Any:
