@@ -26,6 +26,10 @@ MOST_START_SHARE = 0.95
 # Largest distance of an anatomy from the origin, m.
 FAR = 10.0
 
+# Magnitude of a number of any kind: its square is finite in single precision, and no
+# quantity in SI units is larger (a Young's modulus is up to 1e12 Pa).
+LARGEST = 1e15
+
 _SHOWN = 80  # characters of a value in an error
 
 
@@ -54,6 +58,8 @@ def number(
 ) -> float:
     """A finite number in a closed range; `positive` demands more than zero."""
     good = is_number(value) and low <= value <= high and (value > 0 or not positive)
+    if good and abs(value) > LARGEST:
+        refuse(name, value, f"at most {LARGEST:g} in magnitude")
     if not good:
         refuse(name, value, _allowed("a finite number", low, high, unit, positive))
     return float(value)
@@ -269,6 +275,7 @@ def _entries(
     row = _row(value)
     if row is None or len(row) != count:
         return None
+    low, high = max(low, -LARGEST), min(high, LARGEST)
     return row if all(fits(one) and low <= one <= high for one in row) else None
 
 

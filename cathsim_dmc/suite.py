@@ -7,6 +7,7 @@ TorchRL's `DMControlEnv` know it too.
 import dataclasses
 import difflib
 import inspect
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -267,6 +268,7 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
     known = [*inspect.signature(composer.Environment).parameters][1:]
     known.remove("random_state")  # the task's
     bounds.mapping("environment_kwargs", environment_kwargs, known)
+    _check_settings(environment_kwargs)
     settings = {
         "strip_singleton_obs_buffer_dim": True,
         "recompile_mjcf_every_episode": False,
@@ -277,6 +279,22 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
         **environment_kwargs,
     }
     return Environment(task, random_state=task.random, **settings)
+
+
+def _check_settings(settings: Mapping[str, Any]) -> None:
+    """Checks arguments of `composer.Environment`, which checks none of them."""
+    endless = {"time_limit": math.inf, "n_sub_steps": None}
+    for name, value in settings.items():
+        if name in endless and value == endless[name]:
+            continue
+        if name == "time_limit":
+            bounds.number(name, value, unit="s", positive=True)
+        elif name in ("max_reset_attempts", "n_sub_steps"):
+            bounds.whole(name, value, 1)
+        elif name == "delayed_observation_padding":
+            bounds.instance(name, value, composer.ObservationPadding)
+        else:
+            bounds.switch(name, value)
 
 
 def _register_domain() -> None:

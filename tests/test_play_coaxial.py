@@ -131,7 +131,7 @@ def test_an_operator_moves_wire_and_catheter_in_the_window(monkeypatch, tmp_path
     monkeypatch.setitem(sys.modules, "tkinter", screen)
     monkeypatch.setattr(window, "_REPEAT", 0.0)
     written = play(TASK, out=tmp_path, seed=4, speed=1e3)
-    assert screen.said == [controls.COAXIAL_HELP]
+    assert screen.said == [controls.Controls(devices=2).help]
     first, second = (Episode.load(path) for path in written)
     devices = [CoaxialRecord.of(episode) for episode in (first, second)]
 

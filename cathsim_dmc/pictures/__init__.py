@@ -49,6 +49,7 @@ def show(
     Raises:
         TypeError: it is no environment of this package, or there is no such option.
         ValueError: the episode was recorded in an anatomy that the environment has not.
+        RuntimeError: no episode is given, and none has begun.
     """
     from cathsim_dmc.pictures.figure import scene_figure
 
@@ -74,6 +75,7 @@ def fluoroscopy(env: Any, *, seed: int = 0, **options: Any) -> np.ndarray:
     Raises:
         TypeError: it is no environment of this package, or there is no such option.
         ValueError: an option's value is not possible.
+        RuntimeError: no episode has begun.
     """
     base: FluoroscopyOptions = navigation_of(env).config.fluoroscopy
     _check(options, vars(base))

@@ -13,7 +13,7 @@ from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale
-from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
+from cathsim_dmc.recording.recorder import EpisodeRecorder, begun_task_of
 from cathsim_dmc.recording.records import CoaxialRecord, VesselRecord, XRayRecord
 
 
@@ -64,7 +64,7 @@ class Moment:
     @classmethod
     def of(cls, env: Any) -> "Moment":
         """The present state of an environment; TypeError for any other object."""
-        task = navigation_of(env)
+        task = begun_task_of(env)
         episode = EpisodeRecorder(env, task.name).present()
         distance = 1e3 * episode.meta["distance"][-1]
         rest, moving = task.scene.anatomy.surface, task.rollout.moving

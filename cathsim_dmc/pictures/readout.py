@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.recording.recorder import navigation_of
+from cathsim_dmc.recording.recorder import begun_task_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,9 +70,10 @@ def forces(env: Any) -> ForceReadout:
 
     Raises:
         TypeError: if it is no environment of this package.
+        RuntimeError: if no episode has begun.
     """
-    task = navigation_of(env)
-    contacts, readings = task.contacts(env.physics), task.readings
+    task = begun_task_of(env)
+    readings, contacts = task.readings, task.contacts(env.physics)
     there = contacts.present
     return ForceReadout(
         contacts.position[there],

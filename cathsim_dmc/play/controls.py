@@ -19,17 +19,12 @@ HELD = {
 }
 # Keys that act once.
 ONCE = {"space": "straight", "r": "restart", "Escape": "quit"}
+_ALWAYS = "R: again", "Esc: quit"
 
 BEND_RATE = 1.0  # share of the full deflection per second while a key is held
 
-HELP = (
-    "arrows: bend the tip as seen from the front (up: towards you)   "
-    "W/S: push/pull   A/D: rotate   space: straighten   R: again   Esc: quit"
-)
-COAXIAL_HELP = (
-    "arrows: push/pull (up/down) and rotate (left/right) the guidewire   "
-    "W/S: push/pull the catheter   A/D: rotate it   R: again   Esc: quit"
-)
+_BEND = "arrows: bend the tip as seen from the front (up: towards you)"
+_INNERMOST = "arrows: push/pull (up/down) and rotate (left/right) the guidewire"
 
 
 class Controls:
@@ -45,26 +40,46 @@ class Controls:
         bend: Deflection (2,) of the tip about x and y, shares of the full one.
     """
 
-    def __init__(self, tip_joints: int = 0, rotation: bool = False, devices: int = 0):
+    def __init__(
+        self,
+        tip_joints: int = 0,
+        rotation: bool = False,
+        devices: int = 0,
+        *,
+        watching: bool = False,
+    ):
         """Starts with nothing held and a straight tip.
 
         Args:
             tip_joints: Number of steerable joints of the device, two motors each.
             rotation: Whether the action has a rotation.
             devices: Number K of coaxial devices; 0 for a steerable device.
+            watching: Whether somebody else gives the actions.
         """
         self._tip_joints, self._rotation, self._devices = tip_joints, rotation, devices
-        self.help = COAXIAL_HELP if devices else HELP
+        self.help = "   ".join([*([] if watching else self._keys()), *_ALWAYS])
         self._held: set[str] = set()
         self.restart()
 
     @classmethod
-    def of(cls, scene: Scene) -> "Controls":
+    def of(cls, scene: Scene, *, watching: bool = False) -> "Controls":
         """The controls of the devices in a scene."""
         chain = scene.catheter
         if scene.catheter.coaxial:
-            return cls(devices=len(chain.devices))
-        return cls(len(chain.tip_motors) // 2, chain.rotation is not None)
+            return cls(devices=len(chain.devices), watching=watching)
+        turns = chain.rotation is not None
+        return cls(len(chain.tip_motors) // 2, turns, watching=watching)
+
+    def _keys(self) -> list[str]:
+        """What the keys of the task's own actions do."""
+        if self._devices == 1:
+            return ["arrows or W/S and A/D: push/pull and rotate the device"]
+        if self._devices:
+            return [_INNERMOST, "W/S: push/pull the catheter", "A/D: rotate it"]
+        bend = [_BEND] if self._tip_joints else []
+        turn = ["A/D: rotate"] if self._rotation else []
+        straighten = ["space: straighten"] if self._tip_joints else []
+        return [*bend, "W/S: push/pull", *turn, *straighten]
 
     def press(self, key: str) -> None:
         """Begins to hold a key until `release`; others than those above do nothing."""

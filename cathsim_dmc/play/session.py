@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import files, suite
+from cathsim_dmc import bounds, files, suite
 from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.play.window import FluoroscopyWindow
 from cathsim_dmc.policies import Policy, in_environment
@@ -17,6 +17,7 @@ from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 _PAUSE = 1.0  # s, for which the end of an episode is shown
+_FASTEST = 1000.0  # times real time
 
 
 def play(
@@ -44,15 +45,17 @@ def play(
     Raises:
         ValueError: if an argument is wrong or no window can be opened.
     """
-    if not speed > 0:
-        raise ValueError(f"speed is {speed}; it must be > 0")
+    bounds.number("speed", speed, high=_FASTEST, positive=True)
+    bounds.seed("seed", seed)
+    if episodes is not None:
+        bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
     if out is not None:
         files.require_folder(out, make=True)
     options = dict(task_kwargs or {})
     # The screen is the operator's observation; the task's own would only cost.
     observation = (policy and policy.observation) or "tracking"
     env = suite.load(suite.DOMAIN, task, {"observation": observation, **options})
-    controls = Controls.of(env.task.scene)
+    controls = Controls.of(env.task.scene, watching=policy is not None)
     window = FluoroscopyWindow(env.task, controls)
     chosen = policy and in_environment(policy, env)
     due = time.monotonic()

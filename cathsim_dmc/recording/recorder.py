@@ -38,6 +38,16 @@ def navigation_of(env: Any) -> Any:
     return task
 
 
+def begun_task_of(env: Any) -> Any:
+    """The task of an environment; RuntimeError if no episode has begun in it."""
+    task = navigation_of(env)
+    if not task.rollout.begun:
+        raise RuntimeError(
+            "no episode has begun; call reset() of the environment first"
+        )
+    return task
+
+
 class _Rows(collections.defaultdict[str, list]):
     """Growing lists, one per array of an episode."""
 

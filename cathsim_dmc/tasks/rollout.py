@@ -363,6 +363,11 @@ class Rollout:
         return self._cases[self._case_of[index]]
 
     @property
+    def begun(self) -> bool:
+        """Whether an episode has ever begun; until then there is nothing to see."""
+        return self._random_states is not None
+
+    @property
     def goal(self) -> np.ndarray:
         """(N, 3) m, the goals in space, which move with their vessels."""
         goal = self.resting_goal
