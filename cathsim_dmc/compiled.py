@@ -12,16 +12,16 @@ from typing import Any
 class _Compiled:
     """A function that is compiled when it is called, from Python or compiled code."""
 
-    def __init__(self, function: Callable, cache: bool, checked: bool):
+    def __init__(self, function: Callable, cache: bool = True, **options: Any):
         functools.update_wrapper(self, function)
-        self._function, self._cache, self._checked = function, cache, checked
+        self._function, self._cache, self._options = function, cache, options
 
     def _made(self, **options: Any) -> Any:
         import numba
 
         # Wrappers that nothing calls would take a fifth more time to compile.
         options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-        return numba.njit(self._function, boundscheck=self._checked, **options)
+        return numba.njit(self._function, **options, **self._options)
 
     @functools.cached_property
     def _compiled(self) -> Any:
@@ -58,4 +58,21 @@ def compiled(function: Callable, cache: bool = True, checked: bool = False) -> C
     that refers to others which change from call to call must not be kept (`cache`).
     `checked` has an index beyond an array raise IndexError.
     """
-    return _Compiled(function, cache, checked)
+    return _Compiled(function, cache, boundscheck=checked)
+
+
+def law(function: Callable) -> Callable:
+    """Compiles a function that allocates nothing; numba refuses one that does.
+
+    Numba then counts no references to arrays, which takes longer than a small function.
+    """
+    return _Compiled(function, _nrt=False)
+
+
+def inlined(function: Callable) -> Callable:
+    """Compiles a small `law` as a part of those that call it.
+
+    An array in an argument is seven words: where a function is called for every sample,
+    passing them takes longer than its work.
+    """
+    return _Compiled(function, _nrt=False, forceinline=True)

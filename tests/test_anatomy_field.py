@@ -5,10 +5,10 @@ import pytest
 
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
-from cathsim_dmc.anatomy.field_loops import FREE
 from cathsim_dmc.anatomy.parts import End, Surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
+from cathsim_dmc.laws.field import FREE
 
 RADIUS, LENGTH = 4e-3, 40e-3
 UP = np.array([0.0, 0.0, 1.0])

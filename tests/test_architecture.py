@@ -39,9 +39,10 @@ ALLOWED = {
     "extras": set(),
     "compiled": {"compiled_cache"},
     "compiled_cache": set(),
-    "anatomy": set(),
-    "imaging": {"anatomy"},
-    "laws": {"anatomy"},
+    # Laws know no engine and no task.
+    "laws": set(),
+    "anatomy": {"laws"},
+    "imaging": {"anatomy", "laws"},
     "collision": {"anatomy", "laws"},
     "entities": {"anatomy", "collision", "imaging", "laws"},
     "physics": {"anatomy", "collision", "imaging", "laws", "entities"},

@@ -11,10 +11,6 @@ from cathsim_dmc.anatomy.parts import End
 
 # Mean shares of the inflow, from the resistances of ADAN56 (Boileau 2015).
 SHARES = {"bca": 0.120, "lcca": 0.069, "lsa": 0.050}
-# Inflow over a beat of 1 s: ms and mL/s (ADAN56, Boileau 2015, as in openBF).
-_TIMES = (0, 22, 41, 61, 80, 99, 128, 158, 177, 196, 245, 322, 351, 390, 415, 438, 1000)
-_FLOWS = (0, 0, 105, 273, 405, 536, 573, 536, 489, 452, 315, 179, 137, 0, -163, 0, 0)
-BEAT = np.interp(np.arange(1001), _TIMES, _FLOWS) / max(_FLOWS)
 _SPACING = 3e-3  # m, of the places along a vessel
 _AT_END = 1e-6  # m
 

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from cathsim_dmc import file_maps
 from cathsim_dmc.anatomy.centreline import Array, VesselTree, as_rows
-from cathsim_dmc.anatomy.field_loops import END, FIRST_END, MARGIN, depths, gradients
-from cathsim_dmc.anatomy.parts import End, Surface
+from cathsim_dmc.anatomy.parts import MARGIN, End, Surface
+from cathsim_dmc.laws.field import END, FIRST_END, FieldArrays, depths, gradients
 
 EDGE = 4e-3  # m, of a brick
 # Depths, m, between which a device touches the wall: from as deep as an impact takes
@@ -65,7 +65,7 @@ class Field:
         Args:
             points: m.
             free: what lies behind an open end, in the straight continuation of the
-                lumen, is `field_loops.FREE` deep; otherwise it is outside, by its
+                lumen, is `laws.field.FREE` deep; otherwise it is outside, by its
                 distance from the plane of the end.
         """
         flat, out = as_rows(points), np.empty(np.shape(points)[:-1])
@@ -84,9 +84,9 @@ class Field:
         return out.reshape(np.shape(points))
 
     @property
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Head, coarse lattice, index and samples."""
-        return self.head, self.coarse, self.index, self.samples
+    def arrays(self) -> FieldArrays:
+        """The arrays, as the laws take them."""
+        return FieldArrays(self.head, self.coarse, self.index, self.samples)
 
     @property
     def nbytes(self) -> int:

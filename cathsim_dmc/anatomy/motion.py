@@ -10,10 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import softmax
 
-from cathsim_dmc.anatomy import motion_loops
 from cathsim_dmc.anatomy.centreline import Array, VesselTree, as_rows
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.anatomy.parts import End, Surface
+from cathsim_dmc.laws.motion import (
+    VALUES,
+    WARP,
+    Course,
+    MotionParameters,
+    course_at,
+    to_rest,
+    to_space,
+)
 
 _STEP = 6e-3  # m, of the lattice
 _SMOOTH = 25e-3  # m, over which a displacement is that of the aorta around
@@ -27,6 +35,9 @@ _BREATHING = np.array([8.9e-3, 12.0e-3, 11.1e-3, 4.9e-3])
 _MEDIAL = np.array([1.0, 1.0, -1.0, -1.0])
 _INSPIRATION = (0.33, -0.47, -0.82)  # medial, posterior, superior
 PULSE_PRESSURE = 5.33  # kPa, 40 mmHg
+# Numbers of a motion in a recording; those from 1 to 8 are
+# `laws.motion.MotionParameters`, the others are not used.
+PARAMETERS = 11
 STEEPEST = 0.6  # norm of the gradient of a displacement, at most; at 1 space folds
 
 
@@ -35,7 +46,7 @@ class Motion:
     """Displacements of space around an anatomy, on a lattice.
 
     It is (7 + 8 a b c,): origin (3) and step, m, shape (a, b, c), and at each point
-    what `motion_loops.VALUES` says.
+    what `laws.motion.VALUES` says.
     """
 
     lattice: Array
@@ -76,8 +87,8 @@ class Motion:
 
     def to_rest(self, parameters: Array, time: float, points: Array) -> Array:
         """Places at rest (..., 3) of places in space (..., 3), m."""
-        out = np.empty((points.size // 3, 3))
-        motion_loops.rest(self.lattice, parameters, time, as_rows(points), out)
+        out, course = np.empty((points.size // 3, 3)), course_of(parameters, time)
+        to_rest(self.lattice, course, as_rows(points), scratch(), out)
         return out.reshape(points.shape)
 
     def to_space(
@@ -86,13 +97,24 @@ class Motion:
         """Places in space (..., 3) m of those at rest, and growth of radii (...) m."""
         flat = as_rows(points)
         out, growth = np.empty_like(flat), np.empty(len(flat))
-        motion_loops.moved(self.lattice, parameters, time, flat, out, growth)
+        course = course_of(parameters, time)
+        to_space(self.lattice, course, flat, scratch(), out, growth)
         return out.reshape(points.shape), growth.reshape(points.shape[:-1])
 
     def surface(self, parameters: Array, time: float, rest: Surface) -> Surface:
         """The lumen's surface at a time, s, of that at rest."""
         places, growth = self.to_space(parameters, time, rest.vertices)
         return Surface(places + growth[:, None] * rest.normals, rest.faces)
+
+
+def scratch() -> Array:
+    """Memory of `laws.motion.to_rest` and `to_space`."""
+    return np.empty((VALUES + WARP // 4, 4))
+
+
+def course_of(parameters: Array, time: float) -> Course:
+    """Motion at a time, s, of numbers (PARAMETERS,)."""
+    return course_at(MotionParameters(*parameters[1:9].tolist()), time)
 
 
 def distensibility(radius: Array) -> Array:

@@ -14,6 +14,7 @@ from cathsim_dmc.anatomy.centreline import Array, _readonly
 # Radius of the hole in the cap over the inlet of an exported wall, m. The front of the
 # introducer sheath covers it; its rim stays clear of the device.
 INLET_HOLE_RADIUS = 2.5e-3
+MARGIN = 4e-3  # m, by which the box of a field exceeds the lumen
 
 
 def _vector(name: str, value: ArrayLike) -> Array:

@@ -6,8 +6,7 @@ import numpy as np
 from scipy.sparse import coo_array
 
 from cathsim_dmc.anatomy.centreline import Array
-from cathsim_dmc.anatomy.field_loops import MARGIN
-from cathsim_dmc.anatomy.parts import End, Surface
+from cathsim_dmc.anatomy.parts import MARGIN, End, Surface
 
 # Cosines: of normals of neighbours, and up to which a normal tells inside from outside.
 _SMOOTH, _BEFORE = 0.5, 0.9

@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 from tyro import conf
 
 from cathsim_dmc.cli.options import CHECK_FAILED, Json, print_json, say, show
-from cathsim_dmc.collision import loops
+from cathsim_dmc.laws.capsule import nearest_places
 
 _OPENGL = "import mujoco; mujoco.GLContext(8, 8).make_current()"
 
@@ -68,7 +68,7 @@ def _versions(name: str) -> list[Finding]:
 
 
 def _kernels() -> Finding:
-    folder = loops.straight.cache_path
+    folder = nearest_places.cache_path
     if folder is None:
         advice = "every process compiles anew; set NUMBA_CACHE_DIR to a folder"
         return Finding("compiled kernels", "not kept", False, advice)

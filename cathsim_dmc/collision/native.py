@@ -21,7 +21,7 @@ import llvmlite.binding as llvm
 import mujoco
 import numpy as np
 from llvmlite import ir
-from numba.core import sigutils, types
+from numba.core import cgutils, sigutils, types
 from numba.core.ccallback import CFunc
 from numba.extending import intrinsic, overload, register_jitable
 from numba.np.arrayobj import populate_array
@@ -263,6 +263,27 @@ def _array(kind: Any) -> Any:
 
 numbers, wholes, shorts = map(_array, (types.float64, types.int32, types.int16))
 longs = _array(types.int64)
+
+
+@_typed
+def stacked(_, rows, columns):
+    """Scratch (rows, columns) of float64 that lives as long as the function that asks.
+
+    Both sizes are literals. It holds anything at first.
+    """
+    sizes = rows, columns
+    if not all(isinstance(size, types.IntegerLiteral) for size in sizes):
+        return None
+    shape = tuple(size.literal_value for size in sizes)
+    kind = types.Array(types.float64, 2, "C")
+
+    def generate(context, builder, signature, arguments):
+        room = ir.ArrayType(ir.DoubleType(), math.prod(shape))
+        place = cgutils.alloca_once(builder, room)
+        address = builder.ptrtoint(place, ir.IntType(64))
+        return _array_at(context, builder, kind, address, shape)
+
+    return kind(rows, columns), generate
 
 
 def _call(builder, values, result, variadic=False):

@@ -6,15 +6,17 @@ the wall. The camera looks along +z of the head, with +x to the right and +y dow
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from cathsim_dmc.anatomy import motion_loops
 from cathsim_dmc.anatomy.field import Field
-from cathsim_dmc.anatomy.field_loops import behind, depth_at
-from cathsim_dmc.anatomy.motion import STEEPEST
+from cathsim_dmc.anatomy.motion import PARAMETERS, STEEPEST, course_of, scratch
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.imaging.options import FARTHEST_WALL, VIEW_ANGLE
+from cathsim_dmc.laws.field import FieldArrays, behind, depth_at
+from cathsim_dmc.laws.motion import VALUES, Course, rest_place, warp
+from cathsim_dmc.laws.vectors import along
 
 # Distance at which a wall that is met straight on is white, m.
 WHITE = 8e-3
@@ -25,9 +27,25 @@ _MOST_STEPS = 100
 _NEAR, _LONGEST = 1e-3, 8.0
 _STEP = 0.25e-3  # m, to both sides, over which a gradient is taken
 
-# Lattice, parameters and time (s) of a vessel that moves, see `motion_loops.warp`.
+# Lattice, parameters and time (s) of a vessel that moves, see `laws.motion.warp`.
 Warp = tuple[np.ndarray, np.ndarray, float]
-AT_REST: Warp = (np.zeros(0), np.zeros(motion_loops.PARAMETERS), 0.0)
+AT_REST: Warp = (np.zeros(0), np.zeros(PARAMETERS), 0.0)
+
+
+class _Vessel(NamedTuple):
+    """Field of a lumen and its motion: lattice, of no length at rest, and course."""
+
+    field: FieldArrays
+    lattice: np.ndarray
+    course: Course
+
+
+class _Camera(NamedTuple):
+    """Place (3) m, axes (3, 3) in columns, and focal length in pixels."""
+
+    eye: np.ndarray
+    axes: np.ndarray
+    focal: float
 
 
 def views(
@@ -56,33 +74,33 @@ def views(
     grey, distance = np.empty(shape, np.uint8), np.empty(shape, np.float32)
     focal = 0.5 * resolution[0] / math.tan(math.radians(VIEW_ANGLE) / 2)
     rows = zip(lumens, warps, heads, frames, grey, distance, strict=True)
-    for lumen, warp, head, frame, levels, lengths in rows:
-        axes = np.ascontiguousarray(frame)
-        _trace(lumen.arrays, *warp, head, axes, focal, levels, lengths)
+    for lumen, (lattice, parameters, time), head, frame, levels, lengths in rows:
+        vessel = _Vessel(lumen.arrays, lattice, course_of(parameters, time))
+        camera = _Camera(head, np.ascontiguousarray(frame), focal)
+        _trace(vessel, camera, scratch(), levels, lengths)
     return grey[..., None], distance[..., None]
 
 
 @compiled
-def _clear(lumen, lattice, course, x, y, z, values):
-    """Depth (m) of a place in space; in a vessel that moves, within its stretch."""
+def _depth(vessel, point, values):
+    """Depth (m) of a place (3) in space; within its stretch in a vessel that moves."""
     growth = 0.0
-    if len(lattice):
-        there = values[8:].reshape(-1)
-        motion_loops.warp(lattice, course, x, y, z, values, there)
-        x, y, z, growth = there[0], there[1], there[2], there[12]
-    level = behind(lumen[0], x, y, z)
-    return -level if level > 0.0 else depth_at(*lumen, x, y, z) + growth
+    if len(vessel.lattice):
+        there = values[VALUES:].reshape(-1)
+        warp(vessel.lattice, vessel.course, point, values, there)
+        point, growth = rest_place(there), there[12]
+    level = behind(vessel.field.head, point)
+    return -level if level > 0.0 else depth_at(vessel.field, point) + growth
 
 
 @compiled
-def _met(lumen, lattice, course, eye, x, y, z, values):
-    """Way (m) of a ray from an eye (3) along a unit vector to the wall."""
+def _distance(vessel, eye, ray, values):
+    """Distance (m) of the wall from an eye (3) along a ray, a unit vector (3)."""
     # A displacement that stretches space makes distances in it shorter.
-    stride = 1.0 / (1.0 + STEEPEST) if len(lattice) else 1.0
+    stride = 1.0 / (1.0 + STEEPEST) if len(vessel.lattice) else 1.0
     t, step, before = 0.0, 0.0, 0.0
     for _ in range(_MOST_STEPS):
-        a, b, c = eye[0] + t * x, eye[1] + t * y, eye[2] + t * z
-        depth = _clear(lumen, lattice, course, a, b, c, values)
+        depth = _depth(vessel, along(eye, ray, t), values)
         if abs(depth) < _CLOSE or t == FARTHEST_WALL:
             break
         ahead = stride * depth
@@ -95,32 +113,41 @@ def _met(lumen, lattice, course, eye, x, y, z, values):
 
 
 @compiled
-def _trace(lumen, lattice, parameters, time, eye, axes, focal, grey, far):
-    """Writes grey levels and distances (rows, columns) of the view of one camera."""
-    values = np.empty((8 + motion_loops.WARP // 4, 4))
-    slope, place = np.empty(3), np.empty(3)
-    course = motion_loops.courses(parameters, time)
+def _slope(vessel, point, axis, values):
+    """Difference of the depth along an axis at a point (3), by way, m²."""
+    slope = 0.0
+    for side in (-_STEP, _STEP):
+        x, y, z = point
+        x += side if axis == 0 else 0.0
+        y += side if axis == 1 else 0.0
+        z += side if axis == 2 else 0.0
+        slope += side * _depth(vessel, (x, y, z), values)
+    return slope
+
+
+@compiled
+def _trace(vessel, camera, values, grey, far):
+    """Writes grey levels and distances (rows, columns) of the view of one camera.
+
+    `values` is the scratch of `laws.motion.to_rest`.
+    """
+    axes, eye = camera.axes, camera.eye
     rows, columns = far.shape
     for i in range(rows):
-        v = (i + 0.5 - 0.5 * rows) / focal
+        v = (i + 0.5 - 0.5 * rows) / camera.focal
         for j in range(columns):
-            u = (j + 0.5 - 0.5 * columns) / focal
+            u = (j + 0.5 - 0.5 * columns) / camera.focal
             norm = math.sqrt(1.0 + u * u + v * v)
             x = (axes[0, 0] * u + axes[0, 1] * v + axes[0, 2]) / norm
             y = (axes[1, 0] * u + axes[1, 1] * v + axes[1, 2]) / norm
             z = (axes[2, 0] * u + axes[2, 1] * v + axes[2, 2]) / norm
-            t = _met(lumen, lattice, course, eye, x, y, z, values)
-            far[i, j] = t
-            for k in range(3):
-                slope[k] = 0.0
-                for side in (-_STEP, _STEP):
-                    place[0], place[1] = eye[0] + t * x, eye[1] + t * y
-                    place[2] = eye[2] + t * z
-                    place[k] += side
-                    a, b, c = place
-                    slope[k] += side * _clear(lumen, lattice, course, a, b, c, values)
-            size = math.sqrt(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2)
-            facing = -(slope[0] * x + slope[1] * y + slope[2] * z)
+            far[i, j] = t = _distance(vessel, eye, (x, y, z), values)
+            point = along(eye, (x, y, z), t)
+            a = _slope(vessel, point, 0, values)
+            b = _slope(vessel, point, 1, values)
+            c = _slope(vessel, point, 2, values)
+            size = math.sqrt(a**2 + b**2 + c**2)
+            facing = -(a * x + b * y + c * z)
             cosine = facing / size if size > 0.0 else 0.0
             level = 255.0 * math.sqrt(max(cosine, 0.0)) * WHITE / max(t, 1e-9)
             grey[i, j] = int(min(level, 255.0))

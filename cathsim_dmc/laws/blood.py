@@ -10,8 +10,8 @@ Re = ρ|u|d/µ, it is ½ ρ d l C_d |u| u, C_d = 1.18 + 6.8 / Re^0.89 + 1.96 / �
 import math
 from typing import Any, NamedTuple
 
-from cathsim_dmc.anatomy.circulation import BEAT
 from cathsim_dmc.compiled import compiled
+from cathsim_dmc.laws.heart import BEAT
 from cathsim_dmc.laws.parameters import Array
 
 

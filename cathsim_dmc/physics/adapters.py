@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, courses, wall_velocity, warp
 from cathsim_dmc.collision import native
-from cathsim_dmc.collision.loops import SOFT
 from cathsim_dmc.collision.native import (
     address_of,
     contact_at,
@@ -29,8 +27,17 @@ from cathsim_dmc.collision.table import MOTION_ENTRY, SYMBOL, entry_of, key_of
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.laws.blood import Blood, drag
 from cathsim_dmc.laws.compliance import share
+from cathsim_dmc.laws.contact import COMPLIANT
 from cathsim_dmc.laws.device import Contact, Device, Links
 from cathsim_dmc.laws.hinges import Bends
+from cathsim_dmc.laws.motion import (
+    VALUES,
+    WARP,
+    MotionParameters,
+    course_at,
+    wall_velocity,
+    warp,
+)
 from cathsim_dmc.laws.springs import Scratch, Springs, shape_torques
 
 _adapter = native.callback("void(int64, int64, int64, int64)")
@@ -118,7 +125,7 @@ def compliance(model, data, layout, start):
     """Halves the springs of contacts that share one, see `laws.compliance`."""
     for n in range(data_field(data, "ncon")):
         contact = contact_at(data, n)
-        soft = contact_field(contact, "solimp")[0] == SOFT
+        soft = contact_field(contact, "solimp")[0] == COMPLIANT
         if soft and native.wholes(contact)[0] & 1:
             share(_contact(contact))
 
@@ -138,7 +145,7 @@ def motion(model, data, layout, start):
         return
     # In the middle of the step, so that a device that sticks goes the wall's way.
     time = data_field(data, "time") + 0.5 * model_field(model, "opt.timestep")
-    course = courses(data_field(data, "userdata")[start - 1 :], time)
+    course = course_at(_parameters(MotionParameters, data, layout, start), time)
     entry = entry_of(address_of(SYMBOL), key_of(model, wall))
     lattice = numbers(word(entry + MOTION_ENTRY))
     scratch = np.empty(WARP + 4 * VALUES)
@@ -149,7 +156,7 @@ def motion(model, data, layout, start):
         if first < 0 or contact_field(contact, "geom2")[0] != wall:
             continue
         place, frame = contact_field(contact, "pos"), contact_field(contact, "frame")
-        warp(lattice, course, place[0], place[1], place[2], values, there)
+        warp(lattice, course, (place[0], place[1], place[2]), values, there)
         # The frame's first axis points from the device into the wall.
         u, v, w = wall_velocity(there, (-frame[0], -frame[1], -frame[2]))
         for row in range(min(contact_field(contact, "dim")[0], 3)):

@@ -14,9 +14,10 @@ from numpy.random import RandomState
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.circulation import Circulation
-from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, carried, courses, warp
+from cathsim_dmc.anatomy.motion import course_of
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.laws.blood import beat
+from cathsim_dmc.laws.motion import VALUES, WARP, carried, warp
 from cathsim_dmc.physics.blood import StillBlood
 from cathsim_dmc.physics.effects import Episode, World
 from cathsim_dmc.physics.motion import Moving
@@ -135,8 +136,9 @@ class Flow(StillBlood):
                 velocities(row, np.zeros(len(row)), *vessels, out[index])
             else:
                 first = self._moving.entered(index, row)
-                course, there = self._moving.warp(index), out[index, first:]
-                moving_velocities(*course, row[first:], *vessels, there)
+                lattice, parameters, time = self._moving.warp(index)
+                course, there = course_of(parameters, time), out[index, first:]
+                moving_velocities(lattice, course, row[first:], *vessels, there)
         return out
 
     def read(self, time: np.ndarray, state: Readings) -> dict[str, np.ndarray]:
@@ -164,22 +166,21 @@ def profile(share):
 
 
 @compiled
-def moving_velocities(
-    lattice, parameters, time, points, ends, radii, shares, ways, vessel, out
-):
+def moving_velocities(lattice, course, points, ends, radii, shares, ways, vessel, out):
     """As `velocities` at a time, s; `out` (P, 8) ends with that of space, m/s."""
     values, there = np.empty((VALUES, 4)), np.empty((len(points), WARP))
-    course = courses(parameters, time)
     for p in range(len(points)):
         x, y, z = points[p]
-        warp(lattice, course, x, y, z, values, there[p])
+        warp(lattice, course, (x, y, z), values, there[p])
     rest, growth = there[:, :3].copy(), there[:, 12].copy()
     velocities(rest, growth, ends, radii, shares, ways, vessel, out)
     for p in range(len(points)):
         row, at = out[p], there[p]
         if row[4] > 0.0:
-            row[0], row[1], row[2], scale = carried(at, row[0], row[1], row[2])
-            row[5], row[6], row[7], scale = carried(at, at[16], at[17], at[18])
+            flow, scale = carried(at, (row[0], row[1], row[2]))
+            row[0], row[1], row[2] = flow
+            flow, scale = carried(at, (at[16], at[17], at[18]))
+            row[5], row[6], row[7] = flow
             row[5:] /= scale
 
 

@@ -2,17 +2,18 @@
 
 The wall of a moving vessel is the field at rest, looked up at x - u(x, t) in every
 physics step (docs/vessel_model.md). An episode begins at rest, at the end of diastole
-and of expiration, and moves in full after `motion_loops.RAMP`.
+and of expiration, and moves in full after `laws.motion.RAMP`.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.random import RandomState
 
-from cathsim_dmc.anatomy import Anatomy, Surface, motion_loops
-from cathsim_dmc.anatomy.motion import Motion
+from cathsim_dmc.anatomy import Anatomy, Surface
+from cathsim_dmc.anatomy.motion import PARAMETERS, Motion
+from cathsim_dmc.laws.motion import MotionParameters, first_past
 from cathsim_dmc.physics.effects import Effect, Episode, World
 from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
 from cathsim_dmc.physics.readings import Readings
@@ -70,19 +71,6 @@ class MotionOptions:
         anatomy.motion.check(anatomy.name, *map(float, largest))
 
 
-class MotionParameters(NamedTuple):
-    """See `motion_loops.PARAMETERS`."""
-
-    heart: Any
-    breathing: Any
-    distensibility: Any
-    rate: Any
-    phase: Any
-    wave_speed: Any
-    breath_rate: Any
-    breath_phase: Any
-
-
 class Moving(Effect):
     """Moves the wall of each simulation.
 
@@ -138,7 +126,7 @@ class Moving(Effect):
 
     def _numbers(self, index: int) -> np.ndarray:
         """Numbers (PARAMETERS,) of one simulation, as `anatomy.motion` takes them."""
-        numbers = np.zeros(motion_loops.PARAMETERS)
+        numbers = np.zeros(PARAMETERS)
         numbers[1:9] = [each[index] for each in self.world.parameters]
         return numbers
 
@@ -150,7 +138,7 @@ class Moving(Effect):
 
     def entered(self, index: int, nodes: np.ndarray) -> int:
         """Number of the first node (P, 3) of a device, m, that is past the inlet."""
-        return motion_loops.first_past(self._inlets[index], nodes)
+        return first_past(self._inlets[index], nodes)
 
     def at_rest(self, state: Readings) -> Readings:
         """Readings with the places at rest of those in space; the sheath rests."""

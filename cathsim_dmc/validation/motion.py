@@ -6,9 +6,15 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.anatomy import Anatomy
-from cathsim_dmc.anatomy.motion import PULSE_PRESSURE, Motion, distensibility
-from cathsim_dmc.anatomy.motion_loops import MARK, PARAMETERS, courses, pulse
+from cathsim_dmc.anatomy.motion import (
+    PARAMETERS,
+    PULSE_PRESSURE,
+    Motion,
+    course_of,
+    distensibility,
+)
 from cathsim_dmc.entities import contact
+from cathsim_dmc.laws.heart import pulse
 from cathsim_dmc.physics import adapters, dispatcher
 from cathsim_dmc.physics.flow import moving_velocities
 from cathsim_dmc.physics.stepper import PHYSICS_TIMESTEP
@@ -30,7 +36,7 @@ _GRAVITY, _RIDE = 9.81, 2.0  # m/s², s
 def parameters(heart: float, breathing: float, soft: float) -> np.ndarray:
     """Parameters of a motion at 60 beats and 15 breaths a minute, of geom 0."""
     course = [heart, breathing, soft, 1.0, 0.0, 4.6, 0.25, 0.0]
-    return np.array([MARK, *course, 0.0, -1.0])
+    return np.array([0.0, *course, 0.0, -1.0])
 
 
 def stirred(lumen, lattice: np.ndarray, friction: float = 0.0) -> mujoco.MjSpec:
@@ -152,7 +158,8 @@ def section_flow(anatomy: Anatomy, time: float) -> float:
     points = there(radius, angle)[0].reshape(-1, 3)
     out = np.zeros((len(points), 8))
     vessels = anatomy.circulation.arrays
-    moving_velocities(anatomy.motion.lattice, course, time, points, *vessels, out)
+    now = course_of(course, time)
+    moving_velocities(anatomy.motion.lattice, now, points, *vessels, out)
     through = (out[:, :3].reshape(area.shape) * area).sum(axis=-1)
     return float((through * weights).sum() * grown / 2 * 2 * np.pi / len(radius))
 
@@ -196,11 +203,12 @@ def ride(
         model.opt.gravity[:] = _GRAVITY, 0, 0
         if inertial:
             # The wall's velocities are those in the middle of each step.
-            gain = courses(course, time + half)[3] - courses(course, time - half)[3]
+            gain = course_of(course, time + half).heart_rate
+            gain -= course_of(course, time - half).heart_rate
             model.opt.gravity[:] -= gain / PHYSICS_TIMESTEP * np.array(way)
         mujoco.mj_step(model, data)
         link.append(data.qpos[:3].copy())
-    wall = [courses(course, time + PHYSICS_TIMESTEP)[0] for time in times]
+    wall = [course_of(course, time + PHYSICS_TIMESTEP).heart for time in times]
     return np.array(link), np.outer(wall, way)
 
 

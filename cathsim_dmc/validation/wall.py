@@ -6,13 +6,13 @@ import numpy as np
 
 from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.field_loops import FREE
 from cathsim_dmc.anatomy.scan import topology
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.surface import sampled
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 from cathsim_dmc.entities import devices
+from cathsim_dmc.laws.field import FREE
 from cathsim_dmc.validation import convergence, friction, pressed
 from cathsim_dmc.validation.checks import Check, Report
 

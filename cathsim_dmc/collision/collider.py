@@ -1,0 +1,122 @@
+"""Capsules and spheres against walls at rest, in MuJoCo's collision table.
+
+The law is `laws.contact`. MuJoCo calls `of_capsule` and `of_sphere`; they read the link
+and the wall from its structs and write the contacts of the law where it takes them.
+`moving` has those of walls that move, which take a second more to compile.
+"""
+
+import numpy as np
+
+from cathsim_dmc.collision.links import capsule_of, is_finite, law_of, sweep
+from cathsim_dmc.collision.native import (
+    address_of,
+    call_collision,
+    call_error,
+    callback,
+    data_field,
+    model_field,
+    numbers,
+    stacked,
+    wholes,
+    word,
+)
+from cathsim_dmc.collision.table import (
+    ERROR,
+    MESSAGE,
+    OF_CAPSULE,
+    OF_SPHERE,
+    SYMBOL,
+    entry_of,
+    key_of,
+    wall_of,
+)
+from cathsim_dmc.compiled import compiled, inlined
+from cathsim_dmc.laws.capsule import SAMPLES
+from cathsim_dmc.laws.contact import CONTACT, Scratch, contacts, world_contact
+from cathsim_dmc.laws.planes import MOST, PLANES
+
+_RAW = 80  # bytes of a contact for MuJoCo: distance, position and frame
+
+
+@inlined
+def write(data, geoms, law, found, count, raw):
+    """Writes contacts of a law where MuJoCo takes them; returns their number.
+
+    Args:
+        data: Address of `mjData`.
+        geoms: Link and carrier.
+        law: `laws.contact.Law`.
+        found: (MOST, CONTACT), contacts in the frame of the wall.
+        count: Number of contacts.
+        raw: Address of MuJoCo's contacts.
+    """
+    centre = data_field(data, "geom_xpos")[geoms[0]]
+    turned = data_field(data, "geom_xmat")[geoms[0]]
+    frame = data_field(data, "geom_xmat")[geoms[1]]
+    axis = (turned[2], turned[5], turned[8])
+    for n in range(count):
+        distance, place, towards = world_contact(found[n], law, centre, axis, frame)
+        contact = numbers(raw + _RAW * n)
+        contact[0] = distance
+        if law.compliant:
+            bits = wholes(raw + _RAW * n)
+            bits[0] = (bits[0] & -2) | int(found[n, 5])
+        for k in range(3):
+            contact[1 + k], contact[4 + k], contact[7 + k] = place[k], towards[k], 0.0
+    return np.int32(count)
+
+
+@compiled
+def at_rest(model, data, raw, geoms, half_length, margin, entry):
+    """Number of contacts, written, of a link and a wall at rest."""
+    wall = wall_of(entry)
+    capsule = capsule_of(model, data, entry, geoms, half_length)
+    # What is no number has no place in a lattice; MuJoCo's checks of the state tell.
+    if not is_finite(capsule):
+        return np.int32(0)
+    law = law_of(model, wall, geoms[0], margin)
+    step = sweep(model, data, geoms, capsule, law)
+    scratch = Scratch(stacked(1, SAMPLES)[0], stacked(PLANES, 4))
+    found = stacked(MOST, CONTACT)
+    count = contacts(wall, capsule, law, step, scratch, found)
+    return write(data, geoms, law, found, count, raw)
+
+
+@compiled
+def collide(model, data, raw, geoms, margin, before):
+    """Contacts of a capsule or a sphere with a box, which may carry a field.
+
+    `before` is the place in the table of the function for boxes that do not; a constant
+    would be compiled once for each.
+    """
+    table, (link, box) = address_of(SYMBOL), geoms
+    key = key_of(model, box)
+    if key == 0:
+        old = word(table + before)
+        return call_collision(old, model, data, raw, link, box, margin)
+    entry = entry_of(table, key)
+    if entry == 0:
+        call_error(word(table + ERROR), word(table + MESSAGE), box)
+        return np.int32(0)
+    half = half_length_of(model, link, before)
+    return at_rest(model, data, raw, geoms, half, margin, entry)
+
+
+@inlined
+def half_length_of(model, link, before):
+    """Half the length of a link, m: 0 of a sphere."""
+    return model_field(model, "geom_size")[link, 1] if before == OF_CAPSULE else 0.0
+
+
+@callback("int32(int64, int64, int64, int32, int32, float64)")
+def of_capsule(model, data, contacts, geom1, geom2, margin):
+    """Entry of MuJoCo's collision table for a capsule and a box."""
+    place = np.int64(OF_CAPSULE)
+    return collide(model, data, contacts, (geom1, geom2), margin, place)
+
+
+@callback("int32(int64, int64, int64, int32, int32, float64)")
+def of_sphere(model, data, contacts, geom1, geom2, margin):
+    """Entry of MuJoCo's collision table for a sphere and a box."""
+    place = np.int64(OF_SPHERE)
+    return collide(model, data, contacts, (geom1, geom2), margin, place)

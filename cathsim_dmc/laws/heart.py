@@ -1,0 +1,42 @@
+"""Course of a heartbeat: inflow of the aorta, and the pulse of pressure it makes."""
+
+import math
+
+import numpy as np
+
+from cathsim_dmc.compiled import law
+
+# Inflow over a beat of 1 s: ms and mL/s (ADAN56, Boileau 2015, as in openBF).
+_TIMES = (0, 22, 41, 61, 80, 99, 128, 158, 177, 196, 245, 322, 351, 390, 415, 438, 1000)
+_FLOWS = (0, 0, 105, 273, 405, 536, 573, 536, 489, 452, 315, 179, 137, 0, -163, 0, 0)
+BEAT = np.interp(np.arange(1001), _TIMES, _FLOWS) / max(_FLOWS)
+_COMPLIANCE = 1.2  # s, time constant of the pressure's decay in diastole
+SYSTOLE = 0.35  # of a beat, in which the root goes its way; it returns in the rest
+
+
+def _pulse() -> np.ndarray:
+    """Pressure over a beat of 1 s, from 0 to 1: the inflow into a compliance.
+
+    A two-element Windkessel (O. Frank, Z. Biol. 37 (1899) 483), from beat to beat until
+    it repeats itself.
+    """
+    count = len(BEAT) - 1
+    pressure, course = 0.0, np.zeros(count + 1)
+    for _ in range(8):
+        for k in range(count):
+            pressure += (BEAT[k] - pressure / _COMPLIANCE) / count
+            course[k + 1] = pressure
+        course[0] = course[-1]
+    return (course - course.min()) / np.ptp(course)
+
+
+PULSE = _pulse()
+
+
+@law
+def pulse(phase):
+    """Share (0 to 1) of the pulse's growth at a phase in beats, and its derivative."""
+    place = (phase - math.floor(phase)) * (len(PULSE) - 1)
+    first = min(int(place), len(PULSE) - 2)
+    slope = PULSE[first + 1] - PULSE[first]
+    return PULSE[first] + (place - first) * slope, slope * (len(PULSE) - 1)
