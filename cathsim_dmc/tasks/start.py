@@ -9,8 +9,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from cathsim_dmc.anatomy.field_loops import FREE
 from cathsim_dmc.entities.posture import bends_of, joints_along, nodes_of
+from cathsim_dmc.laws.field import FREE
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.effects import Episode
