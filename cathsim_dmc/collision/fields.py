@@ -69,7 +69,7 @@ class _Table:
     """The process's fields, by their keys, where compiled functions find them."""
 
     def __init__(self):
-        from cathsim_dmc.collision import collider, table
+        from cathsim_dmc.collision import loops, table
 
         # The arrays whose addresses are in the table, for as long as the process.
         self._kept: dict[int, Any] = {}
@@ -84,7 +84,7 @@ class _Table:
         error = ctypes.cast(self._library.mju_error, ctypes.c_void_p).value
         self._words[table.ERROR // 8] = error or 0
         self._words[table.MESSAGE // 8] = ctypes.addressof(self._message)
-        self._collide_by(collider)
+        self._collide_by(loops)
         self._rows = self._words[table.HEAD :].reshape(-1, table.ENTRY)
         self._motion = table.MOTION_ENTRY // 8
 
@@ -115,7 +115,7 @@ class _Table:
         self._collide_by(moving)
 
     def _collide_by(self, module: types.ModuleType) -> None:
-        # The functions of `moving` do what those of `collider` do, and more.
+        # The functions of `moving` do what those of `loops` do, and more.
         self._functions[_CAPSULE * _TYPES + _BOX] = module.of_capsule.address
         self._functions[_SPHERE * _TYPES + _BOX] = module.of_sphere.address
 

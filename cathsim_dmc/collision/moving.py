@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from cathsim_dmc.collision.collider import collide, half_length_of, write
 from cathsim_dmc.collision.links import (
     capsule_of,
     is_finite,
@@ -10,6 +9,7 @@ from cathsim_dmc.collision.links import (
     law_of,
     sweep,
 )
+from cathsim_dmc.collision.loops import collide, half_length_of, write
 from cathsim_dmc.collision.native import (
     address_of,
     callback,
@@ -67,7 +67,7 @@ def in_motion(model, data, raw, geoms, half_length, margin, entry):
 
 @compiled
 def collide_moving(model, data, raw, geoms, margin, before):
-    """As `collider.collide`, of fields that move in this simulation, too."""
+    """As `loops.collide`, of fields that move in this simulation, too."""
     key = key_of(model, geoms[1])
     entry = entry_of(address_of(SYMBOL), key) if key != 0 else 0
     if entry == 0 or word(entry + MOTION_ENTRY) == 0 or motion_of(model, data) == 0:

@@ -25,7 +25,7 @@ fields is called `index` or `count`: on CUDA the tuple's method hides such a fie
     parameters       how the parameters of an effect's law are declared
 
 An engine's adapter does five things for each pair of a link and a wall
-(`collision/collider.py` is MuJoCo's):
+(`collision/loops.py` is MuJoCo's):
 
 1. `wall.Wall`: `anatomy.field.Field.arrays` of a lumen, with any float64 array as
    `line`; or the array of a bore as `line`, with any `FieldArrays`.
