@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from cathsim_dmc.anatomy import field_cache, phantoms
+from cathsim_dmc.anatomy.builder import ACCESSES
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End
 
 MEND = "run tools/ship_fields.py"
+SECOND = ("bovine", "descending")  # of the fields in its file
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -55,16 +57,18 @@ def test_a_cached_field_lies_in_its_file(folder):
         assert with_hole.digest == built.with_hole(1e-3).digest != field.digest
 
 
-@pytest.mark.parametrize("name", phantoms.MEASURED)
-def test_fields_of_the_measured_phantoms_come_with_the_package(name, folder, built):
-    anatomy = phantoms.load(name)
+@pytest.mark.parametrize("access", ACCESSES)
+@pytest.mark.parametrize("name", phantoms.PHANTOMS)
+def test_fields_of_the_phantoms_come_with_the_package(name, access, folder, built):
+    anatomy = phantoms.load(name, access=access)
     field = field_cache.field_of(anatomy.tree, anatomy.ends)
     assert not built, MEND
     assert field.pages is not None and field.nbytes > 2e6
 
 
-def test_a_field_that_ships_is_the_one_that_would_be_built(folder):
-    anatomy = phantoms.load("type2")
+@pytest.mark.parametrize(("name", "access"), [("type2", "ascending"), SECOND])
+def test_a_field_that_ships_is_the_one_that_would_be_built(name, access, folder):
+    anatomy = phantoms.load(name, access=access)
     shipped = field_cache.field_of(anatomy.tree, anatomy.ends)
     built = Field.of(anatomy.tree, anatomy.ends)
     for one, other in zip(shipped.arrays, built.arrays, strict=True):

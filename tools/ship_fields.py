@@ -1,22 +1,32 @@
-"""Writes the fields that come with the package, those of the measured phantoms.
+"""Writes the fields that come with the package, those of all phantoms and accesses.
 
 Run it after a change of their centrelines, or of the code that builds fields:
 tests/test_anatomy_field_cache.py says when.
 """
 
+from pathlib import Path
+
+import cathsim_dmc.anatomy
 from cathsim_dmc.anatomy import field_cache, phantoms
+from cathsim_dmc.anatomy.builder import ACCESSES
 from cathsim_dmc.anatomy.field import Field
+
+DATA = Path(cathsim_dmc.anatomy.__file__).parent / "data"
 
 
 def main() -> None:
     """Builds them anew and takes the place of those that are there."""
-    anatomies = [phantoms.load(name) for name in phantoms.MEASURED]
-    paths = [field_cache.shipped_path(one.tree, one.ends) for one in anatomies]
-    for old in paths[0].parent.glob("*.field"):
+    paths = []
+    for name in phantoms.PHANTOMS:
+        fields = {}
+        for access in ACCESSES:
+            one = phantoms.load(name, access=access)
+            content = one.tree, one.ends
+            fields[field_cache.shipped_name(*content)] = Field.of(*content)
+        paths.append(field_cache.ship(DATA, fields))
+        print(f"{name}: {paths[-1].name}, {paths[-1].stat().st_size:,} bytes")
+    for old in set(DATA.glob("*.field")) - set(paths):
         old.unlink()
-    for anatomy, path in zip(anatomies, paths, strict=True):
-        path.write_bytes(field_cache.packed(Field.of(anatomy.tree, anatomy.ends)))
-        print(f"{anatomy.name}: {path.name}, {path.stat().st_size:,} bytes")
 
 
 if __name__ == "__main__":

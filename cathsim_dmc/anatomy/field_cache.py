@@ -1,6 +1,6 @@
 """Cache of fields, by the content that they are built from.
 
-Those of the measured phantoms ship in `data`, written by `tools/ship_fields.py`.
+Those of the phantoms ship in `data`, written by `tools/ship_fields.py`.
 """
 
 import contextlib
@@ -8,7 +8,7 @@ import hashlib
 import io
 import lzma
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -46,14 +46,12 @@ def field_of(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Field:
         ValueError: if the box around the lumen is larger than `MOST_ROOM`.
     """
     _require_size(lumen)
-    shipped = shipped_path(lumen, ends)
     digest = hashlib.sha256(_name(lumen, ends).encode() + _code()).hexdigest()
     path = cache_folder() / f"{digest[:32]}{_SUFFIX}"
     try:
         field = _read(path)
     except (OSError, ValueError):
-        found = shipped.is_file()
-        field = _unpacked(shipped.read_bytes()) if found else Field.of(lumen, ends)
+        field = _shipped(shipped_name(lumen, ends)) or Field.of(lumen, ends)
         with contextlib.suppress(OSError, ValueError):
             _keep(field, path)
             field = _read(path)
@@ -79,9 +77,20 @@ def _require_size(lumen: VesselTree | Surface) -> None:
         )
 
 
-def shipped_path(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Path:
-    """Where the field of a lumen is, if it comes with the package."""
-    return _SHIPPED / f"{_name(lumen, ends)[:16]}.field"
+def shipped_name(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> str:
+    """What the field of a lumen is called, if it comes with the package."""
+    return _name(lumen, ends)[:16]
+
+
+def _shipped(name: str) -> Field | None:
+    # A file has its fields in the order of their names in its own.
+    for path in _SHIPPED.glob(f"*{name}*.field"):
+        stream = io.BytesIO(lzma.decompress(path.read_bytes()))
+        for one in path.stem.split("-"):
+            record = np.load(stream, allow_pickle=False)[0]
+            if one == name:
+                return Field(*(record[part].copy() for part in _NAMES))
+    return None
 
 
 def _name(lumen: VesselTree | Surface, ends: Sequence[End]) -> str:
@@ -120,16 +129,14 @@ def _code() -> bytes:
     return digest.digest()
 
 
-def packed(field: Field) -> bytes:
-    """A field in less than half its size, as it ships."""
+def ship(folder: Path, fields: Mapping[str, Field]) -> Path:
+    """Writes similar fields, by `shipped_name`, to one file of a quarter their size."""
     stream = io.BytesIO()
-    np.save(stream, _record(field), allow_pickle=False)
-    return lzma.compress(stream.getvalue(), filters=_FILTERS)
-
-
-def _unpacked(data: bytes) -> Field:
-    record = np.load(io.BytesIO(lzma.decompress(data)), allow_pickle=False)[0]
-    return Field(*(record[name] for name in _NAMES))
+    for field in fields.values():
+        np.save(stream, _record(field), allow_pickle=False)
+    path = folder / f"{'-'.join(fields)}.field"
+    data = lzma.compress(stream.getvalue(), filters=_FILTERS)
+    return files.write_bytes(path, data)
 
 
 def _record(field: Field) -> np.ndarray:
