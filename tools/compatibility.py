@@ -20,7 +20,9 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PYTHONS = ("python3.11", "python3.12", "python3.13")
+PYTHONS = ("python3.11", "python3.12", "python3.13", "python3.14")
+# dm-control asks for labmaze, which has no wheel for these Pythons.
+LABMAZE = f"{ROOT / 'tools' / 'labmaze'} ; python_version >= '3.13'"
 SETS = ("pinned", "newest", "lowest")
 # Of which the lowest allowed version is asked for; the others follow from them.
 MAIN = ("numpy", "scipy", "mujoco", "dm-control", "torch", "torchrl", "trimesh", "tyro")
@@ -48,7 +50,7 @@ def environment(python: str, versions: str, folder: Path, tests: bool) -> tuple:
     """A fresh environment: its Python, and what went wrong or None."""
     subprocess.run([python, "-m", "venv", str(folder)], check=True)
     inside = folder / "bin" / "python"
-    wanted = [f"{ROOT}[test]" if tests else str(ROOT)]
+    wanted = [f"{ROOT}[test]" if tests else str(ROOT), LABMAZE]
     if versions == "pinned":
         wanted += ["--constraint", str(ROOT / "constraints.txt")]
     if versions == "lowest":
