@@ -40,15 +40,16 @@ def published_options(task_kwargs):
     return {**kept, "max_steps": MAX_STEPS}
 
 
-def judge(policy, task, task_kwargs, episodes=EPISODES, name=None):
+def judge(policy, task, task_kwargs, episodes=EPISODES, name=None, num_threads=None):
     """Evaluate a policy; return the result and the map of its contact forces.
 
     The map is None where every episode has an anatomy of its own.
     """
     log = evaluation.ContactLog()
     found = evaluation.evaluate(
-        policy, task, episodes, name=name, task_kwargs=task_kwargs, observer=log
-    )
+        policy, task, episodes, name=name, task_kwargs=task_kwargs, observer=log,
+        num_threads=num_threads,
+    )  # fmt: skip
     if suite.TASKS[task].random_arch:
         return found, None
     surface = suite.make_task(task, **task_kwargs).scene.anatomy.surface

@@ -4,7 +4,8 @@ python benchmarks/robust.py pretrained:navigator --out runs/navigator.jsonl
 python benchmarks/robust.py expert --out runs/expert.jsonl --only anatomies
 
 Every cell is a line of the file as soon as it has been played; the same command goes on
-with those that are missing. docs/scripts/robust.py makes the tables of
+with those that are missing. With --ray the machines of a Ray cluster play them, see
+docs/cluster.md. docs/scripts/robust.py makes the tables of
 docs/robustness.md.
 """
 
@@ -15,10 +16,13 @@ import time
 from pathlib import Path
 from typing import Annotated, Literal
 
+import torch
 import tyro
 
-from cathsim_dmc import files
-from cathsim_dmc.agents import evaluation, protocols
+# torchrl goes before dm_control.
+from cathsim_dmc.agents import evaluation, protocols  # isort: skip
+
+from cathsim_dmc import cluster, files
 from cathsim_dmc.agents.evaluation import SAFE_FORCES
 from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.anatomy.arch import arch
@@ -102,9 +106,9 @@ def changes(episodes=20):
         yield Cell("changes", {"change": name}, "navigate", options, episodes, "")
 
 
-def play(policy: str, cell: Cell) -> dict:
-    """The line of a cell."""
-    began, player = time.monotonic(), load_policy(policy)
+def play(policy: str, cell: Cell, player=None, threads: int | None = None) -> dict:
+    """The line of a cell, of a policy that is loaded already or that has a name."""
+    began, player = time.monotonic(), player or load_policy(policy)
     # A policy that reads images needs the planes that it was trained with.
     planes = (player.task_kwargs or {}).get("fluoroscopy")
     seen = {} if planes is None else {"fluoroscopy": planes}
@@ -114,6 +118,7 @@ def play(policy: str, cell: Cell) -> dict:
         cell.episodes,
         protocol=cell.protocol or "published",
         task_kwargs={**seen, **cell.options},
+        num_threads=threads,
     )
     reached = found.values("success") > 0
     sums = found.values("forces.peak_sum.maximum")
@@ -138,6 +143,13 @@ def play(policy: str, cell: Cell) -> dict:
         "seconds": round(time.monotonic() - began, 1),
         "date": time.strftime("%Y-%m-%d"),
     }
+
+
+def _play_apart(job):
+    """The line of a cell, in a process of a cluster."""
+    policy, cell, player, threads, of_torch = job
+    torch.set_num_threads(of_torch)  # rounding depends on it
+    return play(policy, cell, player, threads)
 
 
 def _kind(cell, drawn):
@@ -166,6 +178,8 @@ def main(
     anatomy: tuple[str, ...] = PHANTOMS,
     pool: int | None = None,
     max_steps: int | None = None,
+    ray: bool = False,
+    processors: int = 1,
 ) -> None:
     """Play the cells that are missing in a file.
 
@@ -178,6 +192,8 @@ def main(
             default.
         max_steps: Number of control steps after which an episode is cut off; that of
             the task by default.
+        ray: Whether the machines of a Ray cluster play the cells.
+        processors: Number of processors of a cell on the cluster.
     """
     cells = {
         "arches": lambda: arches(pool),
@@ -186,7 +202,7 @@ def main(
     }
     cells["changes"] = changes
     lines = out.read_text().splitlines() if out.exists() else []
-    done = [json.loads(line) for line in lines]
+    done, missing = [json.loads(line) for line in lines], []
     files.require_file(out, make=True)
     for cell in (cell for part in only for cell in cells[part]()):
         key = {"policy": policy, "part": cell.part, **cell.labels}
@@ -195,14 +211,25 @@ def main(
         if max_steps is not None:
             options = {**cell.options, "max_steps": max_steps}
             cell = dataclasses.replace(cell, options=options)
-        line = play(policy, cell)
+        missing.append(cell)
+    played = enumerate(play(policy, cell) for cell in missing)
+    if ray:
+        own = load_policy(policy), processors, torch.get_num_threads()
+        jobs = [(policy, cell, *own) for cell in missing]
+        played = cluster.over(_play_apart, jobs, processors)
+    found = {}
+    for number, line in played:
+        found[number], cell = json.dumps(line), missing[number]
         with out.open("a") as file:
-            file.write(json.dumps(line) + "\n")
-        print(key, line["success"], "of", cell.episodes, line["seconds"], "s")
+            file.write(found[number] + "\n")
+        print(cell.part, cell.labels, line["success"], "of", cell.episodes)
+    if ray:  # which finishes them in another order
+        lines += [found[number] for number in sorted(found)]
+        files.write_text(out, "".join(f"{line}\n" for line in lines))
 
 
 if __name__ == "__main__":
     try:
         tyro.cli(main)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         sys.exit(f"robust: {error}")

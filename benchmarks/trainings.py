@@ -5,7 +5,8 @@
 
 Stopped at any moment, it continues where it was. Each cell of grid.toml (task,
 algorithm, preset, observation, seed) is trained in a folder of its own; when it is
-finished, its evaluation by the published rule appears as a JSON file.
+finished, its evaluation by the published rule appears as a JSON file. With --ray the
+machines of a Ray cluster train the cells, see docs/cluster.md.
 """
 
 import dataclasses
@@ -15,6 +16,7 @@ import os
 import platform
 import subprocess
 import sys
+import tempfile
 import time
 import tomllib
 from collections.abc import Mapping
@@ -23,9 +25,10 @@ from typing import Any, NamedTuple
 
 import judgement
 import numpy as np
+import torch
 import tyro
 
-from cathsim_dmc import files, suite
+from cathsim_dmc import cluster, files, suite
 from cathsim_dmc.agents import training
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.learners import make_config
@@ -185,8 +188,14 @@ def standing(cell, runs, results):
     return "begun" if begun else "waiting", remark
 
 
-def work(cell, runs, results):
+def work(cell, runs, results, num_threads=None):
     """Train or continue a cell, evaluate it and write its file.
+
+    Args:
+        cell: What to train.
+        runs: Directory with a folder for each training.
+        results: Directory with a JSON file for each finished cell.
+        num_threads: Number of threads of the simulation; None for that of the cell.
 
     Returns:
         Whether it came to the end; a signal ends the training with a checkpoint.
@@ -196,14 +205,16 @@ def work(cell, runs, results):
     task, options, arches, episodes = cell.evaluated(config)
     suite.make_task(task, **options)  # refuses options before the training
     resume = (folder / training.CONFIG_FILE).exists()
-    done = training.train(config, folder, resume=resume)
+    threads = config.num_threads if num_threads is None else num_threads
+    own = config.replace(num_threads=threads)
+    done = training.train(own, folder, resume=resume)
     if done.interrupted:
         return False
     checkpoint, began = Checkpoint.open(done.checkpoint), time.monotonic()
     contacts = groups = None
     if arches is None:
         found, contacts = judgement.judge(
-            checkpoint, task, options, episodes, cell.name
+            checkpoint, task, options, episodes, cell.name, num_threads
         )
     else:
         found, groups = judgement.judge_each_arch(
@@ -237,6 +248,41 @@ def work(cell, runs, results):
     }
     write_result(results / f"{cell.name}.json", values)
     return True
+
+
+def _work_apart(job):
+    """`work` in a process of a cluster; error of a folder that is not shared."""
+    cell, runs, results, mark, processors, of_torch = job
+    if not mark.exists():
+        raise FileNotFoundError(
+            f"{runs} of the first machine is not seen on {platform.node()}; --runs and "
+            "--results must be folders that all machines share"
+        )
+    torch.set_num_threads(of_torch)  # rounding depends on it
+    return work(cell, runs, results, processors)
+
+
+def work_on_cluster(cells, runs, results, processors):
+    """`work` on the machines of a cluster, so many processors for each cell.
+
+    A cell begins when that is trained whose policy it starts from.
+
+    Yields:
+        Number of a cell that ended, and what `work` returned or the exception.
+    """
+    runs, results = runs.resolve(), results.resolve()
+    runs.mkdir(parents=True, exist_ok=True)
+    left = dict(enumerate(cells))
+    with tempfile.NamedTemporaryFile(dir=runs, prefix=".shared-") as mark:
+        own = runs, results, Path(mark.name), processors, torch.get_num_threads()
+        while left:
+            names = [cell.name for cell in left.values()]
+            starts = {n: Path(c.config().initial_policy or "") for n, c in left.items()}
+            ready = [n for n, start in starts.items() if start.name not in names]
+            ready = ready or [*left]
+            jobs = [(left.pop(number), *own) for number in ready]
+            ended = cluster.over(_work_apart, jobs, processors, keep_going=True)
+            yield from ((ready[number], outcome) for number, outcome in ended)
 
 
 def write_result(path, values):
@@ -292,6 +338,8 @@ def main(
     results: Path = Path("results"),
     only: tyro.conf.UseAppendAction[list[str]] = [],  # noqa: B006
     list: bool = False,
+    ray: bool = False,
+    processors: int = 1,
 ) -> int:
     """Train and evaluate the cells of a grid, as far as they are missing.
 
@@ -301,29 +349,48 @@ def main(
         results: Directory with a JSON file for each finished cell.
         only: Part of the names of cells, or a pattern with *; repeated for several.
         list: Whether to list what is done and what is left, and run nothing.
+        ray: Whether the machines of a Ray cluster train the cells; they must all see
+            the folders `runs` and `results`.
+        processors: Number of processors of a cell on the cluster.
     """
     try:
         cells = read_grid(grid)
     except ValueError as error:
         print(f"trainings: {error}", file=sys.stderr)
         return BAD_INPUT
-    code = 0
+    code, missing = 0, []
     for cell in cells:
         if only and not any(fnmatch.fnmatch(cell.name, f"*{one}*") for one in only):
             continue
         state, remark = standing(cell, runs, results)
         print(f"{cell.name}: {state} {remark}".rstrip(), flush=True)
-        if list or state in ("finished", "other settings"):
-            continue
-        try:
-            if not work(cell, runs, results):
+        if not list and state not in ("finished", "other settings"):
+            missing.append(cell)
+    try:
+        ended = enumerate(attempt(cell, runs, results) for cell in missing)
+        if ray:
+            ended = work_on_cluster(missing, runs, results, processors)
+        for number, outcome in ended:
+            if outcome is False:
                 return INTERRUPTED
-        except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
-            code = CHECK_FAILED
-            print(f"{cell.name}: failed, {type(error).__name__}: {error}", flush=True)
-        else:
-            print(f"{cell.name}: finished", flush=True)
+            name, text = missing[number].name, "finished"
+            if isinstance(outcome, Exception):
+                code = CHECK_FAILED
+                text = f"failed, {type(outcome).__name__}: {outcome}"
+            print(f"{name}: {text}", flush=True)
+    except (ValueError, OSError, ImportError) as error:
+        print(f"trainings: {error}", file=sys.stderr)
+        return BAD_INPUT
     return code
+
+
+def attempt(cell, runs, results):
+    """What `work` returns, or the exception that ended it."""
+    print(f"{cell.name}: begins", flush=True)
+    try:
+        return work(cell, runs, results)
+    except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
+        return error
 
 
 if __name__ == "__main__":

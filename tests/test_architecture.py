@@ -23,6 +23,7 @@ BELOW = {
     "extras",
     "compiled",
     "compiled_cache",
+    "cluster",
 }
 _TASK = {"anatomy", "laws", "collision", "imaging", "entities", "physics", "tasks"}
 _FACE = _TASK | {"suite", "simulation"}
@@ -31,7 +32,7 @@ _FACE = _TASK | {"suite", "simulation"}
 ALLOWED = {
     "__init__": set(),
     # Below everything: how files are written, what values may be, how figures look,
-    # how loops are compiled and kept.
+    # how loops are compiled and kept, how jobs are spread over machines.
     "files": set(),
     "file_maps": set(),
     "bounds": set(),
@@ -39,6 +40,7 @@ ALLOWED = {
     "extras": set(),
     "compiled": {"compiled_cache"},
     "compiled_cache": set(),
+    "cluster": set(),
     # Laws know no engine and no task.
     "laws": set(),
     "anatomy": {"laws"},
@@ -69,6 +71,7 @@ CONFINED = {
     "torchrl": {*_TORCHRL_FACE, "agents/"},
     "tensordict": {*_TORCHRL_FACE, "agents/"},
     "safetensors": {"agents/pretrained.py"},
+    "ray": {"cluster.py", "agents/ray_source.py"},
     "rerun": {"recording/"},
     "igl": {"anatomy/"},
     "llvmlite": {"collision/"},
@@ -79,6 +82,7 @@ CONFINED = {
 }
 # Slow to import: only within functions, unless a module is itself loaded late.
 LATE = ("trimesh", "skimage", "matplotlib", "rerun", "torch", "torchrl", "numba", "igl")
+LATE += ("ray",)
 
 
 def modules():

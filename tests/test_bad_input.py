@@ -174,6 +174,8 @@ TRAINING = {
     "keep_checkpoints": whole(1),
     "metrics_frames": whole(1),
     "torch_threads": whole(1),
+    "collector": word(),
+    "collectors": whole(1),
 }
 CRITIC = {"critic_observation": st.sampled_from(["", 1, [], [1], {}, 1.5, (), True])}
 PPO = CRITIC | {

@@ -74,7 +74,7 @@ def synthetic(monkeypatch):
             config, run, resume, progress=False, make_env=synthetic_env.make_env
         )
 
-    def judge(policy, task, task_kwargs, episodes, name):
+    def judge(policy, task, task_kwargs, episodes, name, num_threads):
         asked.append(task_kwargs)
         found = evaluation.evaluate(
             policy, task, episodes, name=name, task_kwargs={},

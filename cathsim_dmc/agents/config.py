@@ -129,7 +129,7 @@ class TrainingConfig:
             Evaluation and recordings always take the task's.
         num_envs: Number of simulations stepped side by side.
         num_threads: Number of threads of the batched simulation; None takes one per
-            core.
+            core, and on a cluster one in each process.
         seed: Seed of networks, exploration and environments.
         total_frames: Number of control steps to train for, over all simulations. The
             last batch is finished, so a run may end slightly above.
@@ -168,6 +168,9 @@ class TrainingConfig:
         modules: Modules that define what the run uses, such as a task of your own. They
             are kept with the run, named where they are missing, and imported by you
             alone: `--import` on the command line.
+        collector: Where the simulations are: "local", in this process, or "ray", in
+            processes of a Ray cluster (needs the `ray` extra).
+        collectors: Number of these processes, which share the simulations.
     """
 
     algorithm: ClassVar[str] = ""
@@ -181,7 +184,7 @@ class TrainingConfig:
     resumable: ClassVar[frozenset[str]] = frozenset(
         {"total_frames", "checkpoint_frames", "checkpoint_seconds", "keep_checkpoints"}
         | {"metrics_frames", "logger", "num_threads", "torch_threads", "torch_device"}
-        | {"demonstrations", "modules"}
+        | {"demonstrations", "modules", "collector", "collectors"}
     )
 
     task: str = "type1_bca"
@@ -217,6 +220,8 @@ class TrainingConfig:
     torch_device: str = "cpu"
     torch_threads: int = positive(1)
     modules: tuple[str, ...] | None = None
+    collector: Literal["local", "ray"] = "local"
+    collectors: int = positive(2)
 
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""

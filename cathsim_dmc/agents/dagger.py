@@ -111,6 +111,7 @@ class DAgger(CloningLearner):
     metrics: ClassVar[tuple[str, ...]] = (
         "loss", "deviation", "expert_share", "replay_frames", "gradient_steps",
     )  # fmt: skip
+    remote: ClassVar[bool] = False
 
     def __init__(self, config: DAggerConfig, shapes: NetworkShapes, directory: Path):
         super().__init__(config, shapes, directory)

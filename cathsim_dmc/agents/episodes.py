@@ -45,7 +45,10 @@ class EpisodeTracker:
         self.forces = ForceTracker(num_envs)
 
     def add(self, batch: TensorDictBase) -> list[EpisodeOutcome]:
-        """Add steps (num_envs, steps); return the episodes that ended, in order."""
+        """Add steps (num_envs, steps); return the episodes that ended, in order.
+
+        An episode whose end is never seen, because its process was lost, is left out.
+        """
 
         def read(value: torch.Tensor) -> np.ndarray:
             return value.reshape(batch.shape).numpy()
@@ -56,8 +59,12 @@ class EpisodeTracker:
         names = "reward", "done", "terminated"
         reward, done, terminated = (read(after[name]) for name in names)
         forces = [read(info[name]) for name in NAMES]
+        begun = read(batch["step_count"]) == 0
         finished = []
         for step in range(batch.shape[1]):
+            for env in map(int, np.flatnonzero(begun[:, step] & (self.length > 0))):
+                self.forces.finish(env)
+                self.reward[env] = self.length[env] = 0
             self.reward += reward[:, step]
             self.length += 1
             self.forces.add([one[:, step] for one in forces])

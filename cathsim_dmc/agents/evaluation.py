@@ -1,9 +1,11 @@
 """Evaluation: fixed seeds, each episode counted once, intervals beside every mean."""
 
 import contextlib
+import functools
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import torch
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
-from cathsim_dmc import bounds, files, suite
+from cathsim_dmc import bounds, cluster, files, suite
 from cathsim_dmc.agents import protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.policies import (
@@ -21,6 +23,7 @@ from cathsim_dmc.agents.policies import (
     task_and_options,
     view_of,
 )
+from cathsim_dmc.agents.training_log import progress_bar
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, STATISTICS
 from cathsim_dmc.analysis.intervals import success_interval
@@ -158,6 +161,7 @@ def evaluate(
     out_dir: str | Path | None = None,
     observer: Observer | None = None,
     make_env: EnvFactory = environments.make_env,
+    on_cluster: bool = False,
 ) -> EvaluationResult:
     """Play episodes with a policy, each with a seed of its own, all side by side.
 
@@ -181,9 +185,14 @@ def evaluate(
         make_env: Function with the arguments of `environments.make_env`; "info" of its
             environment has "success", "physics_error", "path_ratio" and the forces
             `physics.forces.NAMES`.
+        on_cluster: Whether the processes of a Ray cluster play the episodes, in groups
+            of `num_threads` processors each (None for one); the observer is then None
+            or a `ContactLog`. The result is the same, bit for bit, on processors of
+            one kind.
 
     Raises:
-        ValueError: no task is known, episodes < 1, or the protocol sets a given option.
+        ValueError: no task is known, episodes < 1, the protocol sets a given option, or
+            the cluster has too few processors.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     conditions = protocols.get(protocol)
@@ -198,18 +207,25 @@ def evaluate(
     options = conditions.beside(options, task_kwargs or {})
     observed = observation or player.observation or "internal"
     parts = protocols.parts(conditions, task, options, episodes, seed)
+    if on_cluster:
+        cluster.connect()
     if out_dir is not None:
         # Now: an evaluation that cannot be written would be lost.
         files.require_folder(out_dir, make=True)
+    wholes = [
+        _Group(
+            part, range(len(part.seeds)), player, bool(conditions.task_kwargs),
+            functools.partial(make_env, task, observation=observed),
+            num_threads, torch.get_num_threads(),
+        )
+        for part in parts
+    ]  # fmt: skip
     outcomes: list[EpisodeOutcome] = []
-    for part in parts:
-        env = make_env(
-            task, observation=observed, num_envs=len(part.seeds),
-            num_threads=num_threads, task_kwargs=part.task_kwargs,
-            seed=part.seeds if conditions.task_kwargs else part.seeds[0],
-        )  # fmt: skip
-        with contextlib.closing(env):
-            outcomes += _first_episodes(env, player, observer)
+    if on_cluster:
+        outcomes += _play_on_cluster(wholes, observer)
+    else:
+        for group in wholes:
+            outcomes += _play(group, observer)
     trained = getattr(player, "checkpoint", None)
     result = EvaluationResult(
         task,
@@ -226,6 +242,81 @@ def evaluate(
     if out_dir is not None:
         files.write_json(Path(out_dir) / "evaluation.json", result.to_dict())
     return result
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Episodes that are played side by side, some of those of a part or all.
+
+    Attributes:
+        part: Where they are from.
+        rows: Their numbers in it.
+        player: The policy of all its episodes.
+        varied: Whether each has a seed of its own, in place of those that count up.
+        make_env: Function of num_envs, num_threads, seed and task_kwargs.
+        num_threads: Number of threads of the simulation; None for one per core.
+        torch_threads: Number of threads of torch, which rounding depends on.
+    """
+
+    part: protocols.Part
+    rows: range
+    player: Policy
+    varied: bool
+    make_env: EnvFactory
+    num_threads: int | None
+    torch_threads: int
+
+    def pieces(self, size: int) -> list["_Group"]:
+        """Groups of so many of its episodes each, or of fewer."""
+        starts = self.rows[::size]
+        cut = (range(n, min(n + size, self.rows.stop)) for n in starts)
+        threads = self.num_threads or 1
+        return [replace(self, rows=rows, num_threads=threads) for rows in cut]
+
+
+def _play(group: _Group, observer: Observer | None) -> list[EpisodeOutcome]:
+    seeds = group.part.seeds[group.rows.start : group.rows.stop]
+    env = group.make_env(
+        num_envs=len(seeds), num_threads=group.num_threads,
+        seed=seeds if group.varied else seeds[0], task_kwargs=group.part.task_kwargs,
+    )  # fmt: skip
+    first = group.rows.start
+    policy = group.player.among(first, len(group.part.seeds))
+    with contextlib.closing(env):
+        found = _first_episodes(env, policy, observer)
+    return [replace(outcome, env=first + outcome.env) for outcome in found]
+
+
+def _play_on_cluster(
+    wholes: Sequence[_Group], observer: Observer | None
+) -> list[EpisodeOutcome]:
+    """Plays groups in pieces, one for each place of the cluster."""
+    if not isinstance(observer, ContactLog | None):
+        raise ValueError("on a cluster the observer must be a ContactLog or None")
+    each = wholes[0].num_threads or 1
+    total = sum(len(group.rows) for group in wholes)
+    size = math.ceil(total / max(cluster.room(each), 1))
+    pieces = [group.pieces(size) for group in wholes]
+    jobs = [(piece, observer is not None) for piece in itertools.chain(*pieces)]
+    found: dict[int, tuple[list[EpisodeOutcome], ContactLog]] = {}
+    with progress_bar(wholes[0].player.name, " groups", total=len(jobs)) as bar:
+        for number, result in cluster.over(_play_apart, jobs, each):
+            found[number] = result
+            bar.update()
+    outcomes, ordered = [], (found[number] for number in range(len(jobs)))
+    for own in pieces:
+        played, logs = zip(*itertools.islice(ordered, len(own)), strict=True)
+        outcomes += itertools.chain(*played)
+        if observer is not None:
+            observer.join(logs)
+    return outcomes
+
+
+def _play_apart(job: tuple[_Group, bool]) -> tuple[list[EpisodeOutcome], "ContactLog"]:
+    """The episodes of a group, and their contacts if these are wanted."""
+    (group, wanted), contacts = job, ContactLog()
+    torch.set_num_threads(group.torch_threads)
+    return _play(group, contacts if wanted else None), contacts
 
 
 @torch.no_grad()
@@ -267,17 +358,28 @@ def _checked(policy: Policy, given: Any, env: EnvBase) -> torch.Tensor:
     return actions
 
 
+_NONE = np.zeros((0, 3)), np.zeros(0)
+
+
 class ContactLog:
     """An observer that keeps the contacts with the wall."""
 
     def __init__(self):
-        self._steps = [(np.zeros((0, 3)), np.zeros(0))]
+        self._steps = [_NONE]
 
     def __call__(self, env: EnvBase, running: np.ndarray) -> None:
         """Adds the contacts at the end of a control step."""
         found = env.base_env.simulation.contacts()
         present = found.present & running[:, None]
         self._steps.append((found.position[present], found.magnitude[present]))
+
+    def join(self, logs: Sequence["ContactLog"]) -> None:
+        """Adds contacts of episodes that were played apart, as if side by side."""
+        for step in itertools.zip_longest(
+            *(log._steps for log in logs), fillvalue=_NONE
+        ):
+            positions, magnitudes = map(np.concatenate, zip(*step, strict=True))
+            self._steps.append((positions, magnitudes))
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions (K, 3), m, world frame, and magnitudes (K,), N."""

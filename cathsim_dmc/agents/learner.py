@@ -2,7 +2,7 @@
 
 import abc
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -10,11 +10,8 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
-from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType
 
-from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.networks import NetworkShapes, make_normalisers, make_policy
 
 
@@ -22,6 +19,8 @@ class Learner(abc.ABC):
     """An algorithm with its networks.
 
     metrics: Names of the figures that `update` returns, columns of metrics.csv.
+    remote: Whether the policy needs nothing but observations, so that it can act in
+        another process.
     random_frames: Number of frames to collect with uniformly random actions first.
     device: Torch device of the networks.
     shapes: Sizes of what the policy reads, and of the action.
@@ -34,6 +33,7 @@ class Learner(abc.ABC):
     """
 
     metrics: ClassVar[tuple[str, ...]]
+    remote: ClassVar[bool] = True
     random_frames: int = 0
     optimiser: torch.optim.Optimizer
     replay: Any = None
@@ -130,40 +130,3 @@ def means(steps: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, float]:
     """Means of the figures of gradient steps by name; empty without a step."""
     names = steps[0] if steps else ()
     return {n: float(torch.stack([one[n] for one in steps]).mean()) for n in names}
-
-
-def make_collector(
-    config: TrainingConfig, learner: Learner, env: EnvBase, frames: int
-) -> Collector:
-    """A collector of batches (num_envs, steps) with the learner's policy as it is.
-
-    Args:
-        env: Environment, which the collector closes.
-        frames: Number of frames that earlier processes of the run have seen.
-    """
-    # Whole batches.
-    left = max(learner.random_frames - frames, 0) / config.frames_per_batch
-    return Collector(
-        env,
-        _on_cpu(learner.policy, learner.device),
-        frames_per_batch=config.frames_per_batch,
-        init_random_frames=math.ceil(left) * config.frames_per_batch or None,
-        total_frames=-1,
-        exploration_type=ExplorationType.RANDOM,
-        trust_policy=True,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
-    )
-
-
-def _on_cpu(
-    policy: TensorDictModuleBase, device: torch.device
-) -> Callable[[TensorDictBase], TensorDictBase]:
-    if device.type == "cpu":
-        return policy
-
-    def act(observation: TensorDictBase) -> TensorDictBase:
-        outside = observation.select(*policy.in_keys).to(device)
-        return observation.update(policy(outside).to("cpu"))
-
-    return act

@@ -38,6 +38,10 @@ class FunctionPolicy(Policy):
         self._function = function
         self.name = name or getattr(function, "__name__", type(function).__name__)
 
+    def among(self, first: int, count: int) -> Policy:
+        """One that calls the function with as many rows as there are episodes."""
+        return _Among(self, first, count)
+
     @torch.no_grad()
     def act(self, observation: Any) -> np.ndarray:
         """Actions (N, A) float32."""
@@ -54,6 +58,28 @@ class FunctionPolicy(Policy):
             *(TypeError, ValueError, RuntimeError),
         ):
             return torch.as_tensor(action, dtype=torch.float32).numpy()
+
+
+class _Among(Policy):
+    """A function of some of several simulations, called as for all of them.
+
+    Products of matrices round differently with another number of rows, but a row does
+    not depend on what the others hold.
+    """
+
+    def __init__(self, policy: FunctionPolicy, first: int, count: int):
+        self._policy, self._first, self._count = policy, first, count
+        self.name = policy.name
+
+    def reset(self, view: View, which: np.ndarray) -> None:
+        self._policy.reset(view, which)
+
+    def act(self, observation: Any) -> np.ndarray:
+        own = len(observation)
+        if own == self._count:
+            return self._policy.act(observation)
+        rows = (torch.arange(self._count) - self._first).clamp(0, own - 1)
+        return self._policy.act(observation[rows])[self._first : self._first + own]
 
 
 class TrainedPolicy(FunctionPolicy):

@@ -26,10 +26,11 @@ from cathsim_dmc.agents.checkpoint import (
     checkpoints_in,
     save_checkpoint,
 )
+from cathsim_dmc.agents.collection import check_collector, make_collector
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
-from cathsim_dmc.agents.learner import Learner, make_collector
+from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.learners import LEARNERS
 from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
@@ -107,6 +108,7 @@ def train(
     with files.refused(ConfigError, text, RuntimeError, AssertionError):
         torch.zeros(1, device=config.torch_device)
     loggers.require(config.logger)
+    check_collector(config, LEARNERS[config.algorithm].learner)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_only_process(run))
         checkpoint = _prepare(run, config, resume)
@@ -125,7 +127,7 @@ def train(
         learner = LEARNERS[config.algorithm].learner(config, shapes, run)
         learner.attach(env)
         state = _start(learner, env, checkpoint, without_replay)
-        collector = make_collector(config, learner, env, state["frames"])
+        collector = make_collector(config, learner, env, make_env, state["frames"])
         stack.callback(collector.shutdown)
         files.write_json(run / CONFIG_FILE, config.to_dict())
         # After everything that draws numbers while being made.

@@ -23,7 +23,16 @@ from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.agents.policies import task_and_options
 from cathsim_dmc.agents.training_log import LINE_INTERVAL, progress_bar
 from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons, recorded_forces
-from cathsim_dmc.cli.options import Json, Modules, Task, Threads, print_json, say
+from cathsim_dmc.cli.options import (
+    Json,
+    Modules,
+    Ray,
+    Task,
+    Threads,
+    print_json,
+    say,
+    told_of_losses,
+)
 from cathsim_dmc.cli.task_options import TaskOptions, task_kind
 from cathsim_dmc.pictures import recorded
 from cathsim_dmc.pictures.films import SUFFIXES, check_film
@@ -67,6 +76,7 @@ def evaluate(
     out: Path | None = None,
     baseline: bool = True,
     threads: Threads = None,
+    ray: Ray = False,
     report: bool = False,
     json: Json = False,
     modules: Modules = (),
@@ -94,9 +104,17 @@ def evaluate(
     suite.known(task)
     task_kwargs = protocols.get(protocol).beside(task_kwargs, options.given)
     contacts = evaluation.ContactLog()
+    common: Any = {"protocol": protocol, "task_kwargs": task_kwargs}
+    common |= {"num_threads": threads, "on_cluster": ray}
 
     def play(who: Any, out_dir: Path | None = None) -> EvaluationResult:
-        name = getattr(who, "name", who)
+        name, asked = getattr(who, "name", who), (task, episodes, seed)
+        if ray:
+            log = contacts if who is player else None
+            with told_of_losses():
+                return agents.evaluate(
+                    who, *asked, observer=log, out_dir=out_dir, **common
+                )
         with progress_bar(name, " steps", delay=LINE_INTERVAL) as bar:
 
             def observe(env: Any, running: np.ndarray) -> None:
@@ -107,9 +125,8 @@ def evaluate(
                 bar.update()
 
             return agents.evaluate(
-                who, task, episodes, seed, protocol=protocol, task_kwargs=task_kwargs,
-                num_threads=threads, observer=observe, out_dir=out_dir,
-            )  # fmt: skip
+                who, *asked, observer=observe, out_dir=out_dir, **common
+            )
 
     results = {"policy": play(player, out)}
     if baseline and policy != "random":

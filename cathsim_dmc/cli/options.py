@@ -1,5 +1,6 @@
 """Options, exit codes and printing that several commands share."""
 
+import contextlib
 import json
 import sys
 from typing import Annotated, Any
@@ -25,11 +26,18 @@ Modules = Annotated[
     conf.arg(name="import", metavar="MODULE", help=_MODULES),
 ]
 Threads = Annotated[int | None, conf.arg(help=_THREADS)]
+_RAY = "Whether the machines of a Ray cluster do the work (docs/cluster.md)."
+Ray = Annotated[bool, conf.arg(help=_RAY)]
 
 
 def say(text: str) -> None:
     """Print a line of progress on standard error."""
     print(text, file=sys.stderr, flush=True)
+
+
+def told_of_losses() -> contextlib.redirect_stdout:
+    """A context in which Ray tells of lost processes on standard error."""
+    return contextlib.redirect_stdout(sys.stderr)
 
 
 def print_json(values: Any) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated
 from tyro import conf
 
 from cathsim_dmc import bounds
-from cathsim_dmc.cli.options import Json, print_json, say
+from cathsim_dmc.cli.options import Json, Ray, print_json, say, told_of_losses
 from cathsim_dmc.recording import viewer
 from cathsim_dmc.recording.image_set import ImageSetOptions, write
 
@@ -15,6 +15,7 @@ def dataset(
     out: Annotated[Path, conf.Positional],
     /,
     processes: int | None = None,
+    ray: Ray = False,
     json: Json = False,
     *,
     options: Annotated[ImageSetOptions, conf.arg(name="")],
@@ -26,7 +27,8 @@ def dataset(
         processes: Number of processes; one per core by default.
         options: Content of the data set.
     """
-    done = write(out, options, processes=processes, say=say)
+    with told_of_losses():
+        done = write(out, options, processes=processes, say=say, on_cluster=ray)
     if json:
         print_json(done)
         return 0

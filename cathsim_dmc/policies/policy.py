@@ -58,6 +58,18 @@ class Policy:
             which: (N,) bool, the simulations that begin a new episode.
         """
 
+    def among(self, first: int, count: int) -> "Policy":
+        """The policy for some of the episodes that are evaluated together.
+
+        It acts as this one does in all of them, bit for bit, so that they may be played
+        apart. This one itself, if the action of a simulation depends on nothing else.
+
+        Args:
+            first: Number of the first of these episodes.
+            count: Number of all episodes.
+        """
+        return self
+
     def act(self, observation: Any) -> np.ndarray:
         """Choose the actions of the next control step.
 

@@ -23,6 +23,10 @@ class _Scripted(Policy):
             self._generators = [np.random.default_rng(seed) for seed in seeds]
             self._action = np.zeros(shape)
 
+    def among(self, first: int, count: int) -> Policy:
+        """Another one, whose generators are those of its simulations."""
+        return type(self)(self._seed + first)
+
     def act(self, observation: Any) -> np.ndarray:
         return self._action
 

@@ -16,6 +16,7 @@ import dataclasses
 import json
 import multiprocessing
 import os
+import tempfile
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -23,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import __version__, bounds, extras, files
+from cathsim_dmc import __version__, bounds, cluster, extras, files
 from cathsim_dmc.recording import coco, sequences
 from cathsim_dmc.recording.sequences import KEYPOINTS, KITS, ImageSetOptions
 
@@ -58,6 +59,7 @@ def write(
     *,
     processes: int | None = None,
     say: Callable[[str], None] = lambda text: None,
+    on_cluster: bool = False,
 ) -> dict[str, Any]:
     """Writes a data set, or what an interrupted run has left out of it.
 
@@ -66,12 +68,15 @@ def write(
         processes: number of processes, None for one per core; with more than one, a
             script must guard its main part (`if __name__ == "__main__"`).
         say: receives a line for each anatomy.
+        on_cluster: whether the machines of a Ray cluster simulate, a processor for each
+            anatomy; the files come here. They are the same, byte by byte, on
+            processors of one kind.
 
     Returns:
         "path" of the data set; images of each split ("frames"), with those of earlier
         runs; of this run "new" images, wall time ("seconds"), "processor" time of all
-        processes, s, and the new images in a second of either, "frames_per_second" and
-        "frames_per_processor_second".
+        processes of this machine, s, and the new images in a second of either,
+        "frames_per_second" and "frames_per_processor_second".
 
     Raises:
         ValueError: if an option is wrong, or the folder is that of other options.
@@ -84,9 +89,13 @@ def write(
     count = os.cpu_count() or 1
     if processes is not None:
         count = bounds.whole("processes", processes, 1, bounds.MOST_THREADS)
+    if on_cluster:
+        cluster.connect()
     _begin(out, options)
     start, used = time.monotonic(), sum(os.times()[:4])
     shards, labels, new = _shards(out, options), [], 0
+    if on_cluster:
+        new += _simulate_on_cluster(shards, say)
     for rows, line, own in _over(_write_shard, shards, count):
         labels.append(own)
         new += rows
@@ -177,6 +186,25 @@ def _over(work: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterab
     workers = min(processes, len(jobs))
     with concurrent.futures.ProcessPoolExecutor(workers, context) as pool:
         yield from pool.map(work, jobs)
+
+
+def _simulate_on_cluster(shards: list[_Shard], say: Callable[[str], None]) -> int:
+    """Has a cluster simulate the anatomies that are missing; number of new frames."""
+    missing, new = [shard for shard in shards if not shard.path.exists()], 0
+    for number, (rows, line, data) in cluster.over(_simulated, missing):
+        files.write_bytes(missing[number].path, data)
+        new += rows
+        say(line)
+    return new
+
+
+def _simulated(shard: _Shard) -> tuple[int, str, bytes]:
+    """Simulates one anatomy: frames, a line about it, its file."""
+    with tempfile.TemporaryDirectory() as folder:
+        own = dataclasses.replace(shard, folder=Path(folder))
+        own.path.parent.mkdir()
+        rows, line = _simulate_shard(own)
+        return rows, line, own.path.read_bytes()
 
 
 def _label(out: Path, shards: list[_Shard], labels: list[Labels]) -> dict[str, int]:
