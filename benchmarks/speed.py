@@ -22,7 +22,14 @@ from cathsim_dmc.simulation.torchrl import BatchedEnv
 # isort: on
 import mujoco
 import numpy as np
-from pace import (
+
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.cli.options import show
+from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.pace import (
     NEVER,
     RUNS,
     STEPS,
@@ -32,13 +39,6 @@ from pace import (
     pace,
     speed,
 )
-
-from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.cli.options import show
-from cathsim_dmc.imaging.device import Shadow
-from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.validation.checks import Check, Report
 
 DEPTHS = (0.0, 0.1, 0.2, 0.3, np.inf)  # m of insertion, edges of the bins
 # Long enough that the deepest bin is reached, m, in so many steps.

@@ -54,7 +54,7 @@ ALLOWED = {
     "policies": _FACE,
     "recording": _FACE,
     "analysis": _FACE | {"recording", "validation", "policies"},
-    "validation": _FACE | {"recording"},
+    "validation": _FACE | {"recording", "policies"},
     "pictures": _FACE | {"recording", "policies"},
     "agents": _FACE | {"recording", "analysis", "policies"},
     # The faces to the outside: everything but each other.

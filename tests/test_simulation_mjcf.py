@@ -1,9 +1,7 @@
 """A task as files: another program that steps the scene gets what the task gets."""
 
 import json
-import sys
 import types
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -12,11 +10,7 @@ import pytest
 from cathsim_dmc import suite
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import Drives
-
-SCRIPTS = Path(__file__).parents[1] / "docs" / "scripts"
-sys.path.insert(0, str(SCRIPTS))
-
-from mjcf_scene import write_mjcf  # noqa: E402
+from cathsim_dmc.simulation.mjcf import write_mjcf
 
 TASK, SEED, STEPS = "type1_lcca", 3, 30
 
@@ -40,11 +34,16 @@ def test_the_scene_moves_nearly_as_the_task(exported):
     model = mujoco.MjModel.from_xml_path(str(exported / "scene.xml"))
     assert not model.nuser_geom or not model.geom_user.any()
     data = mujoco.MjData(model)
-    data.qpos[:] = task["qpos"]
+    mujoco.mj_resetDataKeyframe(model, data, model.key("start").id)
+    np.testing.assert_array_equal(data.qpos, task["qpos"])
     mujoco.mj_forward(model, data)
+    # The device stands clear of the wall, which it does not at qpos0.
+    assert all(contact.dist > -0.1e-3 for contact in data.contact)
     views = {name: getattr(data, name)[None] for name in ("qpos", "qvel", "act")}
     drives = Drives(model, types.SimpleNamespace(**views))
+    held = data.act.copy()
     drives.hold(0)
+    np.testing.assert_array_equal(data.act, held)
     env = suite.load("cathsim", TASK, task_kwargs={"random": SEED})
     env.reset()
     order = [model.actuator(name).id for name in task["actuators"]]
@@ -80,6 +79,43 @@ def test_what_success_is_stands_beside_the_scene(exported):
     assert task["substeps"] * 0.004 == pytest.approx(task["control_timestep"])
 
 
+def test_a_pair_is_written_as_its_chain_stands(tmp_path, cathsim):
+    task, out = "simple1_lcca_pair", tmp_path / "pair"
+    code, told, _ = cathsim("export", task, "--out", out, "--seed", "2")
+    assert not code and told.strip() == str(out)
+    model = mujoco.MjModel.from_xml_path(str(out / "scene.xml"))
+    env = suite.load("cathsim", task, {"random": 2})
+    env.reset()
+    own, chain = env.physics.model.ptr, env.task.scene.catheter
+    close = dict(rtol=1e-9, atol=1e-15)
+    for link in chain.links:
+        found, expected = (m.body(link.full_identifier) for m in (model, own))
+        for name in ("mass", "inertia", "ipos", "iquat", "gravcomp"):
+            np.testing.assert_allclose(
+                getattr(found, name, 0), getattr(expected, name, 0), **close
+            )
+        for joint in link.find_all("joint", immediate_children_only=True):
+            found, expected = (m.joint(joint.full_identifier) for m in (model, own))
+            np.testing.assert_allclose(found.stiffness, expected.stiffness, **close)
+            np.testing.assert_allclose(
+                model.dof_damping[found.dofadr],
+                own.dof_damping[expected.dofadr],
+                **close,
+            )
+            np.testing.assert_allclose(
+                model.qpos_spring[found.qposadr],
+                own.qpos_spring[expected.qposadr],
+                **close,
+            )
+        for geom in link.find_all("geom", immediate_children_only=True):
+            found, expected = (m.geom(geom.full_identifier) for m in (model, own))
+            np.testing.assert_allclose(found.size, expected.size, **close)
+            np.testing.assert_allclose(found.friction, expected.friction, **close)
+    described = json.loads((out / "task.json").read_text())
+    assert described["devices"] == ["wire_035_glide", "berenstein_5f"]
+    np.testing.assert_array_equal(model.key("start").qpos, env.physics.data.qpos)
+
+
 @pytest.mark.slow
 def test_what_cannot_be_written_is_refused_before(tmp_path):
     with pytest.raises(ValueError, match="type9.*type1_bca"):
@@ -88,6 +124,6 @@ def test_what_cannot_be_written_is_refused_before(tmp_path):
         write_mjcf(TASK, tmp_path)
     with pytest.raises(ValueError, match="pool=1"):
         write_mjcf("arch_bca", tmp_path / "b", task_kwargs={"pool": 2})
-    with pytest.raises(ValueError, match="single device"):
-        write_mjcf("type1_lcca_pair", tmp_path / "c")
+    with pytest.raises(ValueError, match="wall.*merged, prisms, coacd"):
+        write_mjcf(TASK, tmp_path / "c", wall="boxes")
     assert not list(tmp_path.iterdir())

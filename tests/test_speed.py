@@ -2,9 +2,10 @@
 
 import mujoco
 import numpy as np
-import pace as speed
 import pytest
 import speed as script
+
+from cathsim_dmc.validation import pace as speed
 
 
 @pytest.fixture(scope="module")

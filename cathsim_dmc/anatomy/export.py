@@ -2,79 +2,220 @@
 
 A prism stands on every triangle of the lumen's surface, outwards along the vertex
 normals; neighbours share their side faces, so nothing can pass between two of them.
+Neighbouring prisms are merged while their hull stays out of the lumen.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
 from scipy.spatial import ConvexHull, cKDTree
 
-from cathsim_dmc import files
+from cathsim_dmc import bounds, extras, files
 from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.merging import merged
 from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS, Inlet
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS
 from cathsim_dmc.anatomy.scan.places import cut_open
-from cathsim_dmc.anatomy.scan.topology import decimated
+from cathsim_dmc.anatomy.scan.topology import adjacent, decimated
 from cathsim_dmc.anatomy.surface import sampled
 
 TRIANGLES = 3_000  # of the surface that carries prisms; others are decimated
 THICKNESS = 4e-3  # m, of the wall where no other lumen is near
 THINNEST = 0.3e-3  # m, of the wall between two lumens
-MOVE = 0.3e-3  # m, largest outward movement of a vertex
+SHIFT = 0.2e-3  # m, of the wall outwards, which chords take back
+MOVE = 0.6e-3  # m, largest outward movement of a vertex
+TOLERANCE = 0.25e-3  # m, that a merged piece may protrude into the lumen
+_CHORD = 0.08e-3  # m, that a prism may protrude into the lumen
 CAP_OVERLAP = 2e-3  # m, of the inlet's cap under the wall around it
+CAP_SECTORS = 12
 _BEHIND = 0.05e-3  # m, of the surface that is cut off ahead of the inlet's flat cap
+_AHEAD = 1e-3  # m from an open end, from where on its depth is that of the wall alone
+_LONGER = 6e-3  # m, by which the lumen goes on behind an open end
 _PLACES = 10_000  # of the wall that are looked at
-_NEAR = 1.5e-3  # m from an open end, where there is no wall
 # Levels (m) along the normal at which pieces are looked for, > 0 in the lumen.
 _LEVELS = np.arange(-1.5e-3, 1.5e-3, 0.05e-3)
 _GRAZE = 0.05e-3  # m, by which a piece may touch a 5 Fr catheter on a centreline
 _OFF = 0.3e-3  # m; farther from the wall a place of the surface is on an open end
 
 
-def wall_pieces(anatomy: Anatomy) -> tuple[np.ndarray, ...]:
-    """Vertices (n_i, 3) m of convex pieces around the lumen; takes seconds.
+class _Shell(NamedTuple):
+    """The wall as a thick surface.
+
+    Attributes:
+        inner: (V, 3) m, on the lumen.
+        outer: (V, 3) m, where the wall ends.
+        faces: (F, 3) triangles of both, without the inlet's cap.
+        cap: pieces that close the inlet but for its hole.
+    """
+
+    inner: np.ndarray
+    outer: np.ndarray
+    faces: np.ndarray
+    cap: list[np.ndarray]
+
+
+def wall_pieces(anatomy: Anatomy, wall: str = "merged") -> tuple[np.ndarray, ...]:
+    """Vertices (n_i, 3) m of convex pieces around the lumen.
 
     The pieces lie outside the lumen but for some tenths of a millimetre. The inlet is
     closed but for a hole of `INLET_HOLE_RADIUS`.
+
+    Args:
+        wall: How the wall is divided, of `WALLS`: "merged" prisms, "prisms" as they
+            are, or "coacd".
+
+    Raises:
+        ValueError: if there is no such wall.
+        ModuleNotFoundError: if CoACD is asked for and not installed.
     """
-    inlet, lumen, surface = anatomy.inlet, anatomy.lumen, anatomy.surface
-    vertices, faces = decimated(surface.vertices, surface.faces, TRIANGLES)
+    check_wall(wall)
+    shell = _shell(anatomy)
+    return (*WALLS[wall](anatomy, shell), *shell.cap)
+
+
+def check_wall(wall: str) -> None:
+    """Raise ValueError or ModuleNotFoundError unless there are pieces of that kind."""
+    bounds.choice("wall", wall, WALLS)
+    if wall == "coacd":
+        extras.require("export", "coacd")
+
+
+def _shell(anatomy: Anatomy) -> _Shell:
+    inlet, depth = anatomy.inlet, _depth(anatomy)
+    vertices, faces = anatomy.surface.vertices.copy(), anatomy.surface.faces
+    # The rim of the inlet's flat cap would be rounded when triangles are merged: it
+    # is moved away, and what lies behind the inlet is cut off afterwards.
+    behind = (vertices - inlet.position) @ inlet.direction < 2 * _BEHIND
+    around = np.linalg.norm(vertices - inlet.position, axis=1) < 1.5 * inlet.radius
+    vertices[behind & around] -= _LONGER * inlet.direction
+    vertices, faces = decimated(vertices, faces, TRIANGLES)
     at = inlet.position + _BEHIND * inlet.direction
     points, shell, cap = cut_open(vertices, faces, replace(inlet, position=at))
     normals = _outward_normals(points, shell)
+    used = np.unique(shell)
+    points[used] += depth(points[used])[:, None] * normals[used]
     # How far each vertex can move out before another lumen comes near.
     reach = np.full(len(points), THINNEST)
     going = np.ones(len(points), dtype=bool)
     for s in np.arange(0.4e-3, THICKNESS + 1e-9, 0.2e-3):
-        going &= -lumen(points + s * normals) > 0.35 * s
+        going &= -depth(points + s * normals) > 0.35 * s
         reach[going] = s
-    chords = lumen(points[shell].mean(axis=1)).clip(0.0, MOVE)
-    move = np.zeros(len(points))
-    np.maximum.at(move, shell, chords[:, None])
     # Between two lumens there is no room to move into.
-    inner = points + np.minimum(move, 0.5 * reach)[:, None] * normals
-    outer = inner + reach[:, None] * normals
-    prisms = np.concatenate([inner[shell], outer[shell]], axis=1)
-    return (*prisms, *_inlet_cap(points[cap[:, :2]], inlet))
+    room = np.minimum(MOVE, 0.5 * reach)
+    moved = np.minimum(SHIFT, room)
+    for _ in range(4):
+        corners = (points + moved[:, None] * normals)[shell]
+        middles = (corners + np.roll(corners, 1, axis=1)) / 2
+        places = np.concatenate([middles, corners.mean(axis=1, keepdims=True)], axis=1)
+        over = (depth(places).max(axis=1) - _CHORD).clip(0.0)
+        push = np.zeros(len(points))
+        np.maximum.at(push, shell, over[:, None])
+        moved = np.minimum(moved + push, room)
+    outward = np.maximum(reach, moved + THINNEST)
+    inner, outer = (points + far[:, None] * normals for far in (moved, outward))
+    return _Shell(inner, outer, shell, _inlet_cap(points[cap[:, :2]], inlet))
+
+
+def _depth(anatomy: Anatomy) -> Callable[[np.ndarray], np.ndarray]:
+    """Depth of points in the lumen, which goes on behind the inlet as a tube."""
+    inlet = anatomy.inlet
+
+    def depth(points: np.ndarray) -> np.ndarray:
+        return anatomy.lumen(
+            _before(points, inlet.position, inlet.direction, inlet.radius)
+        )
+
+    return depth
+
+
+def _before(
+    points: np.ndarray, position: np.ndarray, inward: np.ndarray, radius: float
+) -> np.ndarray:
+    """Points, of which those at an open end or behind it are moved ahead of it."""
+    away = points - position
+    height = away @ inward
+    aside = np.linalg.norm(away - height[..., None] * inward, axis=-1)
+    near = (np.abs(height) < _LONGER) & (height < _AHEAD) & (aside < 1.5 * radius)
+    return points + np.where(near, _AHEAD - height, 0.0)[..., None] * inward
+
+
+def _prisms(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
+    """A prism on every triangle."""
+    del anatomy
+    ends = shell.inner[shell.faces], shell.outer[shell.faces]
+    return list(np.concatenate(ends, axis=1))
+
+
+def _merged(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
+    """Prisms, merged while they stay out of the lumen."""
+    prisms, pairs = _prisms(anatomy, shell), adjacent(shell.faces).tolist()
+    return merged(prisms, pairs, _depth(anatomy), TOLERANCE)
+
+
+def _coacd(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
+    """Pieces by convex decomposition (CoACD) of patches of the wall."""
+    import coacd
+
+    del anatomy
+    coacd.set_log_level("error")
+    inner, outer, faces, _ = shell
+    flat = np.cross(*np.diff(inner[faces], axis=1).swapaxes(0, 1))
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    # A patch lies on one side of its vessel.
+    features = np.hstack([1e3 * inner[faces].mean(axis=1), 4.0 * flat])
+    count = len(faces) // _PATCH + 1
+    label = kmeans2(features, count, minit="++", seed=0)[1]
+    solid, size = 1e3 * np.concatenate([inner, outer]), len(inner)
+    pieces = []
+    for patch in (faces[label == k] for k in np.unique(label)):
+        edges = patch[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        paired = (edges[:, None] == edges[:, ::-1]).all(axis=-1).any(axis=1)
+        a, b = edges[~paired].T
+        sides = np.stack([a, b, b + size, a, b + size, a + size], axis=-1)
+        closed = [patch[:, ::-1], patch + size, sides.reshape(-1, 3)]
+        mesh = coacd.Mesh(solid, np.concatenate(closed))
+        found = coacd.run_coacd(mesh, real_metric=True, **_COACD)
+        pieces += [1e-3 * np.asarray(vertices) for vertices, _ in found]
+    return pieces
+
+
+WALLS = {"merged": _merged, "prisms": _prisms, "coacd": _coacd}
+_PATCH = 24  # triangles of a patch that CoACD divides
+# Largest concavity, mm, and the least search: patches are nearly convex.
+_COACD: dict[str, Any] = {
+    "threshold": 1.0, "preprocess_mode": "off", "resolution": 500, "seed": 0,
+    "mcts_iterations": 10, "mcts_nodes": 5, "mcts_max_depth": 1,
+}  # fmt: skip
 
 
 def _inlet_cap(border: np.ndarray, inlet: Inlet) -> list[np.ndarray]:
-    """Convex sectors on edges (n, 2, 3) m of the cut that close it but for the hole."""
-    # A chord between two spokes cuts into the hole less than this at 12 sectors.
-    hole = INLET_HOLE_RADIUS / np.cos(np.pi / 12)
+    """Convex sectors behind edges (n, 2, 3) m of the cut; they leave the hole open."""
     spokes = border - inlet.position
     reach = np.linalg.norm(spokes, axis=-1, keepdims=True)
     spokes = spokes / np.maximum(reach, 1e-9)
+    first = spokes[0, 0]
+    second = np.cross(inlet.direction, first)
+    angle = np.arctan2(spokes @ second, spokes @ first) % (2 * np.pi)
+    sector = (angle * CAP_SECTORS / (2 * np.pi)).astype(int)
     sectors = []
-    for spoke, far in zip(spokes, reach, strict=True):
+    for k in range(CAP_SECTORS):
+        # Edges across a border of sectors belong to both.
+        rows = (sector == k).any(axis=1)
+        middle = 2 * np.pi * (k + 0.5) / CAP_SECTORS
+        span = np.abs((angle[rows] - middle + np.pi) % (2 * np.pi) - np.pi)
+        if not rows.any():
+            continue
+        # A chord between two spokes stays out of the hole.
+        hole = INLET_HOLE_RADIUS / np.cos(span.max())
+        own, far = spokes[rows].reshape(-1, 3), reach[rows].reshape(-1, 1)
         if far.max() <= hole:
             continue
-        face = inlet.position + np.concatenate(
-            [hole * spoke, np.maximum(far, hole) * spoke + CAP_OVERLAP * spoke]
-        )
+        face = np.concatenate([hole * own, (np.maximum(far, hole) + CAP_OVERLAP) * own])
+        face = face + inlet.position
         sectors.append(np.concatenate([face, face - THICKNESS * inlet.direction]))
     return sectors
 
@@ -158,35 +299,44 @@ def _within(points: np.ndarray, pieces: Sequence[np.ndarray]) -> np.ndarray:
 def _wall_places(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
     """Places (n, 3) m all over the wall, and unit normals (n, 3) into the lumen."""
     points, _ = sampled(anatomy.surface, _PLACES)
-    depth, inward = anatomy.lumen(points), anatomy.lumen.gradient(points)
+    inside = points
+    for end in anatomy.ends:
+        if end.open:
+            inside = _before(inside, end.position, -end.direction, end.radius)
+    depth, inward = anatomy.lumen(inside), anatomy.lumen.gradient(inside)
     inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-9)
     wall = np.abs(depth) < _OFF
     for end in anatomy.ends:
-        beyond = (points - end.position) @ end.direction > -_NEAR
+        beyond = (points - end.position) @ end.direction > -_BEHIND
         near = np.linalg.norm(points - end.position, axis=1) < 3.0 * end.radius
         wall &= ~(end.open & beyond & near)
     return (points - depth[:, None] * inward)[wall], inward[wall]
 
 
-def write_mjcf(anatomy: Anatomy, path: str | os.PathLike[str]) -> dict[str, Any]:
+def write_mjcf(
+    anatomy: Anatomy, path: str | os.PathLike[str], wall: str = "merged"
+) -> dict[str, Any]:
     """Write an anatomy as a model of convex geoms, with a site at the inlet and goals.
 
     Args:
         path: of the file, which must end in .xml; lengths in it are metres.
+        wall: How the wall is divided, see `wall_pieces`.
 
     Returns:
         Number of `pieces`, and how well they stand for the lumen, see `fidelity`.
 
     Raises:
-        ValueError: if the file name has another ending.
+        ValueError: if the file name has another ending, or there is no such wall.
+        ModuleNotFoundError: if CoACD is asked for and not installed.
     """
     import mujoco
 
+    check_wall(wall)
     with files.atomic_path(path, ".xml") as temporary:
-        wall = wall_pieces(anatomy)
+        pieces = wall_pieces(anatomy, wall)
         spec = mujoco.MjSpec()
         spec.modelname = anatomy.name
-        for index, piece in enumerate(wall):
+        for index, piece in enumerate(pieces):
             name = f"wall_{index:04d}"
             mesh = spec.add_mesh(name=name, uservert=piece.ravel().tolist())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
@@ -196,4 +346,4 @@ def write_mjcf(anatomy: Anatomy, path: str | os.PathLike[str]) -> dict[str, Any]
             spec.worldbody.add_site(name=name, pos=place.position.tolist())
         spec.compile()
         temporary.write_text(spec.to_xml())
-    return {"pieces": len(wall), **fidelity(anatomy, wall)}
+    return {"pieces": len(pieces), **fidelity(anatomy, pieces)}

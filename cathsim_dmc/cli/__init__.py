@@ -29,8 +29,10 @@ COMMANDS = {
     "replay": ("recordings:replay", "Open a recording in the Rerun viewer."),
     "play": ("agents:play", "Cannulate by keyboard, with the forces on the screen."),
     "doctor": ("checks:doctor", "Check what is installed; say what to do."),
+    "export": ("exporting:export", "Write a task's scene as MJCF for other programs."),
     "phantom": ("phantoms:phantoms", "Make, import and check anatomies."),
     "validate": ("checks:validate", "Compare the physics with theory."),
+    "benchmark": ("checks:benchmark", "Measure the speed on this machine."),
 }
 
 

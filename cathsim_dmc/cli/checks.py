@@ -1,5 +1,6 @@
-"""`cathsim doctor`, what is installed, and `cathsim validate`, the physics."""
+"""`cathsim doctor`, `validate` and `benchmark`: what is installed, physics, speed."""
 
+import dataclasses
 import importlib
 import os
 import platform
@@ -12,6 +13,7 @@ from typing import Annotated, Literal, NamedTuple
 from packaging.requirements import Requirement
 from tyro import conf
 
+from cathsim_dmc import files
 from cathsim_dmc.cli.options import CHECK_FAILED, Json, print_json, say, show
 from cathsim_dmc.laws.capsule import nearest_places
 
@@ -86,6 +88,26 @@ def _opengl() -> Finding:
     return Finding("OpenGL", found, note=advice)
 
 
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """Of `forces`: a cannulation against a normal distribution, as published.
+
+    Attributes:
+        episode: Recorded cannulation (.npz), such as a manual one of `cathsim play
+            --out`; by default one of the expert.
+        mean: Mean of the normal distribution, N; the published one is unverified.
+        sd: Its standard deviation, N.
+        margin: Means closer than this count as equal, N.
+        figure: PNG of the density and cumulative plots to write.
+    """
+
+    episode: Path | None = None
+    mean: float = 0.4
+    sd: float = 0.02
+    margin: float = 0.1
+    figure: Path | None = None
+
+
 def validate(
     part: Annotated[
         Literal["rod", "pair", "wall", "vessel", "forces", "bench"], conf.Positional
@@ -93,6 +115,8 @@ def validate(
     /,
     data: Path | None = None,
     json: Json = False,
+    *,
+    protocol: Annotated[Protocol, conf.arg(name="")] = Protocol(),  # noqa: B008
 ) -> int:
     """Compare the physics with theory, or with measured guidewires.
 
@@ -100,15 +124,56 @@ def validate(
         part: Rod and drives; coaxial devices; contact with the wall and its shape;
             flow, wall and motion of the vessel; force sensors; guidewires on a bench.
         data: Of `bench`: folder with phantom.stl and wires.json (docs/bench.md).
+        protocol: Options of `forces`.
     """
-    module = "force_sensors" if part == "forces" else part
-    found = importlib.import_module(f"cathsim_dmc.validation.{module}")
-    run = getattr(found, f"validate_{part}")
     if (data is not None) != (part == "bench"):
         raise ValueError(
             "`validate bench` and it alone takes --data DIR, a folder with phantom.stl "
             "and wires.json (docs/bench.md)"
         )
-    if part == "bench":
-        return show(run(data, say), json)
-    return show(run(), json)
+    if part != "forces" and protocol != Protocol():
+        raise ValueError(
+            "--episode, --mean, --sd, --margin and --figure are options of `validate "
+            "forces` alone"
+        )
+    if part == "forces":
+        return _forces(protocol, json)
+    found = importlib.import_module(f"cathsim_dmc.validation.{part}")
+    run = getattr(found, f"validate_{part}")
+    return show(run(data, say) if part == "bench" else run(), json)
+
+
+def _forces(options: Protocol, json: bool) -> int:
+    from cathsim_dmc import style
+    from cathsim_dmc.recording.episode import Episode
+    from cathsim_dmc.validation import force_sensors, protocol
+
+    if options.figure is not None:
+        files.require_file(options.figure)
+    episode = None if options.episode is None else Episode.load(options.episode)
+    report = force_sensors.validate_forces(
+        episode=episode, mean=options.mean, sd=options.sd, margin=options.margin
+    )
+    code, found = show(report, json), report.findings["protocol"]
+    if not json:
+        print_json(found)
+    if options.figure is not None:
+        style.save(protocol.figure(report.data["samples"], found), options.figure)
+    return code
+
+
+def benchmark(
+    part: Annotated[Literal["speed"], conf.Positional], /, json: Json = False
+) -> int:
+    """Measure the speed of the simulator on one core, relative to this machine's.
+
+    Calibrated speeds are real-time factors times the microseconds of one `mj_step` of
+    dm_control's humanoid, timed in alternation; takes minutes.
+
+    Args:
+        part: What is measured.
+    """
+    del part
+    from cathsim_dmc.validation.pace import speed
+
+    return show(speed(say), json)

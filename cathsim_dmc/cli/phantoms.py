@@ -175,14 +175,22 @@ def check(
 
 
 @phantoms.command
-def export(phantom: Annotated[str, conf.Positional], /, out: Path) -> int:
+def export(
+    phantom: Annotated[str, conf.Positional],
+    /,
+    out: Path,
+    wall: Literal["merged", "prisms", "coacd"] = "merged",
+) -> int:
     """Write an anatomy as MJCF with convex wall pieces, for other engines.
 
     Args:
         phantom: Directory of an anatomy, or the name of a phantom.
         out: File of the model, ending in .xml.
+        wall: Pieces of the wall: prisms on the triangles of the surface, merged or as
+            they are; or those of CoACD (extra `export`), which intrude farther.
     """
     files.require_file(out)
-    found = exported.write_mjcf(suite.load_anatomy(phantom), out)
+    exported.check_wall(wall)
+    found = exported.write_mjcf(suite.load_anatomy(phantom), out, wall)
     print_json({"file": str(out), **found})
     return 0

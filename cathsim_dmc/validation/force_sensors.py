@@ -1,16 +1,19 @@
-"""`cathsim validate forces`: sensors against known loads."""
+"""`cathsim validate forces`: sensors against known loads, the published protocol."""
 
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
+from cathsim_dmc import policies, suite
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.physics import forces
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
-from cathsim_dmc.validation import convergence
+from cathsim_dmc.validation import convergence, protocol
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig, in_tube
 
@@ -143,8 +146,52 @@ def _checks(pushed: dict[str, list[DeadEnd]]) -> Iterator[Check]:
         yield Check.at_least(name, usual, USUAL_SHARE, "%", note)
 
 
-def validate_forces() -> Report:
-    """Runs every check of the forces."""
+def expert_cannulation(seed: int = 0) -> Episode:
+    """An episode of the expert on type1_bca."""
+    environment = suite.load(suite.DOMAIN, "type1_bca", {"random": seed})
+    act = policies.in_environment(policies.make_policy("expert", seed), environment)
+    episode = EpisodeRecorder(environment, "type1_bca").record_episode(act, seed)
+    environment.close()
+    return episode
+
+
+def compare_forces(
+    episode: Episode | None = None,
+    mean: float = protocol.REFERENCE_MEAN,
+    sd: float = protocol.REFERENCE_SD,
+    margin: float = protocol.EQUIVALENCE_MARGIN,
+) -> Report:
+    """Compares forces of a cannulation with a normal distribution, see `protocol`.
+
+    Args:
+        episode: Recorded cannulation, such as a manual one of `cathsim play`; None
+            records one of the expert.
+        mean: Mean of the normal reference, N.
+        sd: Standard deviation of the reference, N.
+        margin: Means closer than this count as equal, N.
+
+    Returns:
+        A report without checks, with findings "protocol" and data "samples" (n,) N.
+
+    Raises:
+        ValueError: if the episode has too few contacts, or a number is not positive.
+    """
+    episode = expert_cannulation() if episode is None else episode
+    samples = protocol.load_cell_samples(episode)
+    found = protocol.compare(samples, mean, sd, margin)
+    about = {"task": episode.task, "termination": episode.termination, **found}
+    return Report("forces, protocol", [], {"protocol": about}, {"samples": samples})
+
+
+def validate_forces(**protocol_options: Any) -> Report:
+    """Runs every check of the forces, and the published protocol.
+
+    Args:
+        **protocol_options: Arguments of `compare_forces`.
+    """
+    # Now: an episode without contacts is refused before the checks.
+    compared = compare_forces(**protocol_options)
     pushed = {"guiding": [dead_end(command) for command in PUSHES]}
     pushed["wide"] = [dead_end(command, WIDE_TUBE) for command in PUSHES]
-    return Report("forces", list(_checks(pushed)), data={"pushed": pushed})
+    data = {"pushed": pushed, **compared.data}
+    return Report("forces", list(_checks(pushed)), compared.findings, data)

@@ -1,5 +1,5 @@
 /**
- * A task of the suite in MuJoCo's WebAssembly build: the scene that `mjcf_scene.py`
+ * A task of the suite in MuJoCo's WebAssembly build: the scene that `cathsim export`
  * writes, commanded, stepped and judged as the Python task does it. SI units, world
  * frame (patient frame LPS). Runs in browsers and in Node.
  */

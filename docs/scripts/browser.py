@@ -5,7 +5,7 @@
 Writes into SITE/browser (build/site/browser): MuJoCo's WebAssembly build from the npm
 registry, at the version and checksum of docs/browser/package-lock.json; the web viewer
 of the installed rerun-sdk, which alone reads the recordings of its version; the scenes
-that `mjcf_scene.py` writes, with pictures of their vessels; and recordings of policies
+that `cathsim export` writes, with pictures of their vessels; and recordings of policies
 that ship. Nothing of it is in the repository.
 """
 
@@ -37,10 +37,7 @@ from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.pictures import record
 from cathsim_dmc.pictures.figure import background
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from mjcf_scene import write_mjcf
+from cathsim_dmc.simulation.mjcf import write_mjcf
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "browser"
@@ -83,7 +80,7 @@ def main() -> None:
 
 
 class ExportedScene:
-    """A scene that `mjcf_scene.py` wrote, at the start of its episode.
+    """A scene that `cathsim export` wrote, at the start of its episode.
 
     Attributes:
         model, data: MuJoCo's.

@@ -2,7 +2,7 @@
 
     python docs/scripts/browser_parity.py
 
-Plays episodes of the task, and replays their actions in the scene that `mjcf_scene.py`
+Plays episodes of the task, and replays their actions in the scene that `cathsim export`
 exports, in Python and in MuJoCo's WebAssembly build (Node.js); writes
 docs/images/browser_parity.png and docs/data/browser_parity.json, and the table of
 docs/browser/index.md.

@@ -205,7 +205,8 @@ def wall(anatomies, capstans, studies):
     return figure
 
 
-def forces(pushed):
+def forces(pushed, samples):
+    del samples  # `cathsim validate forces --figure` draws them
     figure, ((ax,),) = canvas(1, 1)
     for colour, (name, runs) in zip(COLOURS, pushed.items(), strict=False):
         push = [one.push for one in runs]

@@ -1,18 +1,13 @@
 """A task as files: the scene as MJCF, and what another program needs to run it.
 
-    python docs/scripts/mjcf_scene.py type1_lcca DIR
-
 MuJoCo's viewer, its WebAssembly build and other engines read the scene; the page in
 the browser is one of them.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import os
-import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,15 +17,15 @@ from dm_control import mjcf
 from lxml import etree
 
 from cathsim_dmc import bounds, suite
-from cathsim_dmc.anatomy.export import wall_pieces
+from cathsim_dmc.anatomy.export import check_wall, wall_pieces
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.files import atomic_directory
 from cathsim_dmc.physics.forces import CONTACT_SIZE
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation
-from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.scene import Scene, chosen_devices
 
-FORMAT = 1
+FORMAT = 2
 SCENE, TASK = "scene.xml", "task.json"
 _SIDE = 8e-3  # m, thickness of the boxes around the bore of the sheath
 
@@ -40,31 +35,37 @@ def write_mjcf(
     directory: str | os.PathLike[str],
     *,
     seed: int = 0,
-    task_kwargs: dict[str, Any] | None = None,
+    wall: str = "merged",
+    task_kwargs: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write the scene of a task and the start of one of its episodes.
 
     `scene.xml` is a file of plain MuJoCo: convex pieces stand for the wall, and boxes
     for the bore of the sheath, whose fields only this package knows. Stepped with the
-    same actions it moves nearly as the task does. `task.json` says how, see `describe`.
+    same actions it moves nearly as the task does. The keyframe "start" is the start of
+    the episode. `task.json` says the rest, see `describe`.
+
+    Devices that slide in each other are one chain whose fields change in every control
+    step; the file has those of the start, and so their combined chain.
 
     Args:
         directory: Directory to write, which must not exist.
+        wall: How the wall is divided, see `anatomy.export.wall_pieces`.
 
     Returns:
         The directory.
 
     Raises:
         ValueError: the task or an option does not exist, or the task has no single
-            scene: it draws its anatomy anew in each episode, or its devices are
-            coaxial.
+            scene because it draws its anatomy anew in each episode.
         FileExistsError: the directory exists.
+        ModuleNotFoundError: CoACD is asked for and not installed.
     """
     directory = Path(directory)
     if directory.exists():
         raise FileExistsError(f"{directory} exists; give a directory that does not")
-    if task not in suite.SUITE:
-        raise ValueError(f"no task {task!r}; there are {', '.join(suite.SUITE)}")
+    bounds.choice("task", task, suite.SUITE)
+    check_wall(wall)
     options = {**(task_kwargs or {}), "random": bounds.seed("seed", seed)}
     env = suite.load(suite.DOMAIN, task, options)
     if env.task.num_anatomies > 1:
@@ -72,17 +73,14 @@ def write_mjcf(
             f"{task} draws from {env.task.num_anatomies} anatomies; give pool=1 for "
             "the scene of one"
         )
-    if env.task.scene.catheter.coaxial:
-        raise ValueError(
-            f"{task} changes its model in every control step, as one device slides in "
-            "another; no file holds that: give a task with a single device"
-        )
     env.reset()
     values = {"name": task, "seed": seed, **describe(env)}
     directory.parent.mkdir(parents=True, exist_ok=True)
     with atomic_directory(directory) as folder:
         mjcf.export_with_assets(env.task.root_entity.mjcf_model, folder, SCENE)
-        _in_one_file(folder / SCENE, env.task.scene)
+        _in_one_file(folder / SCENE, env.task.scene, wall)
+        chain = env.task.scene.catheter.mjcf_model.model
+        _at_its_start(folder / SCENE, env.physics, f"{chain}/")
         (folder / TASK).write_text(json.dumps(values, indent=1) + "\n")
     return directory
 
@@ -102,7 +100,8 @@ def describe(env: Any) -> dict[str, Any]:
         the sensor of the wall: found, force, dist, pos, normal, tangent), "goal" and
         "branch" (success: the head is within the goal's radius, nearer to the branch's
         centreline than its radius there, and past its ostium), "max_steps",
-        "device_radius" and "versions".
+        "device_radius", "devices" (from the innermost outwards; of several the
+        actuators move their combined chain) and "versions".
     """
     task: Navigation = env.task
     scene, data, objective = task.scene, env.physics.data, task.objective
@@ -120,6 +119,7 @@ def describe(env: Any) -> dict[str, Any]:
         "head": catheter.head.full_identifier,
         "insertion": catheter.insertion.full_identifier,
         "device_radius": scene.catheter.device.outer_radius,
+        "devices": [one.name for one in chosen_devices(task.config)],
         "sensors": {
             "wall_contacts": "wall_contacts",
             "load_cell": "load_cell",
@@ -138,7 +138,45 @@ def describe(env: Any) -> dict[str, Any]:
     }
 
 
-def _in_one_file(path: Path, scene: Scene) -> None:
+def _at_its_start(path: Path, physics: Any, chain: str) -> None:
+    """Writes the fields of a chain as they stand, and the state as a keyframe.
+
+    Args:
+        chain: Prefix of the names of its elements.
+    """
+    tree, model, data = etree.parse(str(path)), physics.model.ptr, physics.data
+    named: dict[str, list[Any]] = {kind: [] for kind in ("body", "joint", "geom")}
+    for one in tree.find("worldbody").iter(*named):
+        if (one.get("name") or "").startswith(chain):
+            named[one.tag].append(one)
+    for one in named["joint"]:
+        joint = model.joint(one.get("name"))
+        dof, place = joint.dofadr[0], joint.qposadr[0]
+        one.set("stiffness", _text(joint.stiffness, 17))
+        one.set("damping", _text(model.dof_damping[dof], 17))
+        one.set("springref", _text(model.qpos_spring[place], 17))
+    for one in named["geom"]:
+        geom = model.geom(one.get("name"))
+        own = one.get("size", "").split()
+        one.set("size", " ".join([_text(geom.size[:1], 17), *own[1:]]))
+        one.set("friction", _text(geom.friction, 17))
+    for one in named["body"]:
+        body = model.body(one.get("name"))
+        one.set("gravcomp", _text(model.body_gravcomp[body.id], 17))
+        if body.mass[0]:
+            for old in one.findall("inertial"):
+                one.remove(old)
+            numbers = {"pos": body.ipos, "quat": body.iquat, "mass": body.mass}
+            numbers["diaginertia"] = body.inertia
+            values = {name: _text(value, 17) for name, value in numbers.items()}
+            one.insert(0, etree.Element("inertial", values))
+    state = {"qpos": _text(data.qpos, 17), "act": _text(data.act, 17)}
+    keyframe = etree.SubElement(tree.getroot(), "keyframe")
+    etree.SubElement(keyframe, "key", {"name": "start", **state})
+    tree.write(str(path))
+
+
+def _in_one_file(path: Path, scene: Scene, wall: str) -> None:
     """Writes meshes and convex walls into the scene, drops what older versions refuse.
 
     MuJoCo up to 3.14 refuses a defaults class of textures. Nothing is lost: PyMJCF
@@ -155,7 +193,7 @@ def _in_one_file(path: Path, scene: Scene) -> None:
         mesh.set("vertex", _text(surface.vertices.astype(np.float32)))
         mesh.set("face", " ".join(map(str, surface.faces.ravel().tolist())))
     carrier = tree.find(".//geom[@name='wall']")
-    for number, piece in enumerate(wall_pieces(scene.anatomy)):
+    for number, piece in enumerate(wall_pieces(scene.anatomy, wall)):
         name = f"wall_{number:03d}"
         etree.SubElement(
             tree.find("asset"), "mesh", name=name, vertex=_text(piece), inertia="shell"
@@ -177,9 +215,9 @@ def _in_one_file(path: Path, scene: Scene) -> None:
     tree.write(str(path))
 
 
-def _text(points: np.ndarray) -> str:
-    """Coordinates as text; nine digits tell every float32."""
-    return " ".join(f"{x:.9g}" for x in np.ravel(points).tolist())
+def _text(values: np.ndarray, digits: int = 9) -> str:
+    """Numbers as text; nine digits tell every float32, 17 every float64."""
+    return " ".join(f"{x:.{digits}g}" for x in np.ravel(values).tolist())
 
 
 def _sides(sheath: Sheath) -> Iterator[dict[str, str]]:
@@ -215,7 +253,3 @@ def _branch(objective: Any) -> dict[str, Any] | None:
         "radii": line.radii.tolist(),
         "ostium": float(objective.ostium),
     }
-
-
-if __name__ == "__main__":
-    print(write_mjcf(*sys.argv[1:3]))

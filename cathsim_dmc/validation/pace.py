@@ -4,7 +4,7 @@ Real-time factor: simulated seconds per CPU second of this process, one thread. 
 depends on the machine, so the checks bound the calibrated speed: the real-time factor
 times the microseconds of one `mj_step` of dm_control's humanoid, timed in alternation.
 Every figure is the median of repeated runs after a warm-up. `speed.py` measures more:
-threads, images, stages, memory.
+threads, images, stages, memory; it is a script of the source tree, in benchmarks.
 """
 
 import dataclasses
