@@ -96,13 +96,43 @@ def test_a_broken_file_is_named_and_left_out(page, tmp_path, capsys, damage):
     assert "0 of the" in text
 
 
-def test_the_interquartile_mean_drops_a_quarter_on_either_side(script):
-    interquartile_mean = script.interquartile_mean
-    scores = [[0.0, 0.9], [0.8, 1.0], [0.9, 1.0], [0.1, 0.9]]
-    mean, interval = interquartile_mean(scores)
-    assert mean == pytest.approx(np.mean([0.8, 0.9, 0.9, 0.9]))
-    assert interval[0] < mean < interval[1] <= 1.0
-    assert interquartile_mean(scores) == (mean, interval)
-    assert interquartile_mean([[0.5], [1.0, 1.0]])[1] is None
-    with pytest.raises(ValueError, match="needs a run"):
-        interquartile_mean([[1.0], []])
+def test_the_mean_over_seeds_hides_no_task_that_fails(script):
+    scores = [[1.0, 1.0], [0.0, 0.0], [1.0, 1.0], [1.0, 0.6]]
+    mean, interval = script.mean_over_seeds(scores)
+    assert mean == pytest.approx(0.7)
+    assert interval[0] < mean < interval[1] <= 0.75
+    assert script.mean_over_seeds(scores) == (mean, interval)
+    for few in ([[0.5], [1.0, 1.0]], [[1.0], []], []):
+        with pytest.raises(ValueError, match="two runs or more"):
+            script.mean_over_seeds(few)
+
+
+def test_means_stand_beside_agents_with_several_seeds_only(page, tmp_path):
+    tasks = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
+    for task in tasks:
+        rate = 0.0 if task == "type1_lcca" else 1.0
+        for label, algorithm, seeds in (("PPO", "ppo", 2), ("SAC", "sac", 1)):
+            for seed in range(seeds):
+                fabricated_results.write(
+                    tmp_path / "results", task, f"{label}-Internal", algorithm,
+                    "internal", seed, rate,
+                )  # fmt: skip
+    _, main, _ = page()
+    several, one = (
+        line_of(main, f"| {label}-Internal | {seeds} |")
+        for label, seeds in (("PPO", 2), ("SAC", 1))
+    )
+    assert several[-1] == "75 % (75–75)" and one[-1] == "–"
+    assert line_of(main, "PPO-Sequential")[-1] == "–"
+
+
+def test_published_agents_are_missing_only_where_the_grid_has_them(page, tmp_path):
+    fabricated_results.write(
+        tmp_path / "results", "type1_lcca", "PPO-Internal", "ppo", "internal", 0, 1.0
+    )
+    _, _, text = page()
+    assert line_of(text, "PPO-Sequential (missing)", "97 %")
+    for success in ("-196 ± 5", "-68 ± 91"):  # type1_lcca, type2_bca
+        assert line_of(text, "SAC-Image (not trained)", success)
+    left = text.partition("Published agents that the grid leaves out:")[2]
+    assert line_of(left, "- SAC-Image: type1_lcca, type2_bca")

@@ -18,7 +18,6 @@ from pathlib import Path
 from cathsim_dmc import agents  # isort: skip  # noqa: F401
 
 import numpy as np
-from scipy import stats
 
 from cathsim_dmc import files
 from cathsim_dmc.analysis.intervals import success_interval
@@ -58,9 +57,9 @@ otherwise ([settings](training.md)).
 SUCCESS = """\
 ## Success
 
-Cells show ours / published; – is not trained yet. *Mean* is the interquartile mean
-over tasks and seeds (Agarwal et al. 2021), with the 95 % interval of a bootstrap over
-seeds where there are several.
+Cells show ours / published; – was not trained. *Mean* is the mean over tasks and seeds
+with the 95 % interval of a stratified bootstrap over seeds (Agarwal et al. 2021). It is
+given only where every task has several seeds.
 """
 
 FORCE = """\
@@ -126,7 +125,7 @@ def pages(results, broken, cells, directory):
         main_figures, further_figures = drawn(table, directory)
         main += [successes(table), force_tables(table), other_tasks(table)]
         main += main_figures
-        detail += [full_tables(table), cost(table), *further_figures]
+        detail += [full_tables(table, cells), cost(table), *further_figures]
     detail.append(standing(results, broken, cells))
     parts = {PAGE: main, DETAIL_PAGE: detail}
     return {name: "\n".join(filter(None, one)) for name, one in parts.items()}
@@ -147,7 +146,7 @@ def arranged(results, cells):
 
 
 def standing(results, broken, cells):
-    """What is missing."""
+    """What is missing of the grid, and of the publication."""
     missing = [cell for cell in cells if cell.name not in results]
     lines = [
         "## What is missing",
@@ -163,6 +162,14 @@ def standing(results, broken, cells):
     for label, tasks in rows.items():
         of = (f"{task} (seed {', '.join(seeds)})" for task, seeds in tasks.items())
         lines.append(f"- {label}: {'; '.join(of)}")
+    cells_of = {(cell.label, cell.task) for cell in cells}
+    beyond = [
+        f"- {name}: {', '.join(left)}"
+        for name, tasks in published_agents().items()
+        if (left := [task for task in tasks if (name, task) not in cells_of])
+    ]
+    if beyond:
+        lines += ["", "Published agents that the grid leaves out:", "", *beyond]
     if broken:
         lines += ["", "Cannot be read, and are left out:", ""]
         lines += [f"- {line}" for line in broken]
@@ -216,17 +223,12 @@ def success_row(label, count, of_task, theirs):
         found = of_task.get(task)
         ours = percent(rate_of(found)[0]) if found else "–"
         cells.append(f"{ours} / {percent(theirs[task]['success'])}" if theirs else ours)
-    whole, ours = len(of_task) == len(PUBLISHED_TASKS), "–"
-    if whole:
+    whole, mean = len(of_task) == len(PUBLISHED_TASKS), "–"
+    if whole and min(map(len, of_task.values())) > 1:
         rates = [[result.success for result in one] for one in of_task.values()]
-        mean, interval = interquartile_mean(rates)
-        ours = percent(mean)
-        if interval is not None:
-            ours += f" ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
-    if theirs:
-        rates = [[theirs[task]["success"]] for task in PUBLISHED_TASKS]
-        ours += f" / {percent(interquartile_mean(rates)[0])}"
-    return f"| {' | '.join([*cells, ours])} |"
+        middle, (low, high) = mean_over_seeds(rates)
+        mean = f"{percent(middle)} ({100 * low:.0f}–{100 * high:.0f})"
+    return f"| {' | '.join([*cells, mean])} |"
 
 
 def force_tables(table):
@@ -249,9 +251,10 @@ def line_of(line):
     return f"|{'|'.join(cells[place] for place in FORCE_COLUMNS)}|"
 
 
-def full_tables(table):
+def full_tables(table, cells):
     """One table with all columns for each task."""
     published, lines = published_agents(), []
+    planned = {(cell.label, cell.task) for cell in cells}
     for task in dict.fromkeys((*PUBLISHED_TASKS, *table)):
         lines += [f"## {task}", "", *HEADER]
         repeated = set()
@@ -262,7 +265,8 @@ def full_tables(table):
             lines.append(row(label, found, theirs))
         for name, tasks in published.items():
             if name not in repeated and task in tasks:
-                lines.append(row(f"{name} (missing)", [], tasks[task]))
+                why = "missing" if (name, task) in planned else "not trained"
+                lines.append(row(f"{name} ({why})", [], tasks[task]))
         lines.append("")
     return "\n".join(lines)
 
@@ -376,12 +380,13 @@ def clock(seconds):
     return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
 
 
-def interquartile_mean(scores, resamples=10_000, seed=0):
-    """Mean of the middle half of all runs, with its 95 % interval over seeds.
+def mean_over_seeds(scores, resamples=10_000, seed=0):
+    """Mean over the runs of all tasks, with its 95 % interval over seeds.
 
-    As in Agarwal et al. (2021), "Deep reinforcement learning at the edge of the
-    statistical precipice": the runs of every task are resampled on their own
-    (stratified bootstrap, percentile interval).
+    The runs of every task are resampled on their own (stratified bootstrap, percentile
+    interval; Agarwal et al. 2021, "Deep reinforcement learning at the edge of the
+    statistical precipice"). It is not their interquartile mean, which of four tasks
+    leaves out one that fails.
 
     Args:
         scores: Scores of the runs (seeds) of each task; their numbers may differ.
@@ -389,24 +394,21 @@ def interquartile_mean(scores, resamples=10_000, seed=0):
         seed: Seed of the bootstrap.
 
     Returns:
-        The mean, and its interval: None unless every task has two runs at least.
+        The mean, in which every task counts alike, and its interval.
 
     Raises:
-        ValueError: there is no task, or one without a run.
+        ValueError: there is no task, or one with less than two runs.
     """
     tasks = [np.asarray(runs, dtype=np.float64) for runs in scores]
-    if not tasks or not all(len(runs) for runs in tasks):
-        raise ValueError(f"every task needs a run; given are {scores!r}")
-    mean = float(stats.trim_mean(np.concatenate(tasks), 0.25))
-    if min(len(runs) for runs in tasks) < 2:
-        return mean, None
+    if not tasks or min(map(len, tasks)) < 2:
+        raise ValueError(f"every task needs two runs or more; given are {scores!r}")
     random = np.random.default_rng(seed)
     drawn = [
         runs[random.integers(len(runs), size=(resamples, len(runs)))] for runs in tasks
     ]
-    means = stats.trim_mean(np.concatenate(drawn, axis=1), 0.25, axis=1)
+    means = np.mean([runs.mean(axis=1) for runs in drawn], axis=0)
     low, high = np.percentile(means, (2.5, 97.5))
-    return mean, (float(low), float(high))
+    return float(np.mean([runs.mean() for runs in tasks])), (float(low), float(high))
 
 
 def cost(table):
