@@ -8,6 +8,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import damping
+from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import Rig
 
 
@@ -18,10 +19,22 @@ def test_a_released_device_swings_as_the_beam_with_stated_losses(blood):
     assert decay == pytest.approx(expected, rel=damping.RELEASE_BOUND / 100)
 
 
+def off(lag, expected):
+    """Whether `cathsim validate rod` refuses a lag."""
+    bound = damping.SPIN_BOUND
+    return not Check.deviation("lag", lag, expected, bound, "rad").passed
+
+
 @pytest.mark.parametrize("speed", [1.0, 3.14])
 def test_a_device_turned_in_a_bend_lags_by_the_losses_of_its_material(speed):
-    lag, expected = damping.spin(speed)
-    assert np.degrees(abs(lag - expected)) < damping.SPIN_BOUND
+    assert not off(*damping.spin(speed))
+
+
+@pytest.mark.parametrize("loss", [0.9, 1.1])
+def test_a_damper_that_is_wrong_by_a_tenth_is_found(loss):
+    lag, expected = damping.spin(1.0, loss=loss)
+    assert lag / expected == pytest.approx(loss, abs=0.03)
+    assert off(lag, expected)
 
 
 def test_drag_is_that_of_the_correlation_against_the_velocity_of_the_blood():

@@ -319,7 +319,15 @@ def validate_rod() -> Report:
     checks = list(_checks(data))
     short = SHORT_COLUMNS.items()
     data["short"] = [buckling(end, count) for end, each in short for count in each]
+    turned = {
+        speed: damping.spin(speed, damping.LINK)
+        for speed in (damping.SLOW, *damping.SPEEDS)
+    }
     findings = {
+        "lag in a half circle of links of 17.5 mm, deviation from its dampers, %": {
+            f"{speed:g} rad/s": 100 * (lag / expected - 1)
+            for speed, (lag, expected) in turned.items()
+        },
         "deflection in three-point bending of links of 17.5 mm, deviation, %": {
             f"{1e3 * span:.0f} mm, load on a {'joint' if on_joint else 'link'}": 100
             * (damping.three_point(span, damping.LINK, on_joint) - 1)
