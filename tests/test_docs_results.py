@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import fabricated_results
-import numpy as np
 import pytest
 
 SCRIPTS = Path(__file__).parents[1] / "docs/scripts"

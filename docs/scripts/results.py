@@ -68,7 +68,8 @@ FORCE = """\
 Cells show ours / published, in mN, ± deviation over episodes
 ([definitions](forces.md)): *mean* is the sum over all contacts, mean over all steps;
 *contact* is the largest contact, mean over the steps with contact, nearest to the
-published f_mean; *largest* is the largest contact of an episode, the published f_max.
+published f_mean; *largest* is the largest contact of an episode at the end of any step,
+the published f_max, and depends on the physics step ([peaks](forces.md#peaks)).
 *Steps* is the length of the episodes.
 """
 
