@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from dm_control import mjcf
 
-from cathsim_dmc.entities import coaxial_loops, devices
+from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.chain import (
@@ -19,6 +19,7 @@ from cathsim_dmc.entities.chain import (
     TIMESTEP,
     TORSION_ARMATURE,
 )
+from cathsim_dmc.laws import coaxial
 
 STEERABLE = ("steerable_5f", "steerable_4f")
 LENGTH = 0.3
@@ -57,7 +58,7 @@ def test_masses_and_inertias_are_the_physical_ones(name):
     np.testing.assert_allclose(model.body_mass[bodies], masses, rtol=1e-9)
     assert model.body_mass[bodies].sum() == pytest.approx(moved * LENGTH, rel=1e-9)
     moments = [
-        coaxial_loops._inertia(mass, device.outer_radius, length)
+        coaxial._inertia(mass, device.outer_radius, length)
         for mass, length in zip(masses, catheter.link_lengths, strict=True)
     ]
     expected = [(across, across, along) for across, along in moments]

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from cathsim_dmc.entities import coaxial_loops, devices, torsion
+from cathsim_dmc.entities import devices, stack_memory
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.coaxial import Stack
-from cathsim_dmc.entities.torsion import STICKING, Rods
+from cathsim_dmc.entities.torsion import rods_of
+from cathsim_dmc.laws import coaxial, torsion
+from cathsim_dmc.laws.coaxial import Lumen, Posture
+from cathsim_dmc.laws.torsion import STICKING
 
 PAIR = ("wire_035_glide", "diagnostic_5f_simmons")
 LENGTHS = np.concatenate([np.full(12, 0.0166), np.full(20, 0.007)])
@@ -130,7 +133,7 @@ def test_nothing_jumps_as_one_device_slides_through_the_other(pair):
         gaps = lead * (np.arange(2) == front)
         for each in (gaps, gaps + 1e-7 * (gaps > 0)):
             overlap = pair.overlap(each)
-            shape = coaxial_loops.rest_angles(overlap.rest, turns)
+            shape = rest_angles(overlap, turns)
             found.append((overlap.compliance, shape, *pair.links(overlap, 0.04)))
     for each in zip(*found, strict=True):
         before, after = np.array(each[::2]), np.array(each[1::2])
@@ -151,15 +154,15 @@ def test_restoring_torque_is_the_derivative_of_the_energy(pair):
         joint = np.abs(bends - rest) ** 2 / (2 * overlap.compliance)
         return joint - overlap.coupling[0] * np.cos(turns[0] - turns[1])
 
-    torque, rate = coaxial_loops.restoring(overlap, bends, turns)
+    torque, rate = restoring(pair, overlap, bends, turns)
     for k in range(2):
         step = np.zeros_like(turns)
         step[k] = 1e-5
         slope = (energy(turns + step) - energy(turns - step)) / 2e-5
         np.testing.assert_allclose(torque[k], -slope, atol=1e-9)
         change = (
-            coaxial_loops.restoring(overlap, bends, turns + step)[0][k]
-            - coaxial_loops.restoring(overlap, bends, turns - step)[0][k]
+            restoring(pair, overlap, bends, turns + step)[0][k]
+            - restoring(pair, overlap, bends, turns - step)[0][k]
         ) / 2e-5
         np.testing.assert_allclose(rate[k], -change, atol=1e-9)
 
@@ -189,16 +192,41 @@ def test_links_have_the_outermost_devices_outside(pair):
 
 def pressed(stack, overlap, bends, turns):
     """Pressure of devices without axial forces of the joints."""
-    force, start = np.zeros(turns.shape), np.zeros(len(turns))
-    given = stack.link_lengths, overlap, bends, turns, force, start
-    return coaxial_loops.pressure(*given, np.ones(len(turns) - 1), 0.04, 1.0)[0]
+    tables, axial, devices = stack.tables, np.zeros(turns.shape), len(turns)
+    lumen = Lumen(np.zeros(devices), np.ones(devices - 1), 0.04, 1.0)
+    posture, scratch = Posture(np.zeros(0), bends, turns), stack_memory.scratch(tables)
+    force, drag = np.empty((devices - 1, turns.shape[1])), np.empty(devices - 1)
+    coaxial.pressure(tables, overlap, posture, axial, lumen, scratch, force, drag)
+    return force
+
+
+def rest_angles(overlap, turns):
+    """Rest angles (J,) complex of the joints, rad."""
+    shape = np.empty(turns.shape[1], complex)
+    coaxial.rest_angles(overlap.rest, turns, shape)
+    return shape
+
+
+def restoring(stack, overlap, bends, turns):
+    """Torque (K, J) of the shapes on each device, and its rate."""
+    posture, scratch = Posture(np.zeros(0), bends, turns), stack_memory.scratch
+    torque, rate = np.empty((2, *turns.shape))
+    coaxial.restoring(overlap, posture, scratch(stack.tables), torque, rate)
+    return torque, rate
+
+
+def at_joints(angles, gaps, nodes):
+    """Rotations (K, J) of devices at the joints, rad."""
+    turns = np.empty((len(gaps), len(nodes) - 2))
+    torsion.at_joints(angles, gaps, nodes, turns)
+    return turns
 
 
 def energy(stack, gaps, bends, angles):
     """Of a pair at given bends and rotations of the nodes of its rods, N·m."""
     nodes, devices = stack.nodes, stack.devices
-    overlap, turns = stack.overlap(gaps), torsion.at_joints(angles, gaps, nodes)
-    found = np.abs(bends - coaxial_loops.rest_angles(overlap.rest, turns)) ** 2
+    overlap, turns = stack.overlap(gaps), at_joints(angles, gaps, nodes)
+    found = np.abs(bends - rest_angles(overlap, turns)) ** 2
     found = (found / (2 * overlap.compliance)).sum()
     found -= (overlap.coupling[0] * np.cos(turns[0] - turns[1])).sum()
     # What the shapes store in each other, apart from the angle between them.
@@ -225,10 +253,12 @@ def test_axial_forces_are_the_derivative_of_the_energy(pair, gaps):
     follower = int(gaps.argmax())
     bends = rng.normal(scale=0.1, size=joints) * np.exp(0.8j)
     angles = np.cumsum(rng.normal(scale=0.2, size=(2, joints + 2)), axis=-1)
-    overlap, turns = pair.overlap(gaps), torsion.at_joints(angles, gaps, pair.nodes)
-    slopes = (torsion.at_joints(angles, gaps + 1e-8, pair.nodes) - turns) / 1e-8
-    slopes *= coaxial_loops.restoring(overlap, bends, turns)[0]
-    force = coaxial_loops.axial(pair.tables, overlap, gaps, bends, turns, slopes)
+    overlap, turns = pair.overlap(gaps), at_joints(angles, gaps, pair.nodes)
+    slopes = (at_joints(angles, gaps + 1e-8, pair.nodes) - turns) / 1e-8
+    slopes *= restoring(pair, overlap, bends, turns)[0]
+    posture, scratch = Posture(gaps, bends, turns), stack_memory.scratch(pair.tables)
+    force = np.empty(turns.shape)
+    coaxial.axial(pair.tables, overlap, posture, slopes, scratch, force)
     force = force.sum(axis=-1)
     step = 2e-5 * (np.arange(2) == follower)
     ends = [energy(pair, gaps + side * step, bends, angles) for side in (1, -1)]
@@ -267,7 +297,7 @@ def test_devices_that_do_not_fit_are_refused():
 
 @pytest.fixture
 def rod():
-    return Rods.of([devices.get("berenstein_5f")], stack(("berenstein_5f",)).nodes)
+    return rods_of([devices.get("berenstein_5f")], stack(("berenstein_5f",)).nodes)
 
 
 def wound(rod, angles, base, duration, friction=0.0, brake=0.0):
@@ -275,7 +305,9 @@ def wound(rod, angles, base, duration, friction=0.0, brake=0.0):
     loads = np.zeros((3, 1, len(LENGTHS)))
     loads[2, 0, -1] = friction
     loads[0, 0, -1] = -brake
-    return torsion.turned(angles, np.array([base]), rod, duration, loads)
+    scratch, new = stack_memory.rod_scratch(len(LENGTHS)), np.empty_like(angles)
+    torsion.turned(angles, np.array([base]), rod, duration, loads, scratch, new)
+    return new
 
 
 def test_a_load_at_the_end_winds_the_device_by_its_compliance(rod):

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import suite
+from cathsim_dmc.entities import stack_memory
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
-from cathsim_dmc.physics import chain_fields, sliding
+from cathsim_dmc.laws import sliding as laws
+from cathsim_dmc.physics import sliding
 from cathsim_dmc.physics.blood import StillBlood
 from cathsim_dmc.physics.effects import userdata_size
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
@@ -117,22 +119,27 @@ def test_rotation_turns_the_shape_of_the_end(environment):
 @pytest.mark.parametrize("stiffness, loss", [(2.0, 1.0), (1.0, 3.0)])
 def test_factors_scale_the_torsion_of_the_devices(environment, stiffness, loss):
     """In a smooth bend, twist does not depend on stiffness; loss is that of devices."""
-    entity, model = environment.task.scene.catheter, environment.physics.model.ptr
-    fields = [getattr(model, name).copy() for name in chain_fields.FIELDS]
-    made = sliding.made(entity, chain_fields.places_of(model, entity))
-    (tables, rods, *of_devices), *others = made
-    links = len(tables[1])
+    entity = environment.task.scene.catheter
+    devices, tables = sliding.devices_at(entity), entity.stack.tables
+    rods, links = devices.rods, len(tables.lengths)
     hinges = np.random.default_rng(0).uniform(-0.2, 0.2, 2 * links - 2)
-    turned, axial = np.array([0.0, 0.1]), np.zeros((2, links - 1))
+    turned, lumen = np.array([0.0, 0.1]), np.zeros((2, 1))
 
-    def angles(times, *factors):
-        devices = (tables, rods._replace(times=times), *of_devices)
-        state = np.zeros((2, links + 1)), np.zeros(1), np.zeros(1), np.zeros(2)
-        sliding.sliding_loops.settle(
-            (devices, *others), entity.start_gaps, turned, np.zeros(links), 0.0, state,
-            axial, hinges, 0.0, np.array(factors), tuple(fields),
-        )  # fmt: skip
-        return state[0]
+    def angles(times, stiffness, loss):
+        state = laws.State(
+            gaps=entity.start_gaps,
+            hinges=hinges,
+            angles=np.zeros((2, links + 1)),
+            ways=lumen[0],
+            drag=lumen[1],
+            slipped=np.zeros(2),
+            axial=np.zeros((2, links - 1)),
+        )
+        loads = laws.Loads(turned, np.zeros(links), 0.0, 0.0, stiffness, loss)
+        given = devices._replace(rods=rods._replace(times=times))
+        memory, chain = stack_memory.settling(tables), stack_memory.chain(tables)
+        laws.settle(given, loads, state, memory, chain)
+        return state.angles
 
     expected = angles(loss * rods.times, 1.0, 1.0)
     assert np.abs(expected[:, -1]).min() > 1e-3
@@ -196,7 +203,7 @@ def test_a_step_of_a_single_device_does_no_pair_work(shared_environment, monkeyp
     chain = environment.task.scene.catheter
     own = userdata_size([StillBlood()], chain)
     assert environment.physics.model.ptr.nuserdata == own
-    monkeypatch.setattr(sliding, "sliding_loops", None)
+    monkeypatch.setattr(sliding, "sliding", None)
     environment.reset()
     environment.step(np.zeros(21))
 

@@ -14,9 +14,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cathsim_dmc.entities import coaxial_loops as loops
+from cathsim_dmc.entities import stack_memory
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.device import Device
+from cathsim_dmc.laws import coaxial as laws
 
 
 class Stack:
@@ -28,10 +29,8 @@ class Stack:
         nodes: (L + 1,), distances of the ends of the links from the end of the chain,
             from proximal to distal, m.
         spans: (J,), length of rod of each joint, half of its two links, m.
-        tables: nodes, link lengths, and (K, E) start of the uniform pieces of the
-            devices, m from their ends, padded with infinity; (K, E + 1), EI, N·m², and
-            EI κ, N·m, beyond the device and of the pieces.
-        of_links: what `coaxial_loops.links` takes of the devices.
+        tables: Sections of the devices along the chain.
+        sections: Outer sections of the devices.
         arms: (K,), radius of each device by its friction ratio, m.
     """
 
@@ -56,7 +55,7 @@ class Stack:
             edges[k, : len(starts)] = starts
             bending[k, 1 : len(starts) + 1] = stiffness
             moment[k, 1 : len(starts) + 1] = moments
-        self.tables = self.nodes, self.link_lengths, edges, bending, moment
+        self.tables = laws.Tables(self.nodes, self.link_lengths, edges, bending, moment)
         radii = np.array([device.outer_radius for device in devices])
         ratios = np.array([device.friction_ratio for device in devices])
         outer = [_disc(device.outer_radius) for device in devices]
@@ -64,16 +63,23 @@ class Stack:
         masses = [device.linear_density for device in devices]
         weights = [weight_density(device) for device in devices]
         carried = 2 * np.array(outer), np.subtract(inner, outer)
-        self.of_links = radii, ratios, np.array([masses, weights, *carried])
+        densities = np.array([masses, weights, *carried])
+        self.sections = laws.Sections(radii, ratios, densities)
         self.arms = ratios * radii
 
-    def overlap(self, gaps: ArrayLike) -> loops.Overlap:
+    def overlap(self, gaps: ArrayLike) -> laws.Overlap:
         """Properties by the distances (K,) of the devices' ends from the chain's, m."""
-        return loops.overlap(np.array(gaps, np.float64), self.tables)
+        found, scratch = stack_memory.overlap(self.tables), stack_memory.scratch
+        laws.overlap(
+            np.array(gaps, np.float64), self.tables, scratch(self.tables), found
+        )
+        return found
 
-    def links(self, overlap: loops.Overlap, friction: float) -> loops.Links:
+    def links(self, overlap: laws.Overlap, friction: float) -> laws.Links:
         """Properties of the links by the Coulomb coefficient of an uncoated device."""
-        return loops.links(overlap, self.link_lengths, friction, *self.of_links)
+        found = stack_memory.links(self.tables)
+        laws.links(overlap, self.link_lengths, friction, self.sections, found)
+        return found
 
 
 def _disc(radius: float) -> float:

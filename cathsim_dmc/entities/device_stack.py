@@ -10,7 +10,7 @@ from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
 from cathsim_dmc.entities.coaxial import Stack, carried_mass, weight_density
 from cathsim_dmc.entities.contact import FRICTION, device_contact
 from cathsim_dmc.entities.device import Device
-from cathsim_dmc.entities.torsion import Rods
+from cathsim_dmc.entities.torsion import rods_of
 from cathsim_dmc.laws.hinges import unloaded_hinges
 
 # Coulomb coefficient between a device and the lined lumen around it (Lin 2020).
@@ -76,7 +76,7 @@ class DeviceStack(Chain):
         division = discretisation or library.Discretisation()
         self.friction, self.lumen_friction = friction, lumen_friction
         self.stack = Stack(self.devices, division.link_lengths(*self.devices))
-        self.rods = Rods.of(self.devices, self.stack.nodes)
+        self.rods = rods_of(self.devices, self.stack.nodes)
         self.start_gaps = lead * np.arange(len(self.devices), dtype=np.float64)
         overlap = self.stack.overlap(self.start_gaps)
         rest = np.empty((len(self.stack.spans), 2))

@@ -1,171 +1,25 @@
-"""Twist of coaxial devices: a one-dimensional rod along each of them.
-
-The M + 1 nodes of a rod are those of the chain when the device reaches its end; the
-rotary unit holds the first. The rod has no inertia: it is in equilibrium with its loads
-at the end of every control step (docs/pair_model.md).
-
-Functions of one simulation; K devices, J = M - 1 joints. `angles` (K, M + 1) are
-rotations of the nodes, rad; `gaps` (K,) the distance from the end of each device to
-that of the chain, m; `nodes` (M + 1,) distances from a device's end, m.
-"""
+"""Torsional rods of devices, of which `laws.torsion` has the law."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from cathsim_dmc.compiled import compiled
 from cathsim_dmc.entities.device import Device
-
-# Rate of rotation below which Coulomb friction is viscous, rad/s; a sticking device
-# creeps more slowly.
-STICKING = 0.02
-# Largest number of iterations that find the sticking nodes; two or three are usual.
-_ROUNDS = 5
+from cathsim_dmc.laws.torsion import Rods
 
 
-class Rods(NamedTuple):
-    """The rods of K devices.
-
-    Attributes:
-        stiffness: (K, M), torsional stiffness of the segments, N·m/rad.
-        times: (K,), relaxation times τ of the materials, s.
-    """
-
-    stiffness: np.ndarray
-    times: np.ndarray
-
-    @classmethod
-    def of(cls, devices: Sequence[Device], nodes: np.ndarray) -> "Rods":
-        """The rods of devices."""
-        tips = np.minimum(nodes, [[device.tip_length] for device in devices])
-        in_tips = -np.diff(tips)
-        in_shafts = -np.diff(nodes) - in_tips
-        # Twist per torque of a segment, ∫ds/GJ.
-        in_tips /= [[device.tip.torsional_stiffness] for device in devices]
-        in_shafts /= [[device.shaft.torsional_stiffness] for device in devices]
-        times = np.array([device.relaxation_time for device in devices])
-        return cls(1 / (in_tips + in_shafts), times)
-
-
-@compiled
-def _on_rod(joint, gap, nodes, first):
-    """Segment of a rod, from `first` on, with a joint; the fraction before it."""
-    place = max(nodes[joint + 1] - gap, 0.0)
-    while first < len(nodes) - 2 and nodes[first + 1] > place:
-        first += 1
-    return first, (nodes[first] - place) / (nodes[first] - nodes[first + 1])
-
-
-@compiled
-def at_joints(angles, gaps, nodes):
-    """Rotations (K, J) of the devices at the joints of the chain, rad.
-
-    The rotation is linear between two nodes; a joint beyond a device's end has that of
-    the end.
-    """
-    devices, joints = len(gaps), len(nodes) - 2
-    turns = np.empty((devices, joints))
-    for k in range(devices):
-        first = 0
-        for j in range(joints):
-            first, share = _on_rod(j, gaps[k], nodes, first)
-            near, far = angles[k, first], angles[k, first + 1]
-            turns[k, j] = near + share * (far - near)
-    return turns
-
-
-@compiled
-def at_nodes(loads, gaps, nodes):
-    """Loads (F, K, M) on the nodes but the bases, from F kinds (F, K, J) at the joints.
-
-    The nodes on both sides of a joint share its load.
-    """
-    kinds, devices, joints = loads.shape
-    shared = np.zeros((kinds, devices, joints + 1))
-    for k in range(devices):
-        first = 0
-        for j in range(joints):
-            first, share = _on_rod(j, gaps[k], nodes, first)
-            for kind in range(kinds):
-                load = loads[kind, k, j]
-                shared[kind, k, first] += share * load
-                if first > 0:
-                    shared[kind, k, first - 1] += (1 - share) * load
-    return shared
-
-
-@compiled
-def _balance(diagonal, beside, load, pivot, move):
-    """Solves a symmetric, diagonally dominant, tridiagonal system."""
-    last = len(load) - 1
-    for m in range(last + 1):
-        pivot[m], move[m] = diagonal[m], load[m]
-        if m > 0:
-            factor = beside[m - 1] / pivot[m - 1]
-            pivot[m] -= factor * beside[m - 1]
-            move[m] -= factor * move[m - 1]
-    move[last] /= pivot[last]
-    for m in range(last - 1, -1, -1):
-        move[m] = (move[m] - beside[m] * move[m + 1]) / pivot[m]
-
-
-@compiled
-def _balance_sticking(diagonal, beside, load, friction, least, move):
-    """Balance with Coulomb friction, linear up to `least`, by Newton's method."""
-    count = len(load)
-    way = np.zeros(count)
-    stiff, pull, pivot = np.empty(count), np.empty(count), np.empty(count)
-    for _ in range(_ROUNDS):
-        for m in range(count):
-            sticks = friction[m] / least if way[m] == 0.0 else 0.0
-            stiff[m] = diagonal[m] + sticks
-            pull[m] = load[m] - friction[m] * way[m]
-        _balance(stiff, beside, pull, pivot, move)
-        settled = True
-        for m in range(count):
-            found = np.sign(move[m]) if abs(move[m]) > least else 0.0
-            if found * way[m] < 0.0:
-                found = 0.0
-            if found != way[m]:
-                settled, way[m] = False, found
-        if settled:
-            return
-
-
-@compiled
-def turned(angles, base, rods, duration, loads):
-    """Rotations (K, M + 1) of the nodes in equilibrium after a rotation of the bases.
+def rods_of(devices: Sequence[Device], nodes: np.ndarray) -> Rods:
+    """The rods of devices.
 
     Args:
-        base: (K,), rotations of the bases, rad.
-        rods: `Rods`.
-        duration: of that rotation, s.
-        loads: (3, K, M) on the nodes but the bases: torque, N·m, minus its derivative
-            by the rotation, N·m/rad, and largest torque of Coulomb friction, N·m.
+        devices: K of them.
+        nodes: (M + 1,), distances from a device's end, m.
     """
-    devices, segments = rods.stiffness.shape
-    new, least = np.empty_like(angles), STICKING * duration
-    diagonal, beside = np.empty(segments), np.empty(segments)
-    load, move = np.empty(segments), np.empty(segments)
-    for k in range(devices):
-        lag = rods.times[k] / duration
-        for m in range(segments):
-            stiffness = rods.stiffness[k, m]
-            now = stiffness * (angles[k, m + 1] - angles[k, m])
-            coupling = (1 + lag) * stiffness
-            load[m] = loads[0, k, m] - now
-            # A negative rate has no equilibrium nearby; there the torque is explicit,
-            # and the damping of the rod bounds the speed.
-            diagonal[m] = coupling + max(loads[1, k, m], 0.0)
-            if m == 0:
-                load[0] += coupling * base[k]
-            else:
-                load[m - 1] += now
-                diagonal[m - 1] += coupling
-                beside[m - 1] = -coupling
-        _balance_sticking(diagonal, beside, load, loads[2, k], least, move)
-        new[k, 0] = angles[k, 0] + base[k]
-        for m in range(segments):
-            new[k, m + 1] = angles[k, m + 1] + move[m]
-    return new
+    tips = np.minimum(nodes, [[device.tip_length] for device in devices])
+    in_tips = -np.diff(tips)
+    in_shafts = -np.diff(nodes) - in_tips
+    # Twist per torque of a segment, ∫ds/GJ.
+    in_tips /= [[device.tip.torsional_stiffness] for device in devices]
+    in_shafts /= [[device.shaft.torsional_stiffness] for device in devices]
+    times = np.array([device.relaxation_time for device in devices])
+    return Rods(1 / (in_tips + in_shafts), times)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc.entities import stack_memory
 from cathsim_dmc.entities.chain import (
     MAX_PUSH_FORCE,
     MAX_PUSH_SPEED,
@@ -21,12 +22,11 @@ from cathsim_dmc.entities.chain import (
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import postures
 from cathsim_dmc.imaging.device import Shadow
-from cathsim_dmc.laws import hinges
+from cathsim_dmc.laws import hinges, sliding
 from cathsim_dmc.laws.hinges import Bends
 from cathsim_dmc.laws.parameters import Array
 from cathsim_dmc.laws.springs import Springs
-from cathsim_dmc.physics import sliding_loops
-from cathsim_dmc.physics.chain_fields import FIELDS, places_of
+from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.physics.effects import Effect, Episode, World
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
@@ -137,7 +137,7 @@ class SlidingDevices(SingleDevice):
     """Coaxial devices, each moved along and about its axis by its actions."""
 
     data_fields = ("cfrc_int", "act", "qfrc_applied")
-    model_fields = FIELDS
+    model_fields = chain_fields.FIELDS
     state = ("slipped", "told", "_friction", "_factors", "_ways", "_drag", "_axial")
     parameters = Positions
 
@@ -156,11 +156,13 @@ class SlidingDevices(SingleDevice):
         self._others = world.arrays.qfrc_applied[:, world.model.jnt_dofadr[base]]
         # Views: writing to them writes the state.
         self._insertion, self._angles = world.parameters
-        places = places_of(world.model, self._entity)
-        self._made = made(self._entity, places)
-        first = places[0][2]
+        self._places = chain_fields.places_of(world.model, self._entity)
+        self._devices = devices_at(self._entity)
+        first, tables = self._places.qpos, self._stack.tables
         self._hinges = self._qpos[:, first : first + 2 * len(self._stack.spans)]
-        self._fields: list[tuple[np.ndarray, ...]] = [()] * total
+        self._fields: list[Any] = [None] * total
+        self._memory = stack_memory.settling(tables)
+        self._chain = stack_memory.chain(tables)
         # Factors of all stiffnesses, and of all loss factors.
         self._friction, self._factors = np.zeros(total), np.ones((total, 2))
         # Fraction of the friction between devices that acts, positive when the inner
@@ -185,8 +187,13 @@ class SlidingDevices(SingleDevice):
             default if value is None else value
             for value, default in zip(drawn, usual, strict=True)
         )
-        self._fields[index] = tuple(self.world.field(index, name) for name in FIELDS)
-        sliding_loops.lay(self._made, gaps, self._angles[index], *self._chain(index))
+        self._fields[index] = chain_fields.fields_of(
+            lambda name: self.world.field(index, name)
+        )
+        state = self._state(index, gaps, np.zeros((len(gaps), len(self._stack.spans))))
+        friction = self._friction[index]
+        sliding.lay(self._devices, state, friction, self._memory, self._chain)
+        self._write(index)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Moves the devices and writes the properties of the chains.
@@ -209,7 +216,9 @@ class SlidingDevices(SingleDevice):
         self.slipped[:, 0::2] += np.abs(told - moved)
         # A device may be withdrawn until its end has left the patient.
         least = -self.world.start_depth
-        target, lead = sliding_loops.advance(before, moved, least, self._entity.stroke)
+        target, lead = np.empty(before.shape), np.empty(len(before))
+        limits = least, self._entity.stroke
+        sliding.advance(before, moved, limits, target, lead)
         slid = -np.diff(target - before, axis=1) / _PRESLIDING
         self._ways[:] = np.clip(self._ways + slid, -1.0, 1.0)
         self._insertion[:] = target
@@ -229,18 +238,31 @@ class SlidingDevices(SingleDevice):
         given = way * np.minimum(way * told, -excess * _GIVE)
         return np.where(excess < 0.0, told, given)
 
-    def _chain(self, index: int) -> tuple:
-        """Hinges, friction, factors and fields of the chain of one simulation."""
-        drawn = self._friction[index], self._factors[index]
-        return self._hinges[index], *drawn, self._fields[index]
+    def _state(self, index: int, gaps: np.ndarray, axial: np.ndarray) -> sliding.State:
+        """State of one simulation, with gaps (K,), m, and axial forces (K, J), N."""
+        return sliding.State(
+            gaps=gaps,
+            hinges=self._hinges[index],
+            angles=self._angles[index],
+            ways=self._ways[index],
+            drag=self._drag[index],
+            slipped=self.slipped[index, 1::2],
+            axial=axial,
+        )
+
+    def _write(self, index: int) -> None:
+        """Writes the chain that a law has left into the model of one simulation."""
+        factors, fields = self._factors[index].tolist(), self._fields[index]
+        chain_fields.write(fields, self._places, self._chain, factors[0], factors[1])
 
     def _settle(self, rate: np.ndarray, lead: np.ndarray, state: Readings) -> None:
         """Turns the devices, writes the chains, computes the forces of the drives."""
         nodes, turned = self._stack.nodes, MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
-        gaps = sliding_loops.gaps(np.ascontiguousarray(self._insertion))
-        # Nothing rubs in the sheath.
+        gaps = _gaps(np.ascontiguousarray(self._insertion))
+        # The sheath is frictionless.
         depth, outside = self.world.start_depth, state.external_force
-        force = sliding_loops.rubbing(outside, lead, depth, nodes)
+        force = np.empty(outside.shape[:2])
+        sliding.rubbing(outside, lead, depth, nodes, force)
         count = gaps.shape[1]
         load, axial = np.zeros(len(gaps)), np.zeros((*gaps.shape, len(nodes) - 2))
         if count > 1:
@@ -248,13 +270,20 @@ class SlidingDevices(SingleDevice):
             # state.
             beyond = -np.cumsum(outside[:, ::-1], axis=1)[:, ::-1]
             beyond = np.ascontiguousarray(beyond)
-            load = sliding_loops.leading_load(beyond, state.centreline, gaps, nodes)
+            sliding.leading_load(beyond, state.centreline, gaps, nodes, load)
         for i in range(len(gaps)):
-            sliding_loops.settle(
-                self._made, gaps[i], turned[i], force[i], load[i],
-                (self._angles[i], self._ways[i], self._drag[i], self.slipped[i, 1::2]),
-                axial[i], *self._chain(i),
-            )  # fmt: skip
+            stiffness, loss = self._factors[i].tolist()
+            loads = sliding.Loads(
+                turned=turned[i],
+                force=force[i],
+                axial=load[i],
+                friction=self._friction[i],
+                stiffness=stiffness,
+                loss=loss,
+            )
+            posture = self._state(i, gaps[i], axial[i])
+            sliding.settle(self._devices, loads, posture, self._memory, self._chain)
+            self._write(i)
         if count > 1:
             self._axial[:] = axial.sum(axis=-1)
             self._axial[:, :-1] += self._drag
@@ -268,7 +297,10 @@ class SlidingDevices(SingleDevice):
     def _pushed(self) -> np.ndarray:
         """Insertion (N, K): leading devices as measured, the others as commanded, m."""
         reached = self._qpos[:, self._index.insertion_qpos].copy()
-        return sliding_loops.held(np.ascontiguousarray(self._insertion), reached)
+        told = np.ascontiguousarray(self._insertion)
+        where = np.empty_like(told)
+        sliding.held(told, reached, where)
+        return where
 
     def follower_posture(self) -> np.ndarray:
         """Joints (N, len(JOINTS)) of the robot that holds the outer and inner device.
@@ -283,17 +315,17 @@ class SlidingDevices(SingleDevice):
     def read(self, readings: Readings) -> CoaxialReadings:
         """State of the devices at readings of the same control step."""
         insertion, nodes = self._pushed(), self._stack.nodes
-        gaps, push = sliding_loops.gaps(insertion), self._axial.copy()
+        gaps, push = _gaps(insertion), self._axial.copy()
         push[np.arange(len(gaps)), gaps.argmin(axis=1)] += readings.push_force
         line, load = readings.centreline, readings.push_force.copy()
         if gaps.shape[1] > 1:
             force = np.ascontiguousarray(self._internal_force)
-            load = sliding_loops.leading_load(force, line, gaps, nodes)
+            sliding.leading_load(force, line, gaps, nodes, load)
         return CoaxialReadings(
             insertion=insertion,
             rotation=self._angles[..., 0].copy(),
             tip_rotation=self._angles[..., -1].copy(),
-            points=sliding_loops.points(line, gaps[..., None] + DEVICE_PLACES, nodes),
+            points=_points(line, gaps[..., None] + DEVICE_PLACES, nodes),
             leading_load=load,
             lumen_friction=np.abs(self._drag).sum(axis=1),
             push=push,
@@ -301,7 +333,7 @@ class SlidingDevices(SingleDevice):
 
     def shadows(self, line: np.ndarray) -> list[Shadow]:
         """See `SingleDevice.shadows`."""
-        gaps = sliding_loops.gaps(self._pushed())
+        gaps = _gaps(self._pushed())
         points = device_points(line, gaps, self._stack.nodes)
         return [
             Shadow(points[:, k], *_X_RAYS(each))
@@ -320,15 +352,33 @@ def device_points(line: np.ndarray, gaps: np.ndarray, nodes: np.ndarray) -> np.n
     places = np.maximum(nodes[np.maximum(own, 0)], gaps[..., None])
     behind = np.full((*places.shape[:2], 1), nodes[0] + BEHIND)
     places = np.concatenate([behind, places], axis=-1)
-    return sliding_loops.points(line, places, nodes)
+    return _points(line, places, nodes)
 
 
-def made(entity: DeviceStack, places: tuple) -> tuple:
-    """What `sliding_loops.settle` takes: of devices, of their drives (SI), places."""
+def _points(line: np.ndarray, places: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    found = np.empty((*places.shape, 3))
+    sliding.points(line, places, nodes, found)
+    return found
+
+
+def _gaps(insertion: np.ndarray) -> np.ndarray:
+    ways = np.empty_like(insertion)
+    sliding.gaps(insertion, ways)
+    return ways
+
+
+def devices_at(entity: DeviceStack) -> sliding.Devices:
+    """What the law of a control step takes of devices and of their drives."""
     stack = entity.stack
-    devices = stack.tables, entity.rods, stack.arms, stack.of_links
-    drives = entity.lumen_friction, CONTROL_TIMESTEP, MAX_TORQUE
-    return devices, drives, places
+    return sliding.Devices(
+        tables=stack.tables,
+        rods=entity.rods,
+        arms=stack.arms,
+        sections=stack.sections,
+        lumen_friction=entity.lumen_friction,
+        duration=CONTROL_TIMESTEP,
+        torque=MAX_TORQUE,
+    )
 
 
 def devices_of(chain: Chain) -> SingleDevice:

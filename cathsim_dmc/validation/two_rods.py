@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from cathsim_dmc.entities import posture
+from cathsim_dmc.entities import posture, stack_memory
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
-from cathsim_dmc.physics import chain_fields, sliding, sliding_loops
+from cathsim_dmc.laws import sliding as laws
+from cathsim_dmc.physics import chain_fields, sliding
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check
@@ -139,9 +140,8 @@ def simulate(
     entity: Any = rig.catheter
     stack = entity.stack
     places = chain_fields.places_of(rig.model, entity)
-    first = places[0][2]
-    hinges = rig.data.qpos[first : first + 2 * len(stack.spans)]
-    fields = tuple(getattr(rig.model, name) for name in chain_fields.FIELDS)
+    hinges = rig.data.qpos[places.qpos : places.qpos + 2 * len(stack.spans)]
+    fields = chain_fields.fields_of(lambda name: getattr(rig.model, name))
     if beyond is not None:
         # Straight, half a circle, and straight.
         start = stack.nodes[0] - beyond - np.pi * BEND_RADIUS
@@ -154,16 +154,19 @@ def simulate(
         rig.model.dof_armature[start : start + held] = _HELD
     gap = np.asarray(gaps, float)
     angles = np.tile(np.asarray(rotation, float)[:, None], len(stack.nodes))
-    made = sliding.made(entity, places)
-    still, force = np.zeros(len(gap)), np.zeros(len(rig.lengths))
-    axial = np.zeros((len(gap), len(stack.spans)))
-    state = angles, np.zeros(len(gap) - 1), np.zeros(len(gap) - 1), np.zeros(len(gap))
-    given = made, gap, still, force, 0.0, state, axial, hinges, 0.0, np.ones(2), fields
+    devices, still = sliding.devices_at(entity), np.zeros(len(gap))
+    axial, count = np.zeros((len(gap), len(stack.spans))), len(gap) - 1
+    lumen = np.zeros((2, count))
+    state = laws.State(gap, hinges, angles, lumen[0], lumen[1], 0.0 * still, axial)
+    loads = laws.Loads(still, np.zeros(len(rig.lengths)), 0.0, 0.0, 1.0, 1.0)
+    memory = stack_memory.settling(stack.tables)
+    chain = stack_memory.chain(stack.tables)
     for _ in range(round(duration / CONTROL_TIMESTEP)):
-        sliding_loops.settle(*given)
+        laws.settle(devices, loads, state, memory, chain)
+        chain_fields.write(fields, places, chain, 1.0, 1.0)
         rig.run(CONTROL_TIMESTEP)
     mujoco.mj_kinematics(rig.model, rig.data)
-    sliding_loops.settle(*given)
+    laws.settle(devices, loads, state, memory, chain)
     end = rig.head_position - rig.joints[0]
     return Rods(angles[:, -1], end, force=axial.sum(axis=-1))
 

@@ -1,21 +1,95 @@
-"""Coaxial devices: what they do to each other and to the chain, compiled.
+"""Coaxial devices: forces on each other, and the chain that represents them.
 
-Functions of one simulation; K devices, J joints, L = J + 1 links. `gaps` (K,), distance
-from the end of each device to the end of the chain, m; `turns` (K, J), rotation of each
-device at each joint, rad; `bends` (J,) complex, bending angles of the joints, rad;
-`tables` of a `coaxial.Stack`. Arrays are C-contiguous.
+docs/pair_model.md derives the equations. Functions of one simulation; K devices, J
+joints, L = J + 1 links, P pairs of devices. `gaps` (K,), distance from the end of each
+device to the end of the chain, m; `turns` (K, J), rotation of each device at each
+joint, rad; `bends` (J,) complex, bending angles of the joints, rad.
 """
 
 import math
-from typing import NamedTuple
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.laws.hinges import unit
 
 # A distance beyond the end of any device, m.
 _FAR = 1e3
+
+
+class Tables(NamedTuple):
+    """Sections of the devices along the chain.
+
+    Attributes:
+        nodes: (L + 1,), distances of the ends of the links from the end of the chain,
+            from proximal to distal, m.
+        lengths: (L,), of the links, m.
+        edges: (K, E), start of the uniform pieces of the devices, m from their ends,
+            padded with infinity.
+        bending: (K, E + 1), EI beyond the device and of the pieces, N·m².
+        moment: (K, E + 1), EI κ there, N·m.
+    """
+
+    nodes: Any
+    lengths: Any
+    edges: Any
+    bending: Any
+    moment: Any
+
+
+class Sections(NamedTuple):
+    """Outer sections of the devices.
+
+    Attributes:
+        radii: (K,), outer radii, m.
+        ratios: (K,), friction ratios.
+        densities: (4, K), mass, weight in blood, blood carried by a device that is the
+            outermost and by one that is present, kg/m.
+    """
+
+    radii: Any
+    ratios: Any
+    densities: Any
+
+
+class Posture(NamedTuple):
+    """How devices lie: `gaps`, `bends` and `turns`."""
+
+    gaps: Any
+    bends: Any
+    turns: Any
+
+
+class Lumen(NamedTuple):
+    """What acts on devices in each other.
+
+    Attributes:
+        start: (K,), compression where each device leaves the others, N.
+        ways: (K - 1,) in [-1, 1], fraction of the friction that acts on device k,
+            positive when it slides forward in the next one.
+        coefficient: Coulomb coefficient between the devices.
+        factor: Of all stiffnesses.
+    """
+
+    start: Any
+    ways: Any
+    coefficient: Any
+    factor: Any
+
+
+class Scratch(NamedTuple):
+    """Memory of the laws.
+
+    Attributes:
+        places: (K E + 1,), m.
+        devices: (2, K).
+        pulls: (K,) complex.
+        joints: (2, J) complex.
+    """
+
+    places: Any
+    devices: Any
+    pulls: Any
+    joints: Any
 
 
 class Overlap(NamedTuple):
@@ -33,13 +107,13 @@ class Overlap(NamedTuple):
         present: (K, L), fraction of each link on which a device is present.
     """
 
-    compliance: np.ndarray
-    rest: np.ndarray
-    coupling: np.ndarray
-    stiffness: np.ndarray
-    moment: np.ndarray
-    outermost: np.ndarray
-    present: np.ndarray
+    compliance: Any
+    rest: Any
+    coupling: Any
+    stiffness: Any
+    moment: Any
+    outermost: Any
+    present: Any
 
 
 class Links(NamedTuple):
@@ -55,11 +129,11 @@ class Links(NamedTuple):
             axis, kg·m².
     """
 
-    radius: np.ndarray
-    friction: np.ndarray
-    mass: np.ndarray
-    buoyancy: np.ndarray
-    inertia: np.ndarray
+    radius: Any
+    friction: Any
+    mass: Any
+    buoyancy: Any
+    inertia: Any
 
 
 @compiled
@@ -73,14 +147,13 @@ def _weight(place, joint, nodes, lengths):
 
 
 @compiled
-def _breaks(gaps, edges):
-    places = np.empty(edges.size + 1)
+def _breaks(gaps, edges, places):
+    """Writes the places, m from the end, where a piece begins, in order."""
     for k in range(edges.shape[0]):
         for e in range(edges.shape[1]):
             places[k * edges.shape[1] + e] = min(gaps[k] + edges[k, e], _FAR)
     places[-1] = _FAR
     places.sort()
-    return places
 
 
 @compiled
@@ -92,16 +165,18 @@ def _piece(place, edges):
 
 
 @compiled
-def overlap(gaps, tables):
-    """The `Overlap` of devices."""
-    nodes, lengths, edges, bending, moment = tables
-    devices, joints = len(gaps), len(lengths) - 1
-    pairs = devices * (devices - 1) // 2
-    compliance, coupling = np.zeros(joints), np.zeros((pairs, joints))
-    parts = np.zeros((3, devices, joints))
-    rest, stiffness, mean = parts[0], parts[1], parts[2]
-    own_bending, own_moment = np.empty(devices), np.empty(devices)
-    breaks = _breaks(gaps, edges)
+def overlap(gaps, tables, scratch, out):
+    """Writes the `Overlap` of devices; `scratch` is `Scratch`."""
+    nodes, lengths, edges = tables.nodes, tables.lengths, tables.edges
+    devices, joints, breaks = len(gaps), len(lengths) - 1, scratch.places
+    own_bending, own_moment = scratch.devices[0], scratch.devices[1]
+    for j in range(joints):
+        out.compliance[j] = 0.0
+        for pair in range(len(out.coupling)):
+            out.coupling[pair, j] = 0.0
+        for k in range(devices):
+            out.rest[k, j] = out.stiffness[k, j] = out.moment[k, j] = 0.0
+    _breaks(gaps, edges, breaks)
     for c in range(len(breaks) - 1):
         low, high = breaks[c], breaks[c + 1]
         if high <= low or low >= nodes[0]:
@@ -109,76 +184,74 @@ def overlap(gaps, tables):
         total = 0.0
         for k in range(devices):
             piece = _piece((low + high) / 2 - gaps[k], edges[k])
-            own_bending[k], own_moment[k] = bending[k, piece], moment[k, piece]
+            own_bending[k] = tables.bending[k, piece]
+            own_moment[k] = tables.moment[k, piece]
             total += own_bending[k]
         for j in range(joints):
             if high <= nodes[j + 2] or low >= nodes[j]:
                 continue
             weight = _weight(high, j, nodes, lengths)
             weight -= _weight(low, j, nodes, lengths)
-            compliance[j] += weight / total
+            out.compliance[j] += weight / total
             pair = 0
             for k in range(devices):
                 share = own_moment[k] / total
-                rest[k, j] += share * weight
-                stiffness[k, j] += own_bending[k] * weight
-                mean[k, j] += own_moment[k] * weight
+                out.rest[k, j] += share * weight
+                out.stiffness[k, j] += own_bending[k] * weight
+                out.moment[k, j] += own_moment[k] * weight
                 for other in range(k + 1, devices):
-                    coupling[pair, j] += share * own_moment[other] * weight
+                    out.coupling[pair, j] += share * own_moment[other] * weight
                     pair += 1
     for j in range(joints):
         span = (lengths[j] + lengths[j + 1]) / 2
         for k in range(devices):
-            stiffness[k, j] /= span
-            mean[k, j] /= span
-    reach = np.empty((2, devices, len(lengths)))
-    outermost, present = reach[0], reach[1]
+            out.stiffness[k, j] /= span
+            out.moment[k, j] /= span
     for link in range(len(lengths)):
         # A device farther out covers a place that it reaches.
         covered = 0.0
         for k in range(devices - 1, -1, -1):
             reached = (nodes[link] - gaps[k]) / lengths[link]
             reached = min(max(reached, 0.0), 1.0)
-            present[k, link] = reached
-            outermost[k, link] = max(reached - covered, 0.0)
+            out.present[k, link] = reached
+            out.outermost[k, link] = max(reached - covered, 0.0)
             covered = max(covered, reached)
-    return Overlap(compliance, rest, coupling, stiffness, mean, outermost, present)
 
 
 @compiled
-def rest_angles(rest, turns):
-    """Rest angles (J,) of the joints, complex, rad; `rest` of an `Overlap`."""
-    angles = np.empty(turns.shape[1], np.complex128)
-    for j in range(len(angles)):
+def rest_angles(rest, turns, out):
+    """Writes the rest angles (J,) complex of the joints, rad; `rest` of `Overlap`."""
+    for j in range(len(out)):
         whole = rest[0, j] * unit(turns[0, j])
         for k in range(1, len(turns)):
             whole += rest[k, j] * unit(turns[k, j])
-        angles[j] = whole
-    return angles
+        out[j] = whole
 
 
 @compiled
-def restoring(overlap, bends, turns):
+def restoring(overlap, posture, scratch, torque, rate):
     """Restoring torques of the shapes of the devices, and their stiffness.
 
     The energy of a joint bent by θ is |θ - Σ R_k e_k|²/2C, e_k = exp(iφ_k), and that of
     two devices against each other -S cos(φ_k - φ_l).
 
-    Returns:
-        (2, K, J): torque on each device about its axis, N·m, and minus its derivative
-        by the rotation, N·m/rad.
+    Args:
+        overlap: `Overlap`.
+        posture: `Posture`.
+        scratch: `Scratch`.
+        torque: (K, J), gets the torque on each device about its axis, N·m.
+        rate: (K, J), gets minus its derivative by the rotation, N·m/rad.
     """
     compliance, rest, coupling = overlap.compliance, overlap.rest, overlap.coupling
+    bends, turns, pulls = posture.bends, posture.turns, scratch.pulls
     devices, joints = turns.shape
-    loads, pulls = np.empty((2, devices, joints)), np.empty(devices, np.complex128)
-    torque, rate = loads[0], loads[1]
     for j in range(joints):
         whole = 0j
         for k in range(devices):
             pulls[k] = rest[k, j] * unit(turns[k, j])
             whole += pulls[k]
         for k in range(devices):
-            force = np.conj(bends[j] - (whole - pulls[k])) * pulls[k]
+            force = (bends[j] - (whole - pulls[k])).conjugate() * pulls[k]
             torque[k, j] = -force.imag / compliance[j]
             rate[k, j] = force.real / compliance[j]
         pair = 0
@@ -190,45 +263,60 @@ def restoring(overlap, bends, turns):
                 rate[k, j] += energy * math.cos(angle)
                 rate[other, j] += energy * math.cos(angle)
                 pair += 1
-    return loads
 
 
 @compiled
-def _pull(place, load, turns, gaps, edges, bending, moment, piece, device):
-    """Force (N) at a place that bears a bending moment: |EI κ|²/2EI - Σ EI_k κ_k²/2."""
+def _pull(place, load, posture, tables, joint, device, piece):
+    """Force (N) at a place that bears a bending moment: |EI κ|²/2EI - Σ EI_k κ_k²/2.
+
+    The piece of one device is given, those of the others are looked up.
+    """
     total, whole, own = 0.0, load, 0.0
-    for k in range(len(gaps)):
-        here = piece if k == device else _piece(place - gaps[k], edges[k])
-        if bending[k, here] > 0.0:
-            total += bending[k, here]
-            whole += moment[k, here] * unit(turns[k])
-            own += moment[k, here] ** 2 / bending[k, here]
+    for k in range(len(posture.gaps)):
+        here = piece
+        if k != device:
+            here = _piece(place - posture.gaps[k], tables.edges[k])
+        bending, moment = tables.bending[k, here], tables.moment[k, here]
+        if bending > 0.0:
+            total += bending
+            whole += moment * unit(posture.turns[k, joint])
+            own += moment**2 / bending
     return (abs(whole) ** 2 / total - own) / 2
 
 
 @compiled
-def axial(tables, overlap, gaps, bends, turns, slopes):
-    """Axial forces (K, J), N, of the joints, positive where a device must be pushed.
+def axial(tables, overlap, posture, slopes, scratch, force):
+    """Writes the axial forces of the joints, positive where a device must be pushed.
 
     Minus the derivative of the energy by the gap of a device, at given bends and
     rotations of its rod; that of the leading device is minus the others' sum.
 
     Args:
+        tables: `Tables`.
+        overlap: `Overlap`.
+        posture: `Posture`.
         slopes: (K, J), N, torque of `restoring` times the derivative of `turns` by gap.
+        scratch: `Scratch`.
+        force: (K, J), N.
     """
-    nodes, lengths, edges, bending, moment = tables
+    nodes, lengths, edges = tables.nodes, tables.lengths, tables.edges
+    gaps, turns, loads = posture.gaps, posture.turns, scratch.joints[0]
     devices, joints = turns.shape
-    force, loads = np.zeros(turns.shape), np.empty(joints, np.complex128)
-    leader = gaps.argmin()
+    leader = 0
+    for k in range(1, devices):
+        if gaps[k] < gaps[leader]:
+            leader = k
     for j in range(joints):
-        whole = bends[j]
+        whole = posture.bends[j]
         for k in range(devices):
             whole -= overlap.rest[k, j] * unit(turns[k, j])
+            force[k, j] = 0.0
         loads[j] = whole / overlap.compliance[j]
     for k in range(devices):
         if k == leader:
             continue
-        force[k] += slopes[k]
+        for j in range(joints):
+            force[k, j] += slopes[k, j]
         link = joints
         for piece in range(edges.shape[1]):
             place = gaps[k] + edges[k, piece]
@@ -240,74 +328,71 @@ def axial(tables, overlap, gaps, bends, turns, slopes):
             # The joints at both ends of the link share what it bends.
             for j, weight in ((link - 1, share), (link, 1 - share)):
                 if 0 <= j < joints:
-                    here = (place, loads[j], turns[:, j], gaps, edges)
-                    jump = _pull(*here, bending, moment, piece, k)
-                    jump -= _pull(*here, bending, moment, piece + 1, k)
+                    jump = _pull(place, loads[j], posture, tables, j, k, piece)
+                    jump -= _pull(place, loads[j], posture, tables, j, k, piece + 1)
                     force[k, j] += weight * jump
-        force[leader] -= force[k]
-    return force
+        for j in range(joints):
+            force[leader, j] -= force[k, j]
 
 
 @compiled
-def pressure(lengths, overlap, bends, turns, axial, start, ways, coefficient, factor):
+def pressure(tables, overlap, posture, axial, lumen, scratch, force, drag):
     """Lateral forces of each device on the lumen of the next one, and friction.
 
     With the moment M and the compression P, the force is M'' + Pκ per length.
 
     Args:
+        tables: `Tables`.
+        overlap: `Overlap`.
+        posture: `Posture`.
         axial: (K, J), see `axial`, N.
-        start: (K,), compression where each device leaves the others, N.
-        ways: (K - 1,) in [-1, 1], fraction of the friction that acts on device k,
-            positive when it slides forward in the next one.
-        coefficient: Coulomb coefficient between the devices.
-        factor: of all stiffnesses.
-
-    Returns:
-        (K - 1, J), force of device k on device k + 1 at the joints, N, and (K - 1,),
-        the axial force that their friction demands of device k, N.
+        lumen: `Lumen`.
+        scratch: `Scratch`.
+        force: (K - 1, J), gets the force of device k on device k + 1 at the joints, N.
+        drag: (K - 1,), gets the axial force that their friction demands of device k, N.
     """
-    stiffness, moment = factor * overlap.stiffness, factor * overlap.moment
+    lengths, bends, turns = tables.lengths, posture.bends, posture.turns
     devices, joints = turns.shape
-    force, drag = np.empty((devices - 1, joints)), np.zeros(devices - 1)
-    own = np.empty(joints, np.complex128)
-    shear = np.zeros(joints, np.complex128)
+    own, shear = scratch.joints[0], scratch.joints[1]
+    shear[joints - 1] = 0j
     for k in range(devices - 1):
+        drag[k] = 0.0
         for j in range(joints):
             span = (lengths[j] + lengths[j + 1]) / 2
-            own[j] = stiffness[k, j] * bends[j] / span
-            own[j] -= moment[k, j] * unit(turns[k, j])
+            stiffness = lumen.factor * overlap.stiffness[k, j]
+            own[j] = stiffness * bends[j] / span
+            own[j] -= lumen.factor * overlap.moment[k, j] * unit(turns[k, j])
         for j in range(joints - 1):
             shear[j] = (own[j + 1] - own[j]) / lengths[j + 1]
         # Compression of the device, from its end on.
-        pushed = start[k]
+        pushed = lumen.start[k]
         for j in range(joints - 1, -1, -1):
             span = (lengths[j] + lengths[j + 1]) / 2
             pushed += axial[k, j]
             here = pushed
-            if stiffness[k, j] > 0.0:
-                square = abs(stiffness[k, j] * bends[j] / span) ** 2
-                square -= moment[k, j] ** 2
-                here += square / (2 * stiffness[k, j])
+            stiffness = lumen.factor * overlap.stiffness[k, j]
+            if stiffness > 0.0:
+                square = abs(stiffness * bends[j] / span) ** 2
+                square -= (lumen.factor * overlap.moment[k, j]) ** 2
+                here += square / (2 * stiffness)
             lateral = shear[j] + here * bends[j]
             if j > 0:
                 lateral -= shear[j - 1]
             # Only where both devices are present: the mean of both links.
             present = overlap.present[k + 1]
             force[k, j] = abs(lateral) * ((present[j] + present[j + 1]) / 2)
-            rubbing = ways[k] * coefficient * force[k, j]
+            rubbing = lumen.ways[k] * lumen.coefficient * force[k, j]
             pushed += rubbing
             drag[k] += rubbing
-    return force, drag
 
 
 @compiled
-def wall_friction(arms, outermost, force, coefficient):
-    """Limits (K, J) of the friction torque of the wall on the devices, N·m.
+def wall_friction(arms, outermost, force, coefficient, torque):
+    """Writes limits (K, J) of the friction torque of the wall on the devices, N·m.
 
     The arms (K,) are radii by friction ratio, m, the forces (L,) those on the links, N.
     """
     devices, links = outermost.shape
-    torque = np.empty((devices, links - 1))
     for k in range(devices):
         for j in range(links - 1):
             # The last joint bears all of the last link.
@@ -315,7 +400,6 @@ def wall_friction(arms, outermost, force, coefficient):
             borne = 0.5 * outermost[k, j] * force[j]
             borne += last * outermost[k, j + 1] * force[j + 1]
             torque[k, j] = coefficient * arms[k] * borne
-    return torque
 
 
 @compiled
@@ -330,34 +414,34 @@ def _inertia(mass, radius, length):
 
 
 @compiled
-def links(overlap, lengths, friction, radii, ratios, densities):
-    """The `Links` of a chain.
+def links(overlap, lengths, friction, sections, out):
+    """Writes the `Links` of a chain.
 
     Args:
+        overlap: `Overlap`.
         lengths: (L,), m.
         friction: Coulomb coefficient of an uncoated device on the wall.
-        radii, ratios: (K,), outer radii, m, and friction ratios.
-        densities: (4, K), mass, weight in blood, blood carried by a device that is the
-            outermost and by one that is present, kg/m.
+        sections: `Sections`.
+        out: `Links`.
     """
-    devices, count = overlap.outermost.shape
-    made, moments = np.zeros((4, count)), np.empty((count, 2))
+    (devices, count), densities = overlap.outermost.shape, sections.densities
     carried = densities[2, devices - 1] + densities[3].sum()
     share = densities[1].sum() / (densities[0].sum() + carried)
     for link in range(count):
-        radius = mass = weight = 0.0
+        radius = mass = weight = coefficient = 0.0
         whole = True
         for k in range(devices):
             outside, there = overlap.outermost[k, link], overlap.present[k, link]
-            radius += outside * radii[k]
-            made[1, link] += outside * ratios[k] * friction
+            radius += outside * sections.radii[k]
+            coefficient += outside * sections.ratios[k] * friction
             carried = outside * densities[2, k] + there * densities[3, k]
             mass += (there * densities[0, k] + carried) * lengths[link]
             weight += there * densities[1, k] * lengths[link]
             whole = whole and there == 1.0
-        made[0, link], made[2, link] = radius, mass
+        out.radius[link], out.mass[link] = radius, mass
+        out.friction[link], out.buoyancy[link] = coefficient, 0.0
         # Exactly 0 where all devices are present: MuJoCo then skips the link.
         if share > 0.0 and not whole:
-            made[3, link] = 1.0 - weight / (mass * share)
-        moments[link] = _inertia(mass, radius, lengths[link])
-    return Links(made[0], made[1], made[2], made[3], moments)
+            out.buoyancy[link] = 1.0 - weight / (mass * share)
+        across, along = _inertia(mass, radius, lengths[link])
+        out.inertia[link, 0], out.inertia[link, 1] = across, along
