@@ -47,7 +47,7 @@ ALLOWED = {
     "imaging": {"anatomy", "laws"},
     "collision": {"anatomy", "laws"},
     "entities": {"anatomy", "collision", "imaging", "laws"},
-    "physics": {"anatomy", "collision", "imaging", "laws", "entities"},
+    "physics": {"anatomy", "collision", "laws", "entities"},
     "tasks": {"anatomy", "collision", "imaging", "laws", "entities", "physics"},
     "suite": _TASK,
     "simulation": _TASK | {"suite"},

@@ -3,8 +3,11 @@
 import dataclasses
 import math
 
+import numpy as np
+
 from cathsim_dmc import bounds
 from cathsim_dmc.imaging import materials
+from cathsim_dmc.imaging.device import Shadow
 
 _MOST_LINKS = 200
 # Frequency at which a damper has the loss factor of the material, Hz; that of the first
@@ -125,6 +128,16 @@ class Device:
         angle = f"steering_angle {of_device}"
         if bounds.number(angle, self.steering_angle, 0.0) >= math.pi / 2:
             bounds.refuse(angle, self.steering_angle, "in [0, π/2) rad for each joint")
+
+    def shadow(self, points: np.ndarray) -> Shadow:
+        """The device as X-rays meet it at points (..., n, 3), m, from base to tip."""
+        return Shadow(
+            points,
+            radius=self.outer_radius,
+            mu=self.attenuation,
+            marker_mu=self.marker_attenuation,
+            marker_length=self.marker_length,
+        )
 
     @property
     def steerable(self) -> bool:

@@ -18,7 +18,6 @@ from numpy.random import RandomState
 
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.entities.chain import Chain
-from cathsim_dmc.imaging.angiograph import Deviation
 from cathsim_dmc.laws import parameters as declared
 from cathsim_dmc.physics.readings import ModelIndex, Readings
 
@@ -33,7 +32,9 @@ class Episode:
         stiffness: factor.
         loss: factor.
         viscosity: factor.
-        deviation: of the angiography machine.
+        view: added to the angles of the C-arms, primary and secondary, whole degrees.
+        gain: factor of the gain of the angiography machine.
+        kerma: factor of its kerma.
         goal_shift: m along the branch.
         roll: rad.
         delay: control steps.
@@ -45,7 +46,9 @@ class Episode:
     stiffness: float | None = None
     loss: float | None = None
     viscosity: float | None = None
-    deviation: Deviation = Deviation()
+    view: tuple[int, int] = (0, 0)
+    gain: float = 1.0
+    kerma: float = 1.0
     goal_shift: float | None = None
     roll: float | None = None
     delay: int = 0

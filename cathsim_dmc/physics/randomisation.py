@@ -16,7 +16,6 @@ from numpy.random import RandomState
 
 from cathsim_dmc import bounds
 from cathsim_dmc.entities.chain import hinge_time
-from cathsim_dmc.imaging.angiograph import Deviation
 from cathsim_dmc.physics.effects import Effect, Episode, World
 from cathsim_dmc.physics.readings import Readings, ids
 
@@ -180,13 +179,10 @@ class Randomisation:
             low, high = map(int, self.delay)
             given["delay"] = int(random_state.randint(low, high + 1))
         given["insertion"] = value("start_insertion")
-        deviation = Deviation(
-            primary=round(primary or 0.0),
-            secondary=round(secondary or 0.0),
-            gain=1.0 if gain is None else gain,
-            kerma=1.0 if kerma is None else kerma,
-        )
-        return Episode(displacement, deviation=deviation, **given)
+        given["view"] = round(primary or 0.0), round(secondary or 0.0)
+        given["gain"] = 1.0 if gain is None else gain
+        given["kerma"] = 1.0 if kerma is None else kerma
+        return Episode(displacement, **given)
 
 
 # Friction and EI over what real devices and lubrication show (the friction that is

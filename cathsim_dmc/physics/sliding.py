@@ -5,7 +5,6 @@ Once in a control step, coaxial devices are moved along and about their axis;
 is turned lies in MuJoCo's `userdata`, which is part of the state that is saved.
 """
 
-import operator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,9 +18,9 @@ from cathsim_dmc.entities.chain import (
     MAX_TORQUE,
     Chain,
 )
+from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import postures
-from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.laws import hinges, sliding
 from cathsim_dmc.laws.hinges import Bends
 from cathsim_dmc.laws.parameters import Array
@@ -41,11 +40,6 @@ _PRESLIDING = 40e-6
 # Way of a slipping clamp in a control step by the force beyond its largest, m/N. The
 # axial force of a stiff wire in a tight bend changes by 0.8 N/mm at most.
 _GIVE = 1e-3
-
-# What a shadow takes of a device, beside its points.
-_X_RAYS = operator.attrgetter(
-    "outer_radius", "attenuation", "marker_attenuation", "marker_length"
-)
 
 
 class SingleDevice(Effect):
@@ -110,11 +104,13 @@ class SingleDevice(Effect):
             held[1::2] = qpos[:, index.rotation_qpos]
         return postures(held)
 
-    def shadows(self, line: np.ndarray) -> list[Shadow]:
-        """The devices as X-rays meet them, from the innermost outwards, on a line."""
+    def courses(self, line: np.ndarray) -> list[tuple[Device, np.ndarray]]:
+        """The devices and their points (N, n, 3) on a line (N, L + 1, 3), m.
+
+        From the innermost outwards, as far behind the base as X-rays meet them.
+        """
         first = line[:, :1] + self._behind * (line[:, :1] - line[:, 1:2])
-        points = np.concatenate([first, line], axis=1)
-        return [Shadow(points, *_X_RAYS(self._device))]
+        return [(self._device, np.concatenate([first, line], axis=1))]
 
     def read(self, readings: Readings) -> CoaxialReadings | None:
         """State of coaxial devices at some readings; None for one alone."""
@@ -331,14 +327,10 @@ class SlidingDevices(SingleDevice):
             push=push,
         )
 
-    def shadows(self, line: np.ndarray) -> list[Shadow]:
-        """See `SingleDevice.shadows`."""
-        gaps = _gaps(self._pushed())
-        points = device_points(line, gaps, self._stack.nodes)
-        return [
-            Shadow(points[:, k], *_X_RAYS(each))
-            for k, each in enumerate(self._entity.devices)
-        ]
+    def courses(self, line: np.ndarray) -> list[tuple[Device, np.ndarray]]:
+        """See `SingleDevice.courses`."""
+        points = device_points(line, _gaps(self._pushed()), self._stack.nodes)
+        return [(each, points[:, k]) for k, each in enumerate(self._entity.devices)]
 
 
 def device_points(line: np.ndarray, gaps: np.ndarray, nodes: np.ndarray) -> np.ndarray:

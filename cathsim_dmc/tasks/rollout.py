@@ -180,9 +180,11 @@ class Rollout:
         self._layout.begin(index)
         for effect in self.effects:
             effect.restart(index, episode, random_state)
-        self.deviations[index] = episode.deviation
+        primary, secondary = episode.view
+        deviation = Deviation(primary, secondary, episode.gain, episode.kerma)
+        self.deviations[index] = deviation
         if self._sensors.planes:
-            self._sensors.planes[index] = case.angiograph.planes(episode.deviation)
+            self._sensors.planes[index] = case.angiograph.planes(deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
 
     def _enter(self, index: int) -> None:
@@ -383,7 +385,8 @@ class Rollout:
     @property
     def shadows(self) -> Sequence[Shadow]:
         """The devices as X-rays meet them, with points (N, n, 3)."""
-        return self._devices.shadows(self.readings.centreline)
+        courses = self._devices.courses(self.readings.centreline)
+        return [device.shadow(points) for device, points in courses]
 
     @property
     def slipped(self) -> np.ndarray:
