@@ -5,6 +5,7 @@ first called, and numba is imported with it.
 """
 
 import functools
+import types
 from collections.abc import Callable
 from typing import Any
 
@@ -45,6 +46,31 @@ class _Compiled:
     def _numba_type_(self) -> Any:
         return self._inner._numba_type_  # noqa: SLF001
 
+    @functools.cached_property
+    def on_cuda(self) -> Any:
+        """What kernels of numba-cuda call; see `for_cuda`."""
+        from numba import cuda
+
+        function, own = self._function, dict(self._function.__globals__)
+        for name in _names(function.__code__):
+            if isinstance(own.get(name), _Compiled):
+                own[name] = own[name].on_cuda
+        held = (
+            types.CellType(cell.cell_contents.on_cuda)
+            if isinstance(cell.cell_contents, _Compiled)
+            else cell
+            for cell in function.__closure__ or ()
+        )
+        made = types.FunctionType(
+            function.__code__,
+            own,
+            function.__name__,
+            function.__defaults__,
+            tuple(held) or None,
+        )
+        made.__module__, made.__qualname__ = function.__module__, function.__qualname__
+        return cuda.jit(device=True)(made)
+
     @property
     def cache_path(self) -> str | None:
         """Folder in which what is compiled is kept; None where nothing is."""
@@ -76,3 +102,34 @@ def inlined(function: Callable) -> Callable:
     passing them takes longer than its work.
     """
     return _Compiled(function, _nrt=False, forceinline=True)
+
+
+def for_cuda(function: Any) -> Any:
+    """A compiled function, and all compiled functions that it calls, for a GPU.
+
+    Both have the same source: the names of compiled functions in it stand for their own
+    device functions. A function that is called by another module's name
+    (`module.function`) is not found.
+
+    Args:
+        function: What `compiled`, `law` or `inlined` has made.
+
+    Returns:
+        A device function of numba-cuda, for its kernels.
+
+    Raises:
+        ImportError: if numba-cuda is missing.
+    """
+    try:
+        return function.on_cuda
+    except ImportError as error:
+        raise ImportError(
+            "functions for a GPU need numba-cuda; install the extra gpu: "
+            "pip install '.[gpu]'"
+        ) from error
+
+
+def _names(code: types.CodeType) -> set[str]:
+    """Global names in the code of a function and of those within it."""
+    inner = (each for each in code.co_consts if isinstance(each, types.CodeType))
+    return set(code.co_names).union(*map(_names, inner))

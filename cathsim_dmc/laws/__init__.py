@@ -2,9 +2,11 @@
 
 One file is one law: a pure function of named parameters, time and arrays. A law
 allocates nothing (scratch is passed in), knows no engine and no global state, and works
-in float64 and SI units. `compiled.law` and `compiled.inlined` compile it. Parameters
-are NamedTuples, which numba passes at the price of plain arguments. None of their
-fields is called `index` or `count`: on CUDA the tuple's method hides such a field.
+in float64 and SI units. `compiled.law` and `compiled.inlined` compile it for the CPU,
+and `compiled.for_cuda` gives the same function, and all that it calls, to kernels of
+numba-cuda; laws therefore import functions by name, not modules. Parameters are
+NamedTuples, which numba passes at the price of plain arguments. None of their fields is
+called `index` or `count`: on CUDA the tuple's method hides such a field.
 
     vectors          products of vectors, frames
     field            signed depth in a lumen, on sparse bricks: `FieldArrays`
