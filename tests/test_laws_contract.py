@@ -36,7 +36,7 @@ MOST_PARAMETERS = 8
 # Laws of several devices in each other run on the host, once in a control step.
 ON_THE_HOST = ("sliding.",)
 # Starred arguments in calls of the package. Lower it with what goes.
-STARRED = 240
+STARRED = 230
 ALLOCATING = {"empty", "zeros", "ones", "full", "array", "copy", "concatenate"}
 PLAIN = {"__future__", "cathsim_dmc", "collections", "math", "numpy", "typing"}
 REAL, BITS = types.float64, types.int64
@@ -255,9 +255,7 @@ def test_every_law_compiles_for_a_gpu(cuda):
         options = {"device": True, "cc": (9, 0), "abi": "numba"}
         ptx, _ = cuda.compile_ptx(made, arguments, **options)
         assert ".visible .func" in ptx and ".f64" in ptx, root.__name__
-    left = [
-        name
-        for each, name in laws_of_the_package().items()
-        if "on_cuda" not in vars(each)
-    ]
+    names = laws_of_the_package().items()
+    left = [name for each, name in names if "on_cuda" not in vars(each)]
+    left = [name for name in left if not name.startswith(ON_THE_HOST)]
     assert not left, f"add signatures that call {left}"
