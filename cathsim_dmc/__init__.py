@@ -1,4 +1,33 @@
-"""Endovascular navigation tasks on dm_control composer and MuJoCo."""
+"""Endovascular navigation tasks on dm_control composer and MuJoCo.
+
+    env = cathsim_dmc.suite.load("cathsim", "type1_lcca", {"random": 0})
+    episode = cathsim_dmc.record(env, "expert", "episode.webp", seed=0)
+
+Functions that look at an environment or an episode (`help(cathsim_dmc.show)`):
+
+    record       plays an episode with a policy and keeps it; films and recordings
+    show         draws anatomy, device, goal and contact forces of a state
+    plot         draws forces, insertion and distance of an episode over time
+    forces       contacts and forces of a state, in newtons
+    fluoroscopy  X-ray image of a state
+
+Packages (`help(cathsim_dmc.suite)`), imported when they are first used:
+
+    suite        tasks by name: load, make_task, register
+    simulation   many simulations at once; TorchRL and Gymnasium environments
+    policies     scripted policies, and what a policy is
+    agents       learners, training, evaluation, policies that ship: load_policy
+    tasks        rewards, observations, options and randomisation of a task
+    entities     devices, sheath, phantom and follower robot
+    anatomy      vessels: phantoms, random arches, scans
+    imaging      fluoroscopy
+    recording    episodes and their files
+    pictures     figures, films and readouts of forces
+    analysis     force statistics, heatmaps, intervals
+    validation   physics against closed forms
+
+The command `cathsim --help` does most of this without Python.
+"""
 
 import importlib
 import warnings
@@ -26,7 +55,7 @@ _SUBMODULES = (
     "validation",
 )
 # What a notebook asks for first; see `cathsim_dmc.pictures`.
-_FUNCTIONS = ("fluoroscopy", "forces", "record", "show")
+_FUNCTIONS = ("fluoroscopy", "forces", "plot", "record", "show")
 
 
 def __getattr__(name: str):

@@ -1,6 +1,7 @@
 """Looking at a state or an episode in one call, on a machine without OpenGL."""
 
 import dataclasses
+import re
 import sys
 
 import numpy as np
@@ -11,10 +12,12 @@ from recording_samples import make_tube, same
 import cathsim_dmc
 from cathsim_dmc import suite
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
-from cathsim_dmc.pictures import recorded
+from cathsim_dmc.physics.forces import PEAK_NOTE
+from cathsim_dmc.pictures import curves, recorded
 from cathsim_dmc.pictures.animation import animate
 from cathsim_dmc.pictures.figure import Picture, draw_fluoroscopy, scene_figure
 from cathsim_dmc.pictures.moment import Moment, on_screen, xray
+from cathsim_dmc.pictures.readout import LEAST_FORCE
 from cathsim_dmc.pictures.recorded import write, xray_film
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
@@ -37,7 +40,8 @@ def pushed():
 def test_forces_are_those_of_the_task(pushed):
     env, episode = pushed
     readout = cathsim_dmc.forces(env)
-    last = episode.contact_step == episode.steps - 1
+    loaded = np.linalg.norm(episode.contact_force, axis=1) >= LEAST_FORCE
+    last = (episode.contact_step == episode.steps - 1) & loaded
     np.testing.assert_array_equal(readout.force, episode.contact_force[last])
     np.testing.assert_allclose(
         readout.magnitude, np.linalg.norm(readout.force, axis=1), rtol=1e-9
@@ -47,7 +51,84 @@ def test_forces_are_those_of_the_task(pushed):
     assert readout.push_force == episode.push_force[-1]
     text = repr(readout)
     assert f"{1e3 * readout.wall_max:.2f} mN" in text
-    assert len(text.splitlines()) == 3 + len(readout)
+    assert len(text.splitlines()) == 4 + len(readout)
+    assert PEAK_NOTE in text
+    assert len(readout.position) == len(readout.penetration) == len(readout)
+
+
+def test_contacts_that_bear_nothing_are_left_out(pushed, monkeypatch):
+    env, _ = pushed
+    task, number = env.task, len(cathsim_dmc.forces(env))
+    contacts = task.contacts(env.physics)
+    force, magnitude = contacts.force.copy(), contacts.magnitude.copy()
+    first = np.flatnonzero(contacts.present & (magnitude >= LEAST_FORCE))[0]
+    for value, kept in ((0.0, number - 1), (4e-6, number - 1), (6e-6, number)):
+        magnitude[first] = value
+        made = dataclasses.replace(contacts, force=force, magnitude=magnitude)
+        monkeypatch.setattr(type(task), "contacts", lambda self, physics, m=made: m)
+        readout = cathsim_dmc.forces(env)
+        assert len(readout) == kept and f"{kept} contact" in repr(readout)
+
+
+def test_an_episode_is_plotted_over_time(pushed):
+    _, episode = pushed
+    figure = cathsim_dmc.plot(episode)
+    top, middle, bottom = figure.axes
+    curves = {line.get_label(): line.get_xydata() for line in top.lines}
+    np.testing.assert_allclose(curves["wall, sum"][:, 1], 1e3 * episode.wall_force_sum)
+    np.testing.assert_allclose(curves["wall, sum"][:, 0], episode.time[1:])
+    peak = curves["wall, peak sum of a physics step*"][:, 1]
+    assert (peak >= curves["wall, sum"][:, 1]).all()
+    assert any(PEAK_NOTE in text.get_text() for text in top.texts)
+    np.testing.assert_allclose(middle.lines[0].get_ydata(), 1e3 * episode.insertion)
+    np.testing.assert_allclose(
+        bottom.lines[0].get_ydata(), 1e3 * np.array(episode.meta["distance"])
+    )
+    assert TASK in figure.get_suptitle() and "truncated" in figure.get_suptitle()
+    with pytest.raises(TypeError, match="Episode.load.*str"):
+        cathsim_dmc.plot("episode.npz")
+
+
+def test_phases_are_what_the_base_does(pushed):
+    _, episode = pushed
+    way = np.cumsum([0.0, *[1e-3] * 10, *[0.0] * 10, 1e-3, *[0.0] * 9, *[-1e-3] * 8])
+    states = len(way)
+    made = dataclasses.replace(
+        episode,
+        time=0.04 * np.arange(states),
+        insertion=way,
+        **{
+            name: np.zeros((states, *getattr(episode, name).shape[1:]))
+            for name in ("qpos", "catheter", "body_pos", "body_quat")
+        },
+        **{
+            name: np.zeros((states - 1, *getattr(episode, name).shape[1:]))
+            for name in ("action", "reward", "wall_force_sum", "wall_force_max")
+        },
+        push_force=np.zeros(states - 1),
+        contact_step=np.array([3, 4, 4, 9]),
+        contact_position=np.zeros((4, 3)),
+        contact_force=np.zeros((4, 3)),
+        meta={"success": False, "termination": "truncated"},
+    )
+    # A single step of motion is no phase.
+    assert curves.phases(made) == [
+        ("advance", 0, 10),
+        ("rest", 10, 30),
+        ("withdraw", 30, 38),
+    ]
+    top, _, bottom = cathsim_dmc.plot(made).axes
+    bars = [patch for patch in top.patches if patch.get_height() < 0.5]
+    spans = [(bar.get_x(), bar.get_x() + bar.get_width()) for bar in bars]
+    np.testing.assert_allclose(spans, [(0.12, 0.2), (0.36, 0.4)])
+    assert "no goal" in bottom.texts[0].get_text()
+
+
+def test_the_help_lists_what_there_is():
+    text = cathsim_dmc.__doc__ or ""
+    listed = set(re.findall(r"(?m)^    (\w+)  ", text))
+    assert listed == {*cathsim_dmc._SUBMODULES, *cathsim_dmc._FUNCTIONS}
+    assert listed <= set(dir(cathsim_dmc))
 
 
 def test_a_film_as_mp4_plays_the_episode(pushed, tmp_path):

@@ -36,8 +36,10 @@ class EpisodeForces:
             step.
         max: Of the largest single contact at the end of a control step; one place of
             the wall may be two contacts.
-        peak_sum: Of the largest sum in any physics step of a control step.
-        peak_max: Of the largest single contact in any physics step of a control step.
+        peak_sum: Of the largest sum in any physics step of a control step; it depends
+            on the physics step (`physics.forces.PEAK_NOTE`).
+        peak_max: Of the largest single contact in any physics step of a control step;
+            likewise.
     """
 
     sum: Statistics | None = None
@@ -62,7 +64,7 @@ class EpisodeForces:
 
     @property
     def peak_force(self) -> float | None:
-        """Largest single contact in any physics step, N."""
+        """Largest single contact in any physics step, N; see `PEAK_NOTE`."""
         return self.peak_max and self.peak_max.maximum
 
 

@@ -114,7 +114,7 @@ def heatmap(
         vmin=0.0, vmax=1e3 * np.nanmax(field.mean) if field.count.any() else 1.0,
     )  # fmt: skip
     bar = figure.colorbar(image, ax=axes, shrink=0.8)
-    bar.set_label("mean contact force, mN")
+    bar.set_label("mean contact force at the ends of control steps, mN")
     axes.set(xlim=x_mm[[0, -1]], ylim=z_mm[[0, -1]], aspect="equal")
     axes.set(xlabel="x, mm (patient left →)", ylabel="z, mm (head ↑)")
     axes.set_title(title, fontsize=11)

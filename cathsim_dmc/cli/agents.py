@@ -34,6 +34,7 @@ from cathsim_dmc.cli.options import (
     told_of_losses,
 )
 from cathsim_dmc.cli.task_options import TaskOptions, task_kind
+from cathsim_dmc.physics.forces import PEAK_NOTE
 from cathsim_dmc.pictures import recorded
 from cathsim_dmc.pictures.films import SUFFIXES, check_film
 from cathsim_dmc.policies import in_environment
@@ -58,7 +59,7 @@ _CAPTION = (
     "contact at the end of a control step, mean over the steps with contact. Max "
     "force: largest single contact at the end of any control step. Peak force: the "
     "same in any physics step. Safe success: the goal reached while the sum over all "
-    "contacts stays at or below a limit in every physics step."
+    f"contacts stays at or below a limit in every physics step. {PEAK_NOTE}"
 )
 _NEARLY_ONE = (
     " Success without interval: episodes differ only by 1 mm of the start, or recur; "
@@ -189,6 +190,7 @@ def print_episodes(result: EvaluationResult) -> None:
     table = Table(*rows[0], title=title)
     for row in rows:
         table.add_row(*row.values())
+    table.caption = f"Peak force and largest sum: of any physics step. {PEAK_NOTE}"
     # A pipe has no width that the columns would have to fit.
     Console(width=None if sys.stdout.isatty() else 160).print(table)
 

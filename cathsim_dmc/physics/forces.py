@@ -9,6 +9,12 @@ import numpy as np
 # The order is MuJoCo's own, whatever the order in the model file.
 CONTACT_SIZE = 1 + 3 + 1 + 3 + 3 + 3
 
+# Shown wherever a peak is.
+PEAK_NOTE = (
+    "Peaks depend on the physics step: at 4 ms they read 0.4 to 0.7 times those at "
+    "0.5 ms."
+)
+
 # A physics step was too long if one begins with a contact harder, N, or deeper, m, than
 # this, or a control step ends deeper: something crossed the lumen and hit the wall.
 HARDEST = 5.0
@@ -67,8 +73,9 @@ class WallForce(NamedTuple):
         sum: (...), sum of the magnitudes of all contacts, last substep.
         max: (...), largest single contact, last substep; one place of the wall may
             be two contacts.
-        peak_sum: (...), largest sum of any substep of the control step.
-        peak_max: (...), largest single contact of any substep.
+        peak_sum: (...), largest sum of any substep of the control step; it depends
+            on the physics step, see `PEAK_NOTE`.
+        peak_max: (...), largest single contact of any substep; likewise.
     """
 
     sum: np.ndarray

@@ -1,13 +1,13 @@
 """Looking at a state or an episode in one call, without OpenGL.
 
 Everything here takes the environment that `cathsim_dmc.suite.load` returns.
-`cathsim_dmc` itself offers `show`, `record`, `forces` and `fluoroscopy`, so that
-`import cathsim_dmc` is enough in a notebook.
+`cathsim_dmc` itself offers `show`, `record`, `plot`, `forces` and `fluoroscopy`, so
+that `import cathsim_dmc` is enough in a notebook.
 """
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,12 +18,16 @@ from cathsim_dmc.pictures.recorded import record, surface_of, write
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import navigation_of
 
+if TYPE_CHECKING:
+    from cathsim_dmc.pictures.figure import Picture
+
 __all__ = [
     "Episode",
     "ForceReadout",
     "Moment",
     "fluoroscopy",
     "forces",
+    "plot",
     "record",
     "show",
     "write",
@@ -58,6 +62,26 @@ def show(
         return scene_figure(Moment.of(env), **options)
     moment = Moment.of_episode(episode, surface_of(episode, env), step)
     return scene_figure(moment, **options)
+
+
+def plot(episode: Episode) -> "Picture":
+    """Draw forces, insertion and distance of an episode over time, with its phases.
+
+    Args:
+        episode: What `record` returns or `Episode.load` reads.
+
+    Returns:
+        The figure; a notebook draws it, `.savefig(path)` writes it. Forces are in mN:
+        sum and largest contact at the end of each control step, the peak of the sum
+        within it, and the push force at the base. Shades are the phases of the base:
+        it advances, rests or withdraws. A bar marks contact with the wall.
+
+    Raises:
+        TypeError: it is no episode.
+    """
+    from cathsim_dmc.pictures import curves
+
+    return curves.plot(episode)
 
 
 def fluoroscopy(env: Any, *, seed: int = 0, **options: Any) -> np.ndarray:

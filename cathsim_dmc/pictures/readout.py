@@ -5,7 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc.physics.forces import PEAK_NOTE
 from cathsim_dmc.recording.recorder import begun_task_of
+
+# Contacts below this, N, are left out: a table in mN would show them as 0.00. A link
+# within 0.1 mm of the wall has a contact that bears nothing.
+LEAST_FORCE = 5e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -13,10 +18,11 @@ class ForceReadout:
     """Contacts and forces at the end of a control step; newtons, world frame (LPS).
 
     Contacts, `wall_sum` and `wall_max` are those of the last physics step; the peaks
-    are the largest of any physics step of the control step.
+    are the largest of any physics step of the control step, and depend on its length.
 
     Attributes:
-        position: (K, 3) places of contact with the wall, m.
+        position: (K, 3) places of contact with the wall, m, where the force reaches
+            `LEAST_FORCE`.
         force: (K, 3) force of the device on the wall.
         magnitude: (K,) its norm, normal force and friction together.
         penetration: (K,) depth of the device in the wall, m.
@@ -52,14 +58,14 @@ class ForceReadout:
         cell = ", ".join(f"{1e3 * force:.1f}" for force in self.load_cell)
         lines = [
             f"{len(self)} contact{'s' * (len(self) != 1)} with the wall: sum {total}, "
-            f"largest {largest}, peak within the step {peak}",
+            f"largest {largest}, peak within the step {peak}*",
             f"push {push}, load cell ({cell}) mN",
         ]
         if len(self):
             lines.append("     position, mm          force on the wall, mN")
         row = "  {:6.1f} {:6.1f} {:6.1f}  {:8.2f} {:8.2f} {:8.2f}"
         lines += [row.format(*r) for r in 1e3 * np.hstack([self.position, self.force])]
-        return "\n".join(lines)
+        return "\n".join([*lines, f"* {PEAK_NOTE}"])
 
 
 def forces(env: Any) -> ForceReadout:
@@ -74,7 +80,7 @@ def forces(env: Any) -> ForceReadout:
     """
     task = begun_task_of(env)
     readings, contacts = task.readings, task.contacts(env.physics)
-    there = contacts.present
+    there = contacts.present & (contacts.magnitude >= LEAST_FORCE)
     return ForceReadout(
         contacts.position[there],
         contacts.force[there],

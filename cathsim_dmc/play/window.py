@@ -142,7 +142,7 @@ def lines_of(task: Any) -> list[tuple[str, str]]:
         "push force": state.push_force,
         "wall force, sum": wall.sum,
         "largest contact": wall.max,
-        "peak in the step": wall.peak_max,
+        f"peak of {1e3 * task.config.physics_timestep:g} ms steps": wall.peak_max,
     }
     # Plus zero: no minus before it.
     texts = {n: f"{round(float(f), 3) + 0.0:6.3f} N" for n, f in forces.items()}

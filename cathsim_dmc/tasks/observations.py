@@ -270,7 +270,7 @@ def goal(frame: Frame) -> Observation:
         4,
         "N",
         "on the wall: sum and largest contact at the end of the step, and their "
-        "peaks within it",
+        "peaks within it, which depend on the physics step",
         0,
     ),
     Entry(

@@ -133,7 +133,7 @@ export class Trace {
     pen.clearRect(0, 0, canvas.width, canvas.height);
     pen.font = "11px system-ui, sans-serif";
     pen.fillStyle = "#63717d";
-    pen.fillText("largest contact, mN", left, 12);
+    pen.fillText("peak contact*, mN", left, 12);
     pen.fillText(highest.toFixed(0), 4, top + 4);
     pen.fillText("0", 4, bottom);
     pen.fillText(`${(span * timestep).toFixed(0)} s`, canvas.width - 34, bottom + 13);

@@ -90,7 +90,7 @@ class Page {
       ["push force", mN(simulation.pushForce)],
       ["on the wall, sum", mN(simulation.wall.sum)],
       ["largest contact", mN(simulation.wall.max)],
-      ["largest in the step", mN(simulation.wall.peakMax)],
+      ["its peak in the step*", mN(simulation.wall.peakMax)],
       ["tip, about x / y", this.controls.bend.map((b) => b.toFixed(2)).join(" / ")],
       ["physics", this.milliseconds ? `${factor.toFixed(1)}× real time` : "–"],
     ];

@@ -146,6 +146,11 @@ def arranged(results, cells):
     return {task: agents_ for task, agents_ in table.items() if agents_}
 
 
+def in_grid(cells):
+    """Labels of the grid's agents with their tasks."""
+    return {(cell.label, cell.task) for cell in cells}
+
+
 def standing(results, broken, cells):
     """What is missing of the grid, and of the publication."""
     missing = [cell for cell in cells if cell.name not in results]
@@ -154,20 +159,20 @@ def standing(results, broken, cells):
         "",
         f"{len(cells) - len(missing)} of the {len(cells)} cells of the grid "
         f"(`benchmarks/grid.toml`) are finished.",
-        "",
     ]
     rows = {}
     for cell in missing:
         seeds = rows.setdefault(cell.label, {}).setdefault(cell.task, [])
         seeds.append(str(cell.seed))
+    lines += [""] * bool(rows)
     for label, tasks in rows.items():
         of = (f"{task} (seed {', '.join(seeds)})" for task, seeds in tasks.items())
         lines.append(f"- {label}: {'; '.join(of)}")
-    cells_of = {(cell.label, cell.task) for cell in cells}
+    planned = in_grid(cells)
     beyond = [
         f"- {name}: {', '.join(left)}"
         for name, tasks in published_agents().items()
-        if (left := [task for task in tasks if (name, task) not in cells_of])
+        if (left := [task for task in tasks if (name, task) not in planned])
     ]
     if beyond:
         lines += ["", "Published agents that the grid leaves out:", "", *beyond]
@@ -255,7 +260,7 @@ def line_of(line):
 def full_tables(table, cells):
     """One table with all columns for each task."""
     published, lines = published_agents(), []
-    planned = {(cell.label, cell.task) for cell in cells}
+    planned = in_grid(cells)
     for task in dict.fromkeys((*PUBLISHED_TASKS, *table)):
         lines += [f"## {task}", "", *HEADER]
         repeated = set()
