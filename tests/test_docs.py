@@ -8,12 +8,15 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 NOTEBOOKS = sorted((DOCS / "tutorials").glob("*.ipynb"))
+FORMULAS = sorted(page.name for page in DOCS.glob("*.md") if "$`" in page.read_text()
+                  or "```math" in page.read_text())  # fmt: skip
 _BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 # Pages whose Python blocks run one after the other in one interpreter.
 SNIPPETS = ["README.md", "docs/index.md", "docs/concepts.md", "docs/how-to.md"]
@@ -114,6 +117,23 @@ def test_pages_link_to_files_that_exist():
     assert not wrong
 
 
+@pytest.mark.parametrize("page", FORMULAS)
+def test_formulas_are_drawn_without_a_script(page, monkeypatch):
+    for module in ("latex2mathml", "mkdocs", "nbconvert"):
+        pytest.importorskip(module, reason="needs the extra docs")
+    monkeypatch.syspath_prepend(str(DOCS / "scripts"))
+    hooks = importlib.import_module("site_hooks")
+    text = (DOCS / page).read_text()
+    written = hooks._formulas(text)
+    drawn = re.findall(r"<math.*?</math>", written, re.DOTALL)
+    assert len(drawn) == text.count("```math") + text.count("$`")
+    for formula in drawn:
+        # What is not known to the converter stays as TeX.
+        assert "\\" not in formula, formula
+        ElementTree.fromstring(formula)
+    assert "```math" not in written and "$`" not in written
+
+
 @pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path):
     pytest.importorskip("mkdocs", reason="needs the extra docs")
@@ -129,6 +149,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     for page in ("index", "concepts", "examples", "reference/suite", "CONTRIBUTING"):
         assert (tmp_path / f"{page}.html").is_file()
     assert list((tmp_path / "tutorials").glob("4_forces*.png"))
+    assert "<math" in (tmp_path / "validation.html").read_text()
     text = re.sub("<[^>]*>", "", (tmp_path / "reference/suite.html").read_text())
     assert "load_anatomy" in text and "Raises" in text
 

@@ -41,9 +41,13 @@ def _metal(bending_stiffness: float) -> Section:
 
 
 # Sources of the devices below.
-_HARRISON = "EI: flexural modulus in three-point bending, Harrison 2011 (11-3592.1)"
+_HARRISON = (
+    "EI: flexural modulus in three-point bending, Harrison et al. 2011, J Endovasc "
+    "Ther 18:797-801, doi:10.1583/11-3592.1"
+)
 _STEERABLE_TUBE = (
-    "EI: 22.7 and 2.8 N·mm² of body and tip of a 1.33/0.8 mm steerable tube"
+    "EI: 22.7 and 2.8 N·mm² of body and tip of a 1.33/0.8 mm steerable tube "
+    "(unpublished figure)"
 )
 _FIVE_FRENCH = (
     "EI: shaft between that tube's body (22.7 N·mm²) and an Amplatz wire (291), tip "
@@ -198,7 +202,8 @@ def _hydrophilic_wire(
         marker_length=_COIL,
         source=f"EI: nitinol core (48 GPa) of {1e3 * shaft:.2g} mm, {1e3 * tip:.2g} mm "
         "in the distal 30 mm, diameters assumed, jacket left out; friction: a third of "
-        "a PTFE-coated wire, Schröder 1993 (BF02602986)",
+        "a PTFE-coated wire, Schröder 1993, Cardiovasc Intervent Radiol 16:93-97, "
+        "doi:10.1007/BF02602986",
     )
 
 

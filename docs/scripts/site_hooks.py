@@ -1,8 +1,8 @@
 """What the documentation site shows beside the pages under docs/.
 
 `CONTRIBUTING.md` and `CHANGELOG.md` of the repository become pages, the examples one
-page with their code, and notebooks pages with their outputs. Links that lead out of
-docs/ in the repository lead to those pages on the site.
+page with their code, notebooks pages with their outputs, formulas MathML. Links that
+lead out of docs/ in the repository lead to those pages on the site.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 
 import nbformat
+from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 from nbconvert import MarkdownExporter
 
@@ -24,6 +25,9 @@ _WIDE = 5
 _WHOLE = 26
 # A link out of docs/ and where it leads on the site.
 _LINK = re.compile(r"\]\((?:\.\./)*(docs/|examples/)?([\w./-]*)(#[\w-]*)?\)")
+# Formulas in TeX, as GitHub draws them: on their own lines, and in a sentence.
+_DISPLAYED = re.compile(r"(?ms)^```math\n(.*?)\n```$")
+_INLINE = re.compile(r"\$`([^`\n]+)`\$")
 # Blanks in a table that a line may not end at; code in a sentence.
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|°|[µmk]?[mNs]|M?B)(?![\w/·]))|(?<=[±≤≥]) | (?=±)")
 _CODE = re.compile(r"<pre.*?</pre>|<code>([^<]+)</code>", re.DOTALL)
@@ -90,8 +94,18 @@ def on_page_markdown(markdown, page, config, files):
             return f"]({up}{Path(target).name}{anchor})"
         return match.group(0).replace(".ipynb", ".md")
 
+    markdown = _formulas(markdown)
     markdown = re.sub(r"(?m)^\|.*$", lambda row: _row(row[0]), markdown)
     return _LINK.sub(lead, markdown)
+
+
+def _formulas(markdown: str) -> str:
+    """Formulas as MathML, which browsers draw without a script."""
+    shown = r'<div class="formula">{}</div>'
+    markdown = _DISPLAYED.sub(
+        lambda tex: shown.format(convert(tex[1], display="block")), markdown
+    )
+    return _INLINE.sub(lambda tex: convert(tex[1]), markdown)
 
 
 def _row(line: str) -> str:
