@@ -137,8 +137,8 @@ def _checks(pushed: dict[str, list[DeadEnd]]) -> Iterator[Check]:
         every = np.concatenate([run.contact_force for run in runs])
         single = np.linalg.norm(every, axis=-1)
         usual = 100 * float((single <= USUAL_FORCE).mean())
-        name = f"insertion into the BCA at {40 * speed:g} mm/s: contact forces up to "
-        name += f"{USUAL_FORCE:g} N"
+        name = f"insertion into the BCA at {40 * speed:g} mm/s: share of contact "
+        name += f"forces up to {USUAL_FORCE:g} N"
         largest = max(max(run.meta["wall_force_peak_max"]) for run in runs)
         note = f"{len(single)} samples of {len(runs)} insertions "
         note += f"({sum(run.success for run in runs)} arrive), mean "

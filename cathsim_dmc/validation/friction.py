@@ -204,7 +204,7 @@ def checks(pulled: list[Capstan]) -> Iterator[Check]:
             yield Check.at_most(name, 100 * max(ripples), RIPPLE_BOUND, "%")
         name = f"{what} under {CREEP_LOAD:g} N, pulled sideways at half the limit: "
         yield Check.at_most(f"{name}creep", 1e3 * creep(device), CREEP_BOUND, "mm/s")
-    name = f"drawn round an arch under {TENSION:g} N: ripple of the force"
+    name = f"device drawn round an arch under {TENSION:g} N: ripple of the force"
     yield Check.at_most(name, 100 * arch_ripple(), ARCH_RIPPLE, "%")
     pulled.extend(capstan(*case) for case in CAPSTANS)
     yield from (one.check() for one in pulled)

@@ -233,13 +233,13 @@ def checks(tube: Anatomy, phantom: Anatomy) -> Iterator[Check]:
         name = f"flow through a section in motion at {time:g} s"
         yield Check.deviation(name, section_flow(tube, time), 1.0, FLOW_BOUND)
     deviation, delays, expected = diameters(tube)
-    name = "lumen's diameter over the beat at three places"
+    name = "diameter of the lumen over the beat at three places, error"
     yield Check.at_most(name, 1e3 * deviation, WALL_BOUND, "mm")
     late = 1e3 * np.abs(delays - expected).max()
-    yield Check.at_most("delay of the pulse", late, DELAY_BOUND, "ms")
-    place, name = 1e3 * wall_place(phantom), f"wall of {phantom.name} with all motions"
-    yield Check.at_most(name, place, WALL_BOUND, "mm")
+    yield Check.at_most("delay of the pulse, error", late, DELAY_BOUND, "ms")
+    name = f"place of the wall of {phantom.name} with all motions, error"
+    yield Check.at_most(name, 1e3 * wall_place(phantom), WALL_BOUND, "mm")
     name = "slip of a link that the wall carries"
     yield Check.at_most(name, slip(tube), SLIP_BOUND, "%")
-    name = "sliding in a moving wall's frame, and at rest under its inertia"
+    name = "way slid on a moving wall, against a resting one under its inertia"
     yield Check.at_most(name, frame(tube), FRAME_BOUND, "%")

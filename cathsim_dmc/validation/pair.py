@@ -155,7 +155,7 @@ def smoothness() -> Check:
         np.linalg.norm(np.diff(ends, axis=0), axis=-1).max()
         for ends in (links.sum(axis=-1).T, curve)
     )
-    name = "free end while the wire slides at 10 mm/s: largest step over the curve's"
+    name = "free end while the wire slides at 10 mm/s: largest step over that of theory"
     note = f"{1e3 * chain:.2f} mm in 40 ms, the curve's {1e3 * curve:.2f} mm, over "
     note += f"{len(leads)} steps"
     return Check.at_most(name, chain / curve, STEP_BOUND, "", note)
@@ -185,7 +185,7 @@ def slide() -> Iterator[Check]:
         note += f"contact {peak:.3f} N, {warnings} warnings"
         largest = 1e3 * steps.max(initial=0.0)
         yield Check.at_most(name, largest, LARGEST_STEP, "mm", note)
-    yield Check.at_most("sliding, warnings", warnings, 0, "", "of MuJoCo")
+    yield Check.at_most("sliding, warnings of MuJoCo", warnings, 0, "", "of MuJoCo")
     environment.close()
 
 
@@ -240,7 +240,7 @@ def _shape_checks() -> Iterator[Check]:
     bent = [twists(lengths, start, plane) for start in starts for plane in TURNS[:7]]
     worst = np.degrees(np.abs(bent).max(axis=0))
     for what, value in zip(("motors", "shapes"), worst, strict=True):
-        name = f"twist of the last frame in half a circle of 40 mm, {what}"
+        name = f"twist of the last link in a half circle of 40 mm, bent by {what}"
         yield Check.at_most(name, value, TWIST_BOUND, "°")
 
 

@@ -88,7 +88,8 @@ def jam(pair: tuple[str, str]) -> tuple[float, float, float, float]:
 def checks(pair: tuple[str, str]) -> Iterator[Check]:
     """Presses a mass and jams a pair, guidewire and catheter by name."""
     depths, ripples = zip(*map(pressed, LOADS), strict=True)
-    name = f"pressed by {LOADS[0]:g} to {LOADS[-1]:g} N: ripple of the depth"
+    name = f"device pressed on a wall by {LOADS[0]:g} to {LOADS[-1]:g} N: "
+    name += "ripple of the depth"
     note = f"depth {1e3 * depths[0]:.2f} to {1e3 * depths[-1]:.2f} mm"
     yield Check.at_most(name, 1e3 * max(ripples), RIPPLE, "mm", note)
     push, deep, least, largest = jam(pair)

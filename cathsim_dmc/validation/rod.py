@@ -299,11 +299,16 @@ def _checks(data: dict[str, Any]) -> Iterator[Check]:
     data["lag"] = lag = twist_lag()
     name = "lag of the tip behind the turning base"
     yield Check.deviation(name, *lag.lags, TWIST_BOUND, "rad")
-    yield Check.deviation("rise time of that lag", *lag.rises, TWIST_BOUND, "s")
+    yield Check.deviation(
+        "rise time of the lag of the tip behind the turning base",
+        *lag.rises,
+        TWIST_BOUND,
+        "s",
+    )
     driven = Driven()
     driven.move(0.4, 0.0, 0.0)
     held = 1e3 * abs(driven.move(10.0, 0.0, JAM))
-    name = f"drive, command 0, {JAM:g} N for 10 s: way"
+    name = f"drive at rest under {JAM:g} N for 10 s: way of the base"
     yield Check.at_most(name, held, HOLD_BOUND, "mm")
     driven.move(0.4, 1.0, JAM)
     moved, name = driven.move(1.0, 1.0, JAM), f"drive, full speed against {JAM:g} N"

@@ -169,7 +169,7 @@ def stiffened(factor: float) -> float:
 
 def _checks() -> Iterator[Check]:
     for speed in CROSS_FLOWS:
-        name = f"cantilever of 0.2 m in a cross-flow of {speed:g} m/s"
+        name = f"deflection of a cantilever of 0.2 m in a cross-flow of {speed:g} m/s"
         bent, elastica = cantilever(speed)
         yield Check.deviation(name, 1e3 * bent, 1e3 * elastica, FLOW_BOUND, "mm")
     for force in FORCES:
@@ -179,16 +179,19 @@ def _checks() -> Iterator[Check]:
         lost, name = volume_defect(phantoms.load(name)), f"the junctions of {name}"
         yield Check.at_most(f"volume lost at {name}", lost, VOLUME_BOUND)
     deviation, flow = profile()
-    name = "profile in a tube, deviation over the mean"
+    name = "velocity across a tube, deviation from the profile over the mean"
     yield Check.at_most(name, deviation, PROFILE_BOUND)
-    yield Check.deviation("flow through the profile", flow, 1.0, 1e-6)
+    yield Check.deviation(
+        "flow through a section, integral of the profile", flow, 1.0, 1e-6
+    )
     # A capsule that lies along the tube touches with both ends.
     shapes = (("sphere", 1), ("capsule", 2))
     for (kind, ends), radius, modulus in itertools.product(shapes, RADII, MODULI):
         expected = ends * stiffness(radius, Material(modulus, 1.5e-3, 1.0))
         loads = expected * np.array([2e-4, 6e-4])
         slope = np.ptp(loads) / np.ptp(indentation(kind, radius, modulus, loads))
-        name = f"{kind} in a tube of {1e3 * radius:g} mm, {1e-6 * modulus:g} MPa"
+        name = f"{kind} on the wall of a tube of {1e3 * radius:g} mm, "
+        name += f"{1e-6 * modulus:g} MPa: stiffness"
         yield Check.deviation(name, slope, expected, SLOPE_BOUND, "N/m")
     name = "joint positions after a push, wall of 1,000 times the modulus to rigid wall"
     yield Check.at_most(name, stiffened(1000.0), 0.0, "rad")
