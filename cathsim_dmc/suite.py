@@ -143,9 +143,10 @@ def make_task(
         name: Name of a task in `SUITE`.
         random: Seed or source of randomness.
         **options: Fields of `NavigationConfig`, options of the task's objective (such
-            as `reward` and `goal_radius`); for `navigate`, `anatomy`, `goal` and
-            `access`; for random arches, `arches`, `pool` and `first`, see
-            `load_arches`.
+            as `reward` and `goal_radius`); for `navigate`, `anatomy`, `goal` (a name,
+            or (x, y, z) in the unit and frame of the file that the anatomy was
+            imported from) and `access`; for random arches, `arches`, `pool` and
+            `first`, see `load_arches`.
 
     Raises:
         ValueError: if the task or an option does not exist; lists those that do.

@@ -49,9 +49,9 @@ def y_anatomy(y_scan):
 
 def test_import_finds_the_tree(y_anatomy, y_scan):
     tree = y_anatomy.tree
-    assert list(tree.vessels) == ["aorta", "left", "right"]
+    assert list(tree.vessels) == ["trunk", "left", "right"]
     parents = {tree.vessel(name).parent for name in ("left", "right")}
-    assert "aorta" in parents
+    assert "trunk" in parents
     truth = y_scan[2]
     for name in ("left", "right"):
         line = tree.vessel(name).centreline

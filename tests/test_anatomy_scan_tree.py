@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -15,8 +16,9 @@ from cathsim_dmc.anatomy.arch.arch import ArchSeed
 from cathsim_dmc.anatomy.arch.tree import arch_tree as random_arch
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Goal, Surface
+from cathsim_dmc.anatomy.reach import unreachable
 from cathsim_dmc.anatomy.scan.aorta import unproven
-from cathsim_dmc.anatomy.scan.check import check_tree, unreachable
+from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.extract import free_ends
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.places import place_goals
@@ -61,6 +63,13 @@ def arch_scan(tmp_path_factory):
     folder = tmp_path_factory.mktemp("arch")
     tree = arch_tree()
     return write_obj(folder / "lumen.obj", *marched(tree, 2.2e-3)), tree
+
+
+class Tube(NamedTuple):
+    """A device as an import sees it."""
+
+    name: str
+    outer_radius: float
 
 
 def failed(anatomy):
@@ -259,16 +268,16 @@ def test_goals_beside_the_inlet_are_left_out_and_said(tmp_path):
     mesh = write_obj(tmp_path / "lumen.obj", *marched(VesselTree(vessels), 2e-3))
     notes = []
     anatomy = import_scan(mesh, notes=notes)
-    assert list(anatomy.tree.vessels) == ["aorta", "branch_1", "branch_2"]
-    assert list(anatomy.goals) == ["branch_1", "branch_1_distal"]
+    assert list(anatomy.tree.vessels) == ["trunk", "branch_1", "branch_2"]
+    assert list(anatomy.goals) == ["branch_1", "branch_1_distal", "trunk"]
     assert failed(anatomy) == {}
     (left_out,) = [note for note in notes if "left out" in note]
-    assert left_out.startswith("branch_2 leaves aorta 7 mm past the inlet")
+    assert re.match("branch_2 leaves trunk [78] mm past the inlet", left_out)
     assert "branch_2, branch_2_distal left out" in left_out and "--inlet" in left_out
     assert any("branch_1 (ends at" in note and "--rename" in note for note in notes)
     words = "no aortic arch recognised.*the widest way.*bends by [1-5]?[0-9] degrees"
     assert any(re.search(words, note) for note in notes)
-    assert any(re.search("inlet.*widest end, which may be.*heart", x) for x in notes)
+    assert any(re.search("inlet.*widest end.*--inlet", x) for x in notes)
     # Somebody who writes them by hand is told.
     by_hand = replace(anatomy, goals=place_goals(anatomy.tree))
     assert "branch_2_distal cannot be reached" in failed(by_hand)["start of the device"]
@@ -336,9 +345,15 @@ def test_a_lumen_thinner_than_the_device_is_refused(tmp_path):
     line = tube([(0, 0, 0), (0, 0, 14), (0, 0, 60)], [3, 0.6, 0.6])
     tree = VesselTree({"aorta": Vessel("aorta", line)})
     mesh = write_obj(tmp_path / "thin.obj", *marched(tree, 0.4e-3))
-    with pytest.raises(ValueError, match="5 Fr catheter") as error:
-        import_scan(mesh, units="mm")
+    with pytest.raises(ValueError, match="no branch .* thick .*--device") as error:
+        import_scan(mesh, units="mm", device=Tube("thick", 3.5e-3))
     assert "\n" not in str(error.value)
+    # Without a choice it is the tree of a device that passes.
+    notes = []
+    anatomy = import_scan(mesh, units="mm", notes=notes)
+    assert any("passes less than half of the vessels" in note for note in notes)
+    assert list(anatomy.goals) == ["trunk"]
+    assert anatomy.goals["trunk"].position[2] > 40e-3
 
 
 def test_a_named_carotid_keeps_what_it_shares_with_a_nameless_branch():

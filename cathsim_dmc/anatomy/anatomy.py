@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cathsim_dmc import bounds, files
 from cathsim_dmc.anatomy import builder, field_cache
@@ -18,10 +19,11 @@ from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.motion import Motion
-from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
+from cathsim_dmc.anatomy.parts import End, FileFrame, Goal, Inlet, Surface
 
 _FORMAT = {"format": "cathsim-anatomy", "version": 3, "units": "m", "frame": "LPS"}
 _FILE = "anatomy.npz"
+_LEAST_ROOM = 0.5e-3  # m, around a goal
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -36,6 +38,8 @@ class Anatomy:
         ends: flat ends of the lumen, open or capped.
         scan: closed surface of the true lumen; None if it is the union of the tree's
             tubes.
+        file: unit and frame of the file that it was imported from; None for metres in
+            LPS.
     """
 
     name: str
@@ -44,6 +48,7 @@ class Anatomy:
     goals: Mapping[str, Goal]
     ends: tuple[End, ...] = ()
     scan: Surface | None = None
+    file: FileFrame | None = None
 
     def __post_init__(self) -> None:
         for key, goal in self.goals.items():
@@ -119,6 +124,56 @@ class Anatomy:
         """Goal called `name`; ValueError lists those that there are."""
         return self.goals[bounds.choice("goal", name, self.goals)]
 
+    def goal_at(self, place: ArrayLike) -> Goal:
+        """A goal at a place (3,) of the lumen, in the unit and frame of the file.
+
+        Of an anatomy without a `file` the place is in metres, LPS. ValueError if it is
+        outside the lumen.
+        """
+        given = np.array(bounds.vector("goal", place, 3))
+        unit = "m" if self.file is None else self.file.unit
+        position = given if self.file is None else self.file.to_lps @ given
+        name = "(" + ", ".join(f"{x:g}" for x in given) + f") {unit}"
+        depth = float(self.lumen(position))
+        if not depth > 0.0:
+            low, high = self._box_of_file()
+            raise ValueError(
+                f"goal {name} lies {-depth * 1e3:.1f} mm outside the lumen of "
+                f"{self.name!r}, which reaches from {low} to {high} {unit}; give a "
+                f"place inside, or one of the goals {', '.join(self.goals)}"
+            )
+        depths = self.tree.depths(position)
+        own = []
+        for key, vessel in self.tree.vessels.items():
+            arc = vessel.centreline.locate(position)
+            if vessel.parent is None or arc >= vessel.ostium:
+                own.append((float(depths[key]), key, arc))
+        _, key, arc = max(own)
+        return Goal(name, key, position, arc)
+
+    def _box_of_file(self) -> list[str]:
+        """Two corners of the lumen in the unit and frame of the file, as text."""
+        points = self.surface.vertices
+        if self.file is not None:
+            points = np.linalg.solve(self.file.to_lps, points.T).T
+        corners = points.min(axis=0), points.max(axis=0)
+        return ["(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in corners]
+
+    def goal_room(self, goal: Goal) -> float:
+        """Radius (m) of a ball around a goal that ends before what lies on the way.
+
+        That is the ostium of its vessel, or the goal before it in the same vessel.
+        """
+        vessel = self.tree.vessel(goal.vessel)
+        before = [vessel.ostium] if vessel.parent is not None else []
+        before += [
+            other.arc_length
+            for other in self.goals.values()
+            if other.vessel == goal.vessel and other.arc_length < goal.arc_length
+        ]
+        room = goal.arc_length - max(before, default=-np.inf)
+        return max(room, _LEAST_ROOM)
+
     def route(self, goal: str | Goal, spare: float = 0.0) -> Centreline:
         """Polyline with radii from the inlet to a goal, or `spare` (m) past it."""
         target = goal if isinstance(goal, Goal) else self.goal(goal)
@@ -154,6 +209,8 @@ class Anatomy:
             "goals": [_plain(goal) for goal in self.goals.values()],
             "ends": [_plain(end) for end in self.ends],
         }
+        if self.file is not None:
+            header["file"] = _plain(self.file)
         text = np.array(json.dumps(header))
         with files.atomic_path(directory / _FILE) as path, open(path, "wb") as stream:
             np.savez_compressed(stream, allow_pickle=False, header=text, **arrays)
@@ -179,7 +236,7 @@ class Anatomy:
             raise ValueError(f"{path}: {error}") from error
 
 
-def _plain(part: Goal | Inlet | End) -> dict[str, Any]:
+def _plain(part: Goal | Inlet | End | FileFrame) -> dict[str, Any]:
     return {name: np.asarray(value).tolist() for name, value in vars(part).items()}
 
 
@@ -206,6 +263,7 @@ def _unpack(arrays: dict[str, np.ndarray]) -> Anatomy:
             goals={goal.name: goal for goal in goals},
             ends=tuple(End(**entry) for entry in _listed(header, "ends")),
             scan=surface if bounds.switch("scanned", header["scanned"]) else None,
+            file=FileFrame(**header["file"]) if "file" in header else None,
         )
     except KeyError as error:
         raise ValueError(f"it lacks the entry {error}") from error

@@ -18,9 +18,9 @@ from cathsim_dmc import bounds, extras, files
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.merging import merged
 from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS, Inlet
-from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS
 from cathsim_dmc.anatomy.scan.places import cut_open
 from cathsim_dmc.anatomy.scan.topology import adjacent, decimated
+from cathsim_dmc.anatomy.scan.ways import DEVICE_RADIUS
 from cathsim_dmc.anatomy.surface import sampled
 
 TRIANGLES = 3_000  # of the surface that carries prisms; others are decimated

@@ -85,6 +85,25 @@ class End(_Part):
     open: bool
 
 
+@dataclass(frozen=True, eq=False)
+class FileFrame:
+    """Unit and frame of the file that an anatomy comes from.
+
+    Attributes:
+        unit: name of the unit of its coordinates, such as "mm".
+        to_lps: (3, 3), takes its coordinates to metres, LPS.
+    """
+
+    unit: str
+    to_lps: Array
+
+    def __post_init__(self) -> None:
+        matrix = bounds.array("to_lps", self.to_lps, shape=(3, 3))
+        if not abs(np.linalg.det(matrix)) > 0.0:
+            bounds.refuse("to_lps", self.to_lps, "a matrix that can be inverted")
+        vars(self).update(unit=bounds.text("unit", self.unit), to_lps=_readonly(matrix))
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Surface:
     """Triangles of the lumen surface, normals outwards, closed.

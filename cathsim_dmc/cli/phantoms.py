@@ -1,5 +1,6 @@
 """`cathsim phantom import`, `build`, `generate`, `check` and `export`."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,14 +11,17 @@ from tyro.extras import SubcommandApp
 from cathsim_dmc import bounds, files, style, suite
 from cathsim_dmc.anatomy import export as exported
 from cathsim_dmc.anatomy import phantoms as shipped
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.places import describe
 from cathsim_dmc.anatomy.tree_file import read_tree
 from cathsim_dmc.cli.options import Json, print_json, say, show
+from cathsim_dmc.entities import devices
 from cathsim_dmc.pictures.figure import anatomy_figure
 
 phantoms = SubcommandApp()
+_FIRST = ("lcca", "bca")  # goals that are tried first
 _PICTURE = "check.png"  # three views of an anatomy, in its directory
 
 
@@ -25,7 +29,7 @@ _PICTURE = "check.png"  # three views of an anatomy, in its directory
 def import_phantom(
     mesh: Annotated[Path, conf.Positional],
     /,
-    out: Path,
+    out: Path | None = None,
     centreline: tuple[Path, ...] = (),
     name: str | None = None,
     units: Literal["mm", "cm", "m", "um"] | None = None,
@@ -35,15 +39,18 @@ def import_phantom(
     inlet: tuple[float, float, float] | None = None,
     heart: tuple[float, float, float] | None = None,
     rename: tuple[str, ...] = (),
+    device: str | None = None,
 ) -> int:
     """Turn the surface of a lumen into an anatomy.
 
+    It ends with the commands that come next.
+
     Args:
-        mesh: Surface of the lumen: OBJ, STL, PLY or VTP; ends open or capped. Or a
-            label map: NIfTI or NRRD, whose unit and frame are its own.
-        out: Directory of the anatomy.
-        centreline: 3D Slicer curves (.mrk.json) or CSV files, one per branch; without
-            any they are computed from the surface.
+        mesh: Surface of the lumen: OBJ, STL, PLY, VTP or VTK; ends open or capped. Or a
+            label map: NIfTI, NRRD or MHA, whose unit and frame are its own.
+        out: Directory of the anatomy; by default the file's name without its ending.
+        centreline: 3D Slicer curves (.mrk.json) or CSV files, one per branch, or VMTK's
+            centrelines (.vtp); without any they are computed from the surface.
         name: Name of the anatomy.
         units: Unit of a surface, and of CSV centrelines, inlet and heart; guessed if
             not given. That of a label map is mm.
@@ -54,8 +61,17 @@ def import_phantom(
         label: Values of a label map that are the lumen.
         inlet: Where the device enters: a free end, or a place to cut the lumen at.
         heart: Near the end of the aorta that is at the heart; found if not given.
-        rename: Names of computed branches, each as computed=wanted.
+        rename: Names of computed vessels, each as computed=wanted.
+        device: Device of the library (`cathsim list --devices`) that the vessels are to
+            let pass; by default a 5 Fr catheter, or the thinnest if that does not pass.
     """
+    bore = None if device is None else devices.get(device, "--device")
+    if out is None:
+        out = Path(mesh.name.split(".")[0])
+        if out.exists() and not (out / "anatomy.npz").is_file():
+            raise ValueError(
+                f"{out} exists and is no anatomy; give a directory (--out)"
+            )
     changes = [text.partition("=") for text in rename]
     for old, _, new in changes:
         if not (old and new):
@@ -67,13 +83,31 @@ def import_phantom(
     anatomy = import_scan(
         mesh, centreline, units=units, mesh_frame=frame, axes=axes, labels=label,
         name=name or out.name, inlet=inlet, heart=heart, progress=say, notes=notes,
-        rename={old: new for old, _, new in changes},
+        rename={old: new for old, _, new in changes}, device=bore,
     )  # fmt: skip
     anatomy.save(out)
     style.save(anatomy_figure(anatomy), out / _PICTURE)
+    commands = _next_commands(anatomy, out, device)
     where = {"directory": str(out), "picture": str(out / _PICTURE), "notes": notes}
-    print_json({**where, **describe(anatomy)})
+    radius = () if bore is None else (bore.outer_radius,)
+    print_json({**where, **describe(anatomy, *radius), "next": commands})
+    say("next:")
+    for command in commands:
+        say(f"  {command}")
     return 0
+
+
+def _next_commands(anatomy: Anatomy, out: Path, device: str | None) -> list[str]:
+    """What to type after an import: the navigator to a goal, and the picture."""
+    picture = shlex.join([sys.executable, "-m", "webbrowser", str(out / _PICTURE)])
+    if not anatomy.goals:
+        return [picture]
+    goal = next((name for name in _FIRST if name in anatomy.goals), None)
+    command = ["cathsim", "eval", "pretrained:navigator", "--anatomy", str(out)]
+    command += ["--goal", goal or next(iter(anatomy.goals)), "--episodes", "10"]
+    if device is not None:
+        command += ["--device", device]
+    return [shlex.join([*command, "--no-baseline"]), picture]
 
 
 @phantoms.command

@@ -22,7 +22,8 @@ class TaskOptions:
 
     Attributes:
         anatomy: Directory of an anatomy, or name of an arch (`navigate`).
-        goal: Name of the goal in it (`navigate`).
+        goal: Name of the goal in it, or a place x,y,z of the lumen in the unit and
+            frame of the file that it was imported from (`navigate`).
         access: Way in: "ascending", from the ascending aorta, or "descending", from
             the femoral artery (`navigate`).
         arches: Set of random arches that episodes draw from: train, test or
@@ -41,7 +42,19 @@ class TaskOptions:
     @property
     def given(self) -> dict[str, Any]:
         """The options that were given, by name."""
-        return {name: one for name, one in vars(self).items() if one is not None}
+        given = {name: one for name, one in vars(self).items() if one is not None}
+        if self.goal is not None and (place := _place(self.goal)):
+            given["goal"] = place
+        return given
+
+
+def _place(text: str) -> list[float] | None:
+    """The three numbers of a text such as 12,-30.5,110, or None if it is no place."""
+    try:
+        numbers = [float(part) for part in text.strip("[]() ").split(",")]
+    except ValueError:
+        return None
+    return numbers if len(numbers) == 3 else None
 
 
 def _read(words: list[str]) -> Any:

@@ -95,7 +95,7 @@ def _draw_forces(axes: Any, episode: Episode, time: np.ndarray) -> None:
         axes.axvspan(*time[[first, last]], 0.97, 1.0, color=_TOUCH, lw=0)
     axes.set_ylabel("force, mN")
     axes.margins(y=0.1)
-    axes.legend(fontsize=8, loc="best", framealpha=0.9)
+    axes.legend(fontsize=8, loc="upper left", framealpha=0.9)
 
 
 def _draw_insertion(axes: Any, episode: Episode, time: np.ndarray) -> None:

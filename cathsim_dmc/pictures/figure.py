@@ -136,7 +136,8 @@ def draw_anatomy(axes: Any, anatomy: Anatomy, view: str = "front") -> None:
         axes.annotate(name, line[-1], (2, 2), textcoords="offset points", fontsize=6)
     for goal in anatomy.goals.values():
         place = projection.flat_mm(goal.position).tolist()
-        ring = Circle(place, GOAL_RADIUS_MM, fill=False, ec=GOAL_COLOUR, lw=0.8)
+        reach = min(GOAL_RADIUS_MM, 1e3 * anatomy.goal_room(goal))
+        ring = Circle(place, reach, fill=False, ec=GOAL_COLOUR, lw=0.8)
         axes.add_patch(ring)
         axes.plot(*place, ".", color=GOAL_COLOUR, ms=4)
     inlet = anatomy.inlet

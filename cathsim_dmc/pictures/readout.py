@@ -54,11 +54,8 @@ class ForceReadout:
     def __repr__(self) -> str:
         """A table of the contacts and a line of the other forces."""
         shown = self.wall_sum, self.wall_max, self.wall_peak_max, self.push_force
-        # Plus zero: no minus before it.
-        total, largest, peak, push = (
-            f"{round(1e3 * force, 2) + 0.0:.2f} mN" for force in shown
-        )
-        cell = ", ".join(f"{round(1e3 * f, 1) + 0.0:.1f}" for f in self.load_cell)
+        total, largest, peak, push = (f"{1e3 * force:.2f} mN" for force in shown)
+        cell = ", ".join(f"{1e3 * force:.1f}" for force in self.load_cell)
         lines = [
             f"{len(self)} contact{'s' * (len(self) != 1)} with the wall: sum {total}, "
             f"largest {largest}, peak within the step {peak}*",

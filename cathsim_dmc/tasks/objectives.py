@@ -251,7 +251,7 @@ class Cannulation(Shiftable, Routed):
         goal: Goal,
         *,
         reward: Mapping[str, float] = PUBLISHED_REWARD,
-        goal_radius: float = GOAL_RADIUS,
+        goal_radius: float | None = None,
         farthest_shift: float = 0.0,
     ) -> "Cannulation":
         """The objective of reaching a goal of an anatomy.
@@ -259,10 +259,13 @@ class Cannulation(Shiftable, Routed):
         Args:
             goal: Goal in the lumen of one of its vessels.
             reward: Weights of the reward terms.
-            goal_radius: Distance from the goal that counts as reached, m.
+            goal_radius: Distance from the goal that counts as reached, m; by default
+                8 mm, or what a short branch has room for.
             farthest_shift: How far past the goal its place may be shifted, m.
         """
         vessel = anatomy.tree.vessel(goal.vessel)
+        if goal_radius is None:
+            goal_radius = min(GOAL_RADIUS, anatomy.goal_room(goal))
         route = anatomy.route(goal, farthest_shift)
         arc_length = route.project(goal.position).arc_length if farthest_shift else None
         lumen = None

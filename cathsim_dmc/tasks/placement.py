@@ -2,19 +2,20 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
+from cathsim_dmc.anatomy.reach import least_ahead, unreachable
 from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks.config import WORKING_LENGTHS
 
 # The steerable tip starts free of the sheath wherever the way to the first branching
 # is long enough.
 _FREE_LENGTH = 0.005  # m of shaft out of the sheath behind the tip
-_LEAST_START_DEPTH = 0.005  # m
 # At the start the head has come no further than this part of the way to the first
 # branching, to the end of the vessel and to the goal, so that all of them lie ahead.
 _LARGEST_SHARE = 0.5
@@ -70,10 +71,23 @@ class Placement:
         return self.start - self.working_length * self.direction
 
 
-def resolve_goal(anatomy: Anatomy, goal: "str | Goal") -> Goal:
-    """The goal, by name or as given; ValueError if outside the lumen."""
+def resolve_goal(anatomy: Anatomy, goal: "str | Goal | Sequence[float]") -> Goal:
+    """The goal, by name, as given, or at a place (3,) of the anatomy's file.
+
+    ValueError if it is outside the lumen, or a place past which a device starts.
+    """
     if isinstance(goal, str):
         goal = anatomy.goal(goal)
+    elif not isinstance(goal, Goal):
+        if np.shape(goal) != (3,):
+            bounds.refuse("goal", goal, "the name of a goal, a Goal, or (x, y, z)")
+        goal = anatomy.goal_at(goal)
+        alone = dataclasses.replace(anatomy, goals={goal.name: goal})
+        for where in unreachable(alone):
+            raise ValueError(
+                f"goal {goal.name}: {where}, where a device starts; give a place "
+                "farther in, or import with another inlet"
+            )
     bounds.instance("goal", goal, Goal)
     depth = float(anatomy.lumen(goal.position))
     if not depth > 0:
@@ -108,7 +122,8 @@ def place_device(
     route = anatomy.route(goal, farthest_shift)
     way = min(_way_to_branching(anatomy), anatomy.route(goal).length)
     start_depth = min(
-        device.tip_length + _FREE_LENGTH, max(_LARGEST_SHARE * way, _LEAST_START_DEPTH)
+        device.tip_length + _FREE_LENGTH,
+        _LARGEST_SHARE * max(way, least_ahead(inlet)),
     )
     if working_length is None:
         needed = max(route.length, start_depth) + _SPARE_STROKE + _BASE_LENGTH

@@ -10,15 +10,17 @@ from scipy.ndimage import gaussian_filter1d
 from cathsim_dmc.anatomy.centreline import VesselTree, arc_lengths
 from cathsim_dmc.anatomy.scan.centring import resample, tangents
 from cathsim_dmc.anatomy.scan.extract import FreeEnd
-from cathsim_dmc.anatomy.scan.units import shown
+from cathsim_dmc.anatomy.scan.units import mm, shown
 from cathsim_dmc.anatomy.scan.ways import Ways
 
-RADIUS = 4.5e-3  # m, least median radius of an aorta
+RADIUS = 3e-3  # m, least median radius of an aorta, a newborn's
 THIN = 0.25  # of the widest end: ends that are no wider are no end of the aorta
 WIDEST = 4  # ends from which the aorta may start
 SMOOTH = 6e-3  # m, standard deviation along the way, which steps from node to node
 ARM = 60e-3  # m to both sides of a place, over which the bend there is taken
 TURN = np.radians(75.0)  # least bend of an arch
+LOOP = np.radians(140.0)  # least bend of an arch of which one branch is seen
+THIRD = 0.7  # of the aorta's width: a branch at the bend that is wider is a limb
 TURN_OF_STUMP = np.radians(60.0)  # the same of one that is cut off past its branches
 LEG = 80e-3  # m of each leg that are compared, from 10 mm past the branches on
 # m of a limb from the bend on, at most half, that has no direction yet; its length from
@@ -63,10 +65,10 @@ def find_aorta(
         return None, "the lumen has no two wide ends"
     ends_of_it = " and ".join(shown(ends[k].position) for k in pair)
     wide, bent = np.median(ways.depth[way]), Bend.of(ways.points[way]).turn
-    if wide < RADIUS:
+    if mm(wide) < 1e3 * RADIUS:
         return None, (
-            f"the widest way, from {ends_of_it}, is {wide * 2e3:.1f} mm wide; an aorta "
-            f"has {RADIUS * 2e3:g} mm or more"
+            f"the widest way, from {ends_of_it}, is {mm(2.0 * wide):.1f} mm wide; an "
+            f"aorta has {2e3 * RADIUS:g} mm or more"
         )
     if bent <= turn:
         return None, (

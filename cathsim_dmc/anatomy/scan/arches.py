@@ -11,7 +11,8 @@ from cathsim_dmc.anatomy.scan import aorta, extract, naming
 from cathsim_dmc.anatomy.scan.aorta import Bend
 from cathsim_dmc.anatomy.scan.extract import FreeEnd, LumenEntry, listed
 from cathsim_dmc.anatomy.scan.naming import SURE, Naming
-from cathsim_dmc.anatomy.scan.offshoots import Offshoot, offshoots
+from cathsim_dmc.anatomy.scan.offshoots import Offshoot, offshoots, third_limb
+from cathsim_dmc.anatomy.scan.units import mm, shown
 from cathsim_dmc.anatomy.scan.ways import Ways
 
 
@@ -22,7 +23,7 @@ class Arch:
     ways: Ways
     ends: tuple[FreeEnd, FreeEnd]  # that at the heart last
     entry: LumenEntry  # at the first of them; at the last if the first is a stump
-    found: tuple[list[np.ndarray], int]  # `centrelines` from there on
+    found: list[np.ndarray]  # `centrelines` from there on
     bend: Bend  # of the aorta, from there on
     heart: float  # probability that the heart is at the last end
 
@@ -53,9 +54,10 @@ class Arch:
             if gaps[0] <= gaps[1]:
                 first, last = last, first
             if min(gaps) > 4.0 * last.radius + 10e-3:
+                off = mm(float(min(gaps)))
                 raise ValueError(
-                    f"heart is {min(gaps) * 1e3:.0f} mm away from both ends of the "
-                    f"aorta; give a point near one of them: {listed([first, last])}."
+                    f"heart is {off:.0f} mm away from both ends of the aorta; give a "
+                    f"point near one of them: {listed([first, last])}."
                 )
             arch = cls._seen(ways, ends, first, last, 1.0)
         else:
@@ -63,6 +65,8 @@ class Arch:
             if arch.heart < 0.5:
                 arch = cls._seen(ways, ends, last, first)
             arch = replace(arch, heart=max(arch.heart, 1.0 - arch.heart))
+            if unlike := arch._unlike():
+                return unlike
         first, last = arch.ends
         if first is not cut:
             return arch
@@ -74,11 +78,31 @@ class Arch:
     def _seen(cls, ways, ends, first, last, heart: float | None = None) -> Self:
         entry = LumenEntry(first.position, True, last.position)
         found = extract.centrelines(ways, ends, entry)
-        bend, width, branches = _branches(ways, first.position, last.position, found[0])
+        bend, width, branches = _branches(ways, first.position, last.position, found)
         if heart is None:
             share = _shares(bend, width, branches)
             heart = sum(value for key, value in share.items() if key.heart_last)
         return cls(ways, (first, last), entry, found, bend, heart)
+
+    def _unlike(self) -> str:
+        """Why the bend is no aortic arch, or nothing."""
+        start, far = (end.position for end in self.ends)
+        bend, width, found = _branches(self.ways, start, far, self.found)
+        limb = third_limb(self.ways, bend, width, self.found)
+        if limb is not None:
+            return (
+                f"a branch {mm(2.0 * limb[1]):.1f} mm wide leaves the widest way at "
+                f"{shown(limb[0])}, where that bends; the branches of an arch are much "
+                "narrower than the aorta"
+            )
+        turn = aorta.TURN if len(found) > 1 else aorta.LOOP
+        if not found or bend.turn < turn:
+            count = "no branch leaves" if not found else "one branch leaves"
+            return (
+                f"{count} the widest way where it bends, by "
+                f"{np.degrees(bend.turn):.0f} degrees"
+            )
+        return ""
 
     def entered(self, inlet: np.ndarray | None, planned: LumenEntry) -> LumenEntry:
         """Where the device enters: by default at the end that is not at the heart.

@@ -8,12 +8,16 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy import geodesic
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import CentrelinePoint
-from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS
+from cathsim_dmc.anatomy.parts import Goal
+from cathsim_dmc.anatomy.reach import unreachable
+from cathsim_dmc.anatomy.scan import units
 from cathsim_dmc.anatomy.scan.aorta import TURN, Bend, mirrored
+from cathsim_dmc.anatomy.scan.lumen import enlargement
 from cathsim_dmc.anatomy.scan.naming import ARCH_BRANCHES
+from cathsim_dmc.anatomy.scan.places import resized
 from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.tree import END_TRIM, TAIL, TAIL_RADIUS
-from cathsim_dmc.anatomy.scan.units import shown
+from cathsim_dmc.anatomy.scan.units import enlarged, mm, shown
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 SLACK = 0.3e-3  # m, by which a triangulated surface may cut into a tube
@@ -24,13 +28,11 @@ NARROW_END = 1.35  # of `TAIL_RADIUS`: a vessel that ends no wider was cut off t
 JOINS = 15e-3  # m of lumen between the end of a vessel and another that it joins
 PASSABLE = 0.6e-3  # m, depth of a lumen that counts as going on
 BESIDE = 15e-3  # m that two vessels may run in one lumen beyond their parting
-VOLUME = (0.5e-6, 2e-3)  # m^3 of a lumen
+VOLUME = (0.02e-6, 2e-3)  # m^3 of a lumen
+WIDE = 90.0  # percentile of the radii of a tree that is the width of its wide part
 RADII = (0.3e-3, 30e-3)  # m, allowed median of a vessel: arteriole, aneurysm
 WIDEST = 45e-3  # m
 ONE_OSTIUM = 3e-3  # m of the aorta between ostia that are one
-# The head of a device starts half the way to the first ostium deep, but 5 mm at least
-# (`tasks.placement`), and turns into ostia that are 5 mm or more ahead of it.
-OSTIUM_AHEAD = 10e-3  # m, least distance of an ostium from the inlet
 
 
 def check_tree(anatomy: Anatomy) -> dict[str, str]:
@@ -38,8 +40,29 @@ def check_tree(anatomy: Anatomy) -> dict[str, str]:
 
     Says what is wrong and where, by what was looked at; nothing where all is right.
     """
-    measure = SurfaceDepth(anatomy.surface)
-    return {name: "; ".join(look(anatomy, measure)) for name, look in _CHECKS.items()}
+    surface = anatomy.surface
+    radii = [vessel.centreline.radii for vessel in anatomy.tree.vessels.values()]
+    wide = float(np.percentile(np.concatenate(radii), WIDE))
+    scale = enlargement(wide, surface.volume)
+    found = {name: "; ".join(look(anatomy)) for name, look in _SIZES.items()}
+    # A small tree is looked at enlarged, as it was imported: the limits suit it then.
+    with enlarged(scale):
+        large = _enlarged(anatomy, scale)
+        measure = SurfaceDepth(large.surface)
+        found |= {k: "; ".join(look(large, measure)) for k, look in _CHECKS.items()}
+    return found
+
+
+def _enlarged(anatomy: Anatomy, scale: float) -> Anatomy:
+    """The anatomy `scale` times as large."""
+    if scale == 1.0:
+        return anatomy
+    tree, inlet, surface = resized(anatomy.tree, anatomy.inlet, anatomy.surface, scale)
+    goals = {
+        key: Goal(key, goal.vessel, scale * goal.position, scale * goal.arc_length)
+        for key, goal in anatomy.goals.items()
+    }
+    return Anatomy(anatomy.name, tree, inlet, goals, (), surface)
 
 
 def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
@@ -56,8 +79,8 @@ def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
         worst = int((depth - floor).argmin())
         if depth[worst] < min(floor[worst], 0.1e-3) - SLACK * 0.5:
             yield (
-                f"{key} leaves the lumen {s[worst] * 1e3:.0f} mm from its start, at "
-                f"{shown(place.position[worst])}, by {-depth[worst] * 1e3:.1f} mm"
+                f"{key} leaves the lumen {mm(s[worst]):.0f} mm from its start, at "
+                f"{shown(place.position[worst])}, by {mm(-depth[worst]):.1f} mm"
             )
 
 
@@ -75,7 +98,7 @@ def _own_lumen(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
                 beside &= place.arc_length > other.ostium
             if (length := STEP * int(beside.sum())) > BESIDE:
                 yield (
-                    f"{vessel.name} runs {length * 1e3:.0f} mm in the lumen of "
+                    f"{vessel.name} runs {mm(length):.0f} mm in the lumen of "
                     f"{other.name}, around {shown(own.position[beside.argmax()])}"
                 )
 
@@ -88,13 +111,13 @@ def _parents(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
         place = parent.centreline.project(vessel.centreline.points[0])
         if place.distance > place.radius:
             yield (
-                f"{key} starts {place.distance * 1e3:.1f} mm from the centreline of "
+                f"{key} starts {mm(place.distance):.1f} mm from the centreline of "
                 f"{parent.name}, outside of it"
             )
         if parent.parent is not None and place.arc_length < parent.ostium - 2e-3:
             yield (
-                f"{key} leaves {parent.name} {place.arc_length * 1e3:.0f} mm from its "
-                f"start, before that has an ostium ({parent.ostium * 1e3:.0f} mm)"
+                f"{key} leaves {parent.name} {mm(place.arc_length):.0f} mm from its "
+                f"start, before that has an ostium ({mm(parent.ostium):.0f} mm)"
             )
 
 
@@ -132,7 +155,8 @@ def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
         gap = np.linalg.norm(ahead - end.position, axis=1)
         beyond = float(gap.max(initial=0.0))
         # What no device can follow was cut off, and is not missing.
-        cut = TAIL + END_TRIM if end.radius < NARROW_END * TAIL_RADIUS else 0.0
+        thin = end.radius < NARROW_END * TAIL_RADIUS * units.enlargement()
+        cut = TAIL + END_TRIM if thin else 0.0
         if beyond <= max(FREE, FREE_RADII * wide, cut):
             continue
         # Or it ends in another vessel, where a ring of vessels closes.
@@ -142,7 +166,7 @@ def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
         if not any((place.distance < 0.7 * place.radius).any() for place in places):
             yield (
                 f"{key} ends at {shown(end.position)}, but its lumen goes on for "
-                f"{beyond * 1e3:.0f} mm or more"
+                f"{mm(beyond):.0f} mm or more"
             )
 
 
@@ -156,7 +180,8 @@ def _lumen_beyond(
     shape = np.full(3, 2 * round(max(24 * spacing, reach) / spacing) + 1)
     low = end.position - 0.5 * (shape - 1) * spacing
     # Lattice points lie beside the middle. Tails are cut off at `TAIL_RADIUS`.
-    deep = max(PASSABLE, TAIL_RADIUS - 0.5 * spacing)
+    scale = units.enlargement()
+    deep = max(PASSABLE * scale, TAIL_RADIUS * scale - 0.5 * spacing)
     ijk, _ = geodesic.inside(depth, low, shape, spacing, deep)
     local = low + spacing * ijk - end.position
     along = local @ end.tangent
@@ -176,7 +201,7 @@ def _goals(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
         line = anatomy.tree.vessel(goal.vessel).centreline
         off = float(np.linalg.norm(line.at(goal.arc_length).position - goal.position))
         if off > 1e-3:
-            yield f"{name} lies {off * 1e3:.1f} mm from its place in {goal.vessel}"
+            yield f"{name} lies {mm(off):.1f} mm from its place in {goal.vessel}"
         depths = anatomy.tree.depths(goal.position)
         best = max(depths, key=lambda key: float(depths[key]))
         if float(depths[goal.vessel]) < float(depths[best]) - 0.5e-3:
@@ -185,7 +210,7 @@ def _goals(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
             yield f"{name} lies outside the lumen"
 
 
-def _sizes(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
+def _sizes(anatomy: Anatomy) -> Iterator[str]:
     volume = anatomy.surface.volume
     if not VOLUME[0] <= volume <= VOLUME[1]:
         yield (
@@ -197,8 +222,8 @@ def _sizes(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
         middle = float(np.median(own))
         if not RADII[0] <= middle <= RADII[1] or own.max() > WIDEST:
             yield (
-                f"{key} has a radius of {middle * 1e3:.3g} mm (median; allowed "
-                f"{RADII[0] * 1e3:g} to {RADII[1] * 1e3:g})"
+                f"{key} has a radius of {mm(middle):.3g} mm (median; allowed "
+                f"{mm(RADII[0]):g} to {mm(RADII[1]):g})"
             )
 
 
@@ -206,49 +231,14 @@ def _inlet(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
     inlet = anatomy.inlet
     place = anatomy.tree.vessel(inlet.vessel).centreline.project(inlet.position)
     if place.distance > place.radius:
-        away = f"{place.distance * 1e3:.0f} mm from the centreline of {inlet.vessel}"
+        away = f"{mm(place.distance):.0f} mm from the centreline of {inlet.vessel}"
         yield f"it lies {away}"
     s = np.linspace(1e-3, max(2e-3, 0.5 * inlet.radius), 5)
     if measure(inlet.position + s[:, None] * inlet.direction).min() <= 0.0:
         yield "its direction does not lead into the lumen"
-    if inlet.radius < INLET_HOLE_RADIUS:
-        yield (
-            f"its radius of {inlet.radius * 1e3:.2g} mm is less than that of the "
-            f"sheath's hole ({INLET_HOLE_RADIUS * 1e3:.2g} mm)"
-        )
 
 
-def unreachable(anatomy: Anatomy) -> dict[str, list[str]]:
-    """Names of the goals that a device is past when it starts, by the reason.
-
-    They lie behind the inlet, or in a branch that leaves the inlet's vessel less than
-    `OSTIUM_AHEAD` past the inlet, or before it.
-    """
-    inlet, tree = anatomy.inlet, anatomy.tree
-    line = tree.vessel(inlet.vessel).centreline
-    start = line.locate(inlet.position)
-    forward = np.sign(line.at(start).tangent @ inlet.direction)
-    found: dict[str, list[str]] = {}
-    for name, goal in anatomy.goals.items():
-        if goal.vessel == inlet.vessel:
-            place, least, what = goal.arc_length, 0.0, f"{name} lies"
-        else:
-            branch = tree.vessel(goal.vessel)
-            while branch.parent not in (inlet.vessel, None):
-                branch = tree.vessel(branch.parent)
-            if branch.parent is None:
-                continue  # the device enters by a branch, and leaves it at its ostium
-            place, least = line.locate(branch.mouth.position), OSTIUM_AHEAD
-            what = f"{branch.name} leaves {inlet.vessel}"
-        ahead = forward * (place - start)
-        if ahead < least:
-            side = "past" if ahead > 0.0 else "before"
-            where = f"{what} {abs(ahead) * 1e3:.0f} mm {side} the inlet"
-            found.setdefault(where, []).append(name)
-    return found
-
-
-def _start(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
+def _start(anatomy: Anatomy) -> Iterator[str]:
     for where, names in unreachable(anatomy).items():
         yield (
             f"{where}, where a device starts: {', '.join(names)} cannot be reached; "
@@ -263,7 +253,6 @@ _CHECKS = {
     "branches of the arch on their sides": _sides,
     "vessels end at ends of the surface": _free_ends,
     "goals in their vessels": _goals,
-    "sizes of vessels": _sizes,
     "inlet": _inlet,
-    "start of the device": _start,
 }
+_SIZES = {"sizes of vessels": _sizes, "start of the device": _start}

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cathsim_dmc.anatomy.scan.naming import ROOT
+from cathsim_dmc.anatomy.scan import vtk_files
+from cathsim_dmc.anatomy.scan.mesh import parsed
+from cathsim_dmc.anatomy.scan.naming import ROOT, TRUNK
 from cathsim_dmc.anatomy.scan.units import to_lps, upright
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
@@ -21,8 +23,9 @@ def read_curves(
 ) -> dict[str, np.ndarray]:
     """Points (n, 3) m, LPS, of drawn centrelines, by the names of their vessels.
 
-    Files are read as by `read_curve`; see `units.upright` for `axes`. ValueError if a
-    file holds no centreline, or two give one name, or `ROOT`.
+    Files are read as by `read_curve`, VTK's with all their lines, numbered; see
+    `units.upright` for `axes`. ValueError if a file holds no centreline, or two give
+    one name, or that of a root.
     """
     listed = isinstance(paths, Sequence) and not isinstance(paths, str | bytes)
     if not listed or not all(isinstance(path, str | Path) for path in paths):
@@ -32,15 +35,31 @@ def read_curves(
         )
     curves: dict[str, np.ndarray] = {}
     for path in paths:
-        points = read_curve(path, units, frame) @ upright(axes).T
-        name = vessel_name(path)
-        if name in curves or name == ROOT:
-            raise ValueError(
-                f"{path} gives the vessel name {name!r}, which is taken (names: "
-                f"{', '.join([ROOT, *curves])}); rename the file."
-            )
-        curves[name] = points
+        found = read_file(path, units, frame)
+        stem = vessel_name(path)
+        for number, points in enumerate(found, 1):
+            name = stem if len(found) == 1 else f"{stem}_{number}"
+            if name in curves or name in (ROOT, TRUNK):
+                raise ValueError(
+                    f"{path} gives the vessel name {name!r}, which is taken (names: "
+                    f"{', '.join([ROOT, TRUNK, *curves])}); rename the file."
+                )
+            curves[name] = points @ upright(axes).T
     return curves
+
+
+def read_file(path: str | Path, units: str, frame: str) -> list[np.ndarray]:
+    """The centrelines (n_i, 3) m, LPS, of a file: several of VTK's, else one."""
+    path = Path(path)
+    if path.suffix.lower() not in (".vtp", ".vtk"):
+        return [read_curve(path, units, frame)]
+    if not path.is_file():
+        raise FileNotFoundError(f"no centreline file {path}; give VMTK's centrelines.")
+    found = parsed(path, path.suffix[1:].lower(), vtk_files.lines, "vtp")
+    if not found:
+        raise ValueError(f"{path} holds no lines; give centrelines, as VMTK's.")
+    matrix = to_lps(units, frame)
+    return [_distinct(path, points @ matrix.T) for points in found]
 
 
 def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> np.ndarray:
@@ -51,7 +70,10 @@ def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> np.nd
     """
     path = Path(path)
     kind = path.suffix.lower()
-    what = "3D Slicer markup (.mrk.json) or a table x,y,z[,radius] (.csv, .tsv, .txt)"
+    what = (
+        "3D Slicer markup (.mrk.json), a table x,y,z[,radius] (.csv, .tsv, .txt) or "
+        "VMTK's centrelines (.vtp)"
+    )
     if not path.is_file():
         raise FileNotFoundError(f"no centreline file {path}; give a {what}.")
     if kind not in (".json", ".csv", ".txt", ".tsv"):
@@ -64,6 +86,11 @@ def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> np.nd
             f"{path} is no {what} ({type(error).__name__}: {error}). Save the curve "
             "again."
         ) from error
+    return _distinct(path, points)
+
+
+def _distinct(path: Path, points: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of a file without repetitions; ValueError if they are no curve."""
     apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-9
     keep = np.concatenate([[True], apart])
     if keep.sum() < 2 or not np.isfinite(points).all():

@@ -1,33 +1,31 @@
 """Free ends of a lumen, its inlet, and centrelines computed between them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from cathsim_dmc.anatomy.centreline import arc_lengths
+from cathsim_dmc.anatomy.scan.rings import COVER, Cover, rings, round_ring
 from cathsim_dmc.anatomy.scan.topology import groups
-from cathsim_dmc.anatomy.scan.units import shown
+from cathsim_dmc.anatomy.scan.units import mm, shown
 from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common
 
 END_SEARCH = 15e-3  # m from a blind end in which its width is looked for
-COVER = 1.5  # radii; what lies nearer to a way is no vessel of its own
 STUB = 3e-3  # m, shortest own vessel beyond that
 STUMP = 500  # lattice points beyond that, least of a wide vessel that is cut off
 WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
 ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
 STARTS = 30e-3  # m along the lumen; curves that start nearer to an end start there
-DEVICE_RADIUS = 0.84e-3  # m, 5 Fr catheter (1 Fr = 1/3 mm diameter)
-BRANCH = 15e-3  # m, shortest passable length of a branch worth a name
-# A ring of vessels has no free end: two ways from the inlet meet in it. They come from
-# different vessels if, some way back, they are farther apart than these widths.
-BACK = 25e-3  # m
-APART = 1.5  # of the sum of both depths
-APART_MIN = 4e-3  # m
-RING = 40e-3  # m, shortest ring
+# m, passable length of a branch worth a name beyond what is covered; or from the wall
+# of the main vessel on, if it is also so many times as long as wide.
+BRANCH, WIDTHS = 15e-3, 1.5
+EVEN = 0.6  # of the wider one's width: two branches of a fork that share its trunk
+EVEN_PART = (1.5, 4.0)  # radii of the trunk past the fork, between which they compare
+TRUNK = 3.0  # of its radii, least length of a trunk
+FITS = 0.5  # of the length of the vessels, that a device must pass to be the default
 
 
 class FreeEnd(NamedTuple):
@@ -39,29 +37,6 @@ class FreeEnd(NamedTuple):
     position: np.ndarray
     radius: float
     bottleneck: float
-
-
-class Cover:
-    """Nodes in or close to vessels that are already known."""
-
-    def __init__(self, ways: Ways):
-        """Nothing is covered yet."""
-        self._ways = ways
-        self._centres, self._reach = np.empty((0, 3)), np.empty(0)
-
-    def add(self, way: np.ndarray) -> None:
-        """Cover the surroundings of a way (n,) of nodes."""
-        # Every other point does: their spheres overlap.
-        way = way[::2]
-        self._centres = np.concatenate([self._centres, self._ways.points[way]])
-        reach = COVER * self._ways.depth[way] + 1e-3
-        self._reach = np.concatenate([self._reach, reach])
-
-    def own_part(self, way: np.ndarray) -> np.ndarray:
-        """Nodes of a way, given from its tip on, before it meets what is covered."""
-        gap = cdist(self._ways.points[way], self._centres)
-        met = (gap < self._reach).any(axis=1)
-        return way[: int(met.argmax())] if met.any() else way
 
 
 def free_ends(ways: Ways) -> list[FreeEnd]:
@@ -215,28 +190,28 @@ def listed(ends: Sequence[FreeEnd]) -> str:
     """Ends with their places and widths, widest first, for a message."""
     ordered = sorted(ends, key=lambda end: -end.radius)
     return ", ".join(
-        f"{shown(end.position)}, {end.radius * 2e3:.1f} mm wide" for end in ordered[:8]
+        f"{shown(end.position)}, {mm(2.0 * end.radius):.1f} mm wide"
+        for end in ordered[:8]
     )
 
 
 def centrelines(
-    ways: Ways, ends: Sequence[FreeEnd], entry: LumenEntry
-) -> tuple[list[np.ndarray], int]:
-    """Deepest ways from the inlet to every branch that a 5 Fr catheter can enter.
+    ways: Ways, ends: Sequence[FreeEnd], entry: LumenEntry, *, rooted: bool = True
+) -> list[np.ndarray]:
+    """Deepest ways from the inlet to every branch that the device can enter.
 
     Branches have a free end, or close a ring (such as the two vertebral arteries,
-    which meet in the basilar).
-
-    Returns:
-        (centrelines (n_i, 3) m, first point at the inlet, the bulkiest first, without
-        the root; how many more branches are too thin or too short).
+    which meet in the basilar). They are given as (n_i, 3) m, from the inlet on, the
+    bulkiest first, without the way to the far end of the entry if that is a root.
     """
     before = ways.deepest_from(ways.node(entry.position))
-    cover, known, toward = Cover(ways), [entry.position], None
+    cover, known, toward, main = Cover(ways), [entry.position], None, None
     if entry.far is not None:
-        known.append(entry.far)
         toward = ways.trace(before, ways.node(entry.far))
-        cover.add(toward)
+        if rooted:
+            known.append(entry.far)
+            cover.add(toward)
+            main = Cover(ways, toward)
     todo = []
     for end in ends:
         way = ways.trace(before, ways.node(end.position))
@@ -247,23 +222,83 @@ def centrelines(
             todo.append(way)
     todo.sort(key=lambda way: -float(ways.depth[way].sum()))
     # Rings last: what they share with a branch that has an end is that branch's.
-    rings = (_round(cover, *pair) for pair in _rings(ways, before))
-    found, thin = [], 0
-    for way in chain(todo, rings):
+    closed = (round_ring(cover, *pair) for pair in rings(ways, before))
+    found = []
+    for way in chain(todo, closed):
         own = cover.own_part(way[::-1])[::-1]
         if len(own) < 3:
             continue
-        if len(own) == len(way):
-            # It begins at the inlet, at whose very end the lattice has no depth.
-            own = own[int((ways.depth[own] >= DEVICE_RADIUS).argmax()) :]
-        narrow = np.flatnonzero(ways.depth[own] + CELL < DEVICE_RADIUS)
-        passable = own[: narrow[0]] if len(narrow) else own
-        if ways.length(passable) < BRANCH:
-            thin += 1
+        passable = _passed(ways, own, from_inlet=len(own) == len(way))
+        if len(passable) < 3:
             continue
-        cover.add(way)
-        found.append(ways.points[way])
-    return found, thin
+        length = ways.length(passable)
+        width = 2.0 * float(np.median(ways.depth[passable]) + CELL)
+        if length < BRANCH:  # of a wide main vessel much is covered, too
+            length += _mouth(ways, main, way, own)
+            length = 0.0 if length < WIDTHS * width else length
+        if length >= BRANCH:
+            cover.add(way)
+            found.append(ways.points[way])
+            main = main or Cover(ways, way)
+    return found
+
+
+def _mouth(ways: Ways, main: Cover | None, way: np.ndarray, own: np.ndarray) -> float:
+    """Length (m) of a way from the wall of the main vessel to its own part, or 0."""
+    if main is None or len(main.own_part(way[::-1])) > len(own):
+        return 0.0  # it leaves another vessel
+    whole = main.own_part(way[::-1], wall=True)[::-1]
+    return ways.length(whole) - ways.length(own)
+
+
+def _passed(ways: Ways, way: np.ndarray, *, from_inlet: bool) -> np.ndarray:
+    """The beginning of a way (n,) of nodes that the device passes."""
+    if from_inlet:  # at whose very end the lattice has no depth
+        way = way[int((ways.depth[way] >= ways.device).argmax()) :]
+    narrow = np.flatnonzero(ways.depth[way] + CELL < ways.device)
+    return way[: narrow[0]] if len(narrow) else way
+
+
+def fits(ways: Ways, ends: Sequence[FreeEnd], entry: LumenEntry) -> bool:
+    """Whether the device passes most of the vessels between the free ends."""
+    before = ways.deepest_from(ways.node(entry.position))
+    traces = [ways.trace(before, ways.node(end.position)) for end in ends]
+    passed = [_passed(ways, way, from_inlet=True) for way in traces]
+    every = len(np.unique(np.concatenate(traces)))
+    return len(np.unique(np.concatenate(passed))) > FITS * every
+
+
+def trunk(
+    ways: Ways, curves: Sequence[np.ndarray]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """End (3,) m of the trunk of a tree's curves (n_i, 3) m, and those that leave it.
+
+    The trunk is the beginning of the bulkiest curve up to the first fork at which
+    another one goes on that is about as wide; the whole curve if there is none.
+    """
+    main, others = curves[0], list(curves[1:])
+    depth = ways.depth[[ways.node(point) for point in main]]
+    s = arc_lengths(main)
+    forks = []
+    for other in others:
+        at = common(main, other) - 1
+        radius = float(np.median(depth[max(at - 3, 0) : at + 1]))
+        beside = ways.depth[[ways.node(point) for point in other]]
+        wide = [
+            _width(s - s[at], depth, radius),
+            _width(arc_lengths(other) - arc_lengths(other)[at], beside, radius),
+        ]
+        if s[at] > TRUNK * radius and min(wide) > EVEN * max(wide):
+            forks.append(at)
+    if not forks:
+        return main[-1], others
+    return main[min(forks)], list(curves)
+
+
+def _width(past: np.ndarray, depth: np.ndarray, radius: float) -> float:
+    """Median depth of a curve over a part past a fork of a trunk of some radius."""
+    part = (past > EVEN_PART[0] * radius) & (past < EVEN_PART[1] * radius)
+    return float(np.median(depth[part])) if part.any() else 0.0
 
 
 def continued(
@@ -312,43 +347,3 @@ def _ahead(ways: Ways, way: np.ndarray, toward: np.ndarray) -> bool:
     here = ways.points[way[0]]
     one, other = (ways.points[each[step]] - here for each in (way, toward))
     return float(one @ other) > 0.0
-
-
-def _rings(ways: Ways, before: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Pairs of ways from the inlet whose ends touch, for every ring of vessels."""
-    up = _upstream(ways, before)
-    links = ways.links[np.not_equal(*up[ways.links.T])]
-    back = up[links]
-    gap = np.linalg.norm(np.diff(ways.points[back], axis=1)[:, 0], axis=1)
-    near = APART * ways.depth[back].sum(axis=1) + APART_MIN
-    links = links[ways.main[links[:, 0]] & (gap > near)]
-    depth = ways.depth[links].min(axis=1)
-    label = groups(len(ways.points), links)[links[:, 0]]
-    for key in np.unique(label):
-        # Of each place the deepest link.
-        at = int(np.where(label == key, depth, -np.inf).argmax())
-        one, other = (ways.trace(before, int(node)) for node in links[at])
-        shared = common(ways.points[one], ways.points[other])
-        own = [way[shared:] for way in (one, other)]
-        if depth[at] >= DEVICE_RADIUS and sum(map(ways.length, own)) > RING:
-            yield one, other
-
-
-def _upstream(ways: Ways, before: np.ndarray) -> np.ndarray:
-    """Node (n,) that lies ``BACK`` up the way of each node, or the way's start."""
-    here, gone = np.arange(len(ways.points)), np.zeros(len(ways.points))
-    up = np.where(before >= 0, before, here)
-    step = np.linalg.norm(ways.points - ways.points[up], axis=1)
-    while (fits := (up[here] != here) & (gone + step[here] <= BACK)).any():
-        gone[fits] += step[here[fits]]
-        here[fits] = up[here[fits]]
-    return here
-
-
-def _round(cover: Cover, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """One way through a ring: up the side that leaves first, on to the other side."""
-    own = [cover.own_part(way[::-1])[::-1] for way in (one, other)]
-    alone = [len(way) - len(part) for way, part in zip((one, other), own, strict=True)]
-    if alone[1] < alone[0]:
-        one, other, own = other, one, own[::-1]
-    return np.concatenate([one, own[1][::-1]])

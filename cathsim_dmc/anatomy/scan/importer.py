@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,28 +12,55 @@ from numpy.typing import ArrayLike
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree
-from cathsim_dmc.anatomy.parts import Inlet, Surface
-from cathsim_dmc.anatomy.scan import extract
-from cathsim_dmc.anatomy.scan.aorta import mirrored, unproven
+from cathsim_dmc.anatomy.parts import FileFrame, Inlet, Surface
+from cathsim_dmc.anatomy.reach import unreachable
+from cathsim_dmc.anatomy.scan import extract, naming
+from cathsim_dmc.anatomy.scan.aorta import bend_of, mirrored, unproven
 from cathsim_dmc.anatomy.scan.arches import SURE, Arch
-from cathsim_dmc.anatomy.scan.check import check_tree, unreachable
+from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.curves import inside_part, read_curves
-from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS, listed
+from cathsim_dmc.anatomy.scan.extract import listed
+from cathsim_dmc.anatomy.scan.left_out import left_out, said
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
-from cathsim_dmc.anatomy.scan.naming import VESSEL_NAME, Naming, neutral_names, renamed
+from cathsim_dmc.anatomy.scan.naming import ROOT, TRUNK, VESSEL_NAME, Naming
 from cathsim_dmc.anatomy.scan.places import (
     cut_open,
     flat_ends,
     place_goals,
     place_inlet,
+    resized,
 )
-from cathsim_dmc.anatomy.scan.tree import grow_tree, name_trunk
-from cathsim_dmc.anatomy.scan.units import file_frame, shown, to_lps, upright
-from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.scan.tree import grow_tree, name_trunk, with_root
+from cathsim_dmc.anatomy.scan.units import file_frame, mm, shown, to_lps, upright
+from cathsim_dmc.anatomy.scan.ways import DEVICE_RADIUS, Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
 SHARES = (1.0, 0.6, 0.3)  # of a blind end that are tried to be cut off at the inlet
+
+
+class Calibre(Protocol):
+    """A device as an import sees it, such as an `entities.device.Device`."""
+
+    @property
+    def name(self) -> str:
+        """What to call it."""
+        ...
+
+    @property
+    def outer_radius(self) -> float:
+        """Radius, m."""
+        ...
+
+
+class _Bore(NamedTuple):
+    name: str
+    outer_radius: float
+
+
+USUAL = _Bore("5 Fr catheter", DEVICE_RADIUS)
+# The thinnest of the library (`entities.devices`), where the usual one does not pass.
+THINNEST = _Bore("0.014 inch wire (wire_014_micro)", 0.1778e-3)
 
 
 def import_scan(
@@ -47,6 +75,7 @@ def import_scan(
     inlet: Sequence[float] | None = None,
     heart: Sequence[float] | None = None,
     rename: Mapping[str, str] | None = None,
+    device: Calibre | None = None,
     progress: Callable[[str], None] | None = None,
     notes: list[str] | None = None,
 ) -> Anatomy:
@@ -70,7 +99,10 @@ def import_scan(
             else the wide end farthest from their starts or from the widest end.
         heart: (x, y, z) near the end of the aorta that is at the heart; None finds it
             by width and length of both legs, their sides and their branches.
-        rename: new names of computed vessels by their computed names.
+        rename: new names of vessels by their computed names.
+        device: what is to pass, such as one of `entities.devices.DEVICES`; decides
+            which vessels are in the tree. None for a 5 Fr catheter, or the thinnest
+            device of the library where that does not pass most vessels.
         progress: called with a line for every step: its name or "note", then text.
         notes: list to which what was guessed, mended and left out is added.
 
@@ -100,30 +132,44 @@ def import_scan(
     changes = bounds.options("rename", rename)
     if not all(VESSEL_NAME.fullmatch(str(wanted)) for wanted in changes.values()):
         bounds.refuse("rename", rename, "names of small letters, digits and '_'")
+    if device is not None:
+        bounds.number("device radius", device.outer_radius, positive=True)
     # Refused before the long steps; read again when the unit is known.
     read_curves(centreline_paths, units or "mm", mesh_frame, axes)
     lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, say)
     notes.extend(lumen.notes)
-    measure = SurfaceDepth(lumen.surface)
+    # Enlarged if it is small, so that every length of the import suits it.
+    scale, surface = lumen.scale, lumen.surface
+    if scale != 1.0:
+        surface = Surface(scale * surface.vertices, surface.faces)
+    measure = SurfaceDepth(surface)
     matrix = to_lps(lumen.units, mesh_frame, axes)
     curves = read_curves(centreline_paths, lumen.units, mesh_frame, axes)
-    say(f"tree: looking for vessels in {len(lumen.surface.faces):,} triangles")
-    with file_frame(matrix, lumen.units):
-        middle = shown(lumen.surface.vertices.mean(axis=0))
-        places = {k: _placed(k, matrix @ x, measure, middle) for k, x in given.items()}
-        curves = {key: inside_part(key, c, measure) for key, c in curves.items()}
-        grown = _tree(measure, curves, places, changes, note)
+    say(f"tree: looking for vessels in {len(surface.faces):,} triangles")
+    with file_frame(matrix, lumen.units, scale):
+        middle = shown(surface.vertices.mean(axis=0))
+        places = {
+            k: _placed(k, scale * (matrix @ x), measure, middle)
+            for k, x in given.items()
+        }
+        curves = {k: inside_part(k, scale * c, measure) for k, c in curves.items()}
+        grown = _Growth(measure, scale, device, places, changes, note)
+        tree, at_end, arch = grown.tree(curves)
         turn = None if axes is None else upright(axes)
-        note(*filter(None, [unproven(grown[0], turn)]))
-        name = name or Path(mesh_path).name.split(".")[0]
-        anatomy = _anatomy(name, *_opened(*grown, lumen.surface), say, note)
+        note(*filter(None, [unproven(tree, turn) if arch else None]))
+        opened = resized(*_opened(tree, at_end, surface), 1.0 / scale)
+    name = name or Path(mesh_path).name.split(".")[0]
+    with file_frame(matrix, lumen.units):
+        frame = FileFrame(lumen.units, matrix)
+        anatomy = _anatomy(name, opened, grown.device, frame, say, note)
     seconds = time.monotonic() - started
     say(f"done in {seconds:.0f} s, goals {', '.join(anatomy.goals) or 'none'}")
     return anatomy
 
 
-def _anatomy(name, tree, opening, surface, say, note) -> Anatomy:
+def _anatomy(name, opened, device, frame, say, note) -> Anatomy:
     """The anatomy of a tree, proved against its surface; notes goals left out."""
+    tree, opening, surface = opened
     sizes = [
         f"{key} {vessel.centreline.length * 1e3:.0f} mm"
         + (f" from {vessel.parent}" if vessel.parent else "")
@@ -131,7 +177,8 @@ def _anatomy(name, tree, opening, surface, say, note) -> Anatomy:
     ]
     say(f"tree: {', '.join(sizes)}")
     ends = flat_ends(tree, opening)
-    anatomy = Anatomy(name, tree, opening, place_goals(tree), ends, surface)
+    goals = place_goals(tree, device.outer_radius)
+    anatomy = Anatomy(name, tree, opening, goals, ends, surface, frame)
     for where, missed in unreachable(anatomy).items():
         note(
             f"{where}, where a device starts: {', '.join(missed)} left out of the "
@@ -149,76 +196,131 @@ def _anatomy(name, tree, opening, surface, say, note) -> Anatomy:
     return anatomy
 
 
-def _tree(field, curves, places, changes, note) -> tuple[VesselTree, bool]:
-    """The tree of given curves, or of computed ones; whether it starts at an end."""
-    ways = Ways(field)
-    ends, right, drawn = extract.free_ends(ways), frozenset(), bool(curves)
-    entry = extract.plan_inlet(ways, ends, list(curves.values()), places.get("inlet"))
-    if not drawn:
-        entry, curves, right = _computed(ways, ends, entry, places, changes, note)
-    elif changes or "heart" in places:
-        raise ValueError(
-            "rename and heart are for computed centrelines; with drawn ones rename the "
-            "files, and give the inlet."
-        )
-    else:
-        curves, added = extract.continued(ways, ends, curves, entry)
-        for key, length in added.items():
-            note(
-                f"centreline {key!r} stops {length * 1e3:.0f} mm before its vessel "
-                "ends; continued to the end"
+class _Growth:
+    """From an enlarged lumen to its tree: what is given, and the device that passes."""
+
+    def __init__(self, field, scale, device, places, changes, note):
+        self._field, self._scale, self._note = field, scale, note
+        self._places, self._changes = places, changes
+        self.device, self._given = device or USUAL, device is not None
+        self._ways = Ways(field, scale * self.device.outer_radius)
+        self._ends = extract.free_ends(self._ways)
+
+    def tree(self, curves) -> tuple[VesselTree, bool, bool]:
+        """The tree of drawn curves, or of computed ones if there are none.
+
+        Also whether it starts at an end of the lumen, and whether it is an arch.
+        """
+        ways, ends, drawn = self._ways, self._ends, bool(curves)
+        inlet = self._places.get("inlet")
+        entry = extract.plan_inlet(ways, ends, list(curves.values()), inlet)
+        self._choose_device(entry)
+        root, right, arch = ROOT, frozenset(), True
+        if not drawn:
+            entry, curves, right, root, arch = self._computed(entry)
+        elif "heart" in self._places or set(self._changes) - {ROOT, TRUNK}:
+            raise ValueError(
+                "heart is for computed centrelines, and so is rename, but for the "
+                f"root ({ROOT} or {TRUNK}); with drawn ones rename the files, and give "
+                "the inlet."
             )
-    tree = grow_tree(field, ways, curves, entry.position, entry.far, drawn)
-    return name_trunk(tree, right), entry.at_end
+        else:
+            curves, added = extract.continued(ways, ends, curves, entry)
+            for key, length in added.items():
+                self._note(
+                    f"centreline {key!r} stops {mm(length):.0f} mm before its vessel "
+                    "ends; continued to the end"
+                )
+        tree = grow_tree(self._field, ways, curves, entry.position, entry.far, drawn)
+        tree = name_trunk(tree, right)
+        if drawn:
+            arch = bend_of(tree) is not None or bool({*naming.BRANCHES} & set(curves))
+            root = ROOT if arch else TRUNK
+            (wanted,) = naming.renamed([root], self._changes)
+            tree = with_root(tree, wanted)
+        elif root != ROOT:
+            tree = with_root(tree, root)
+        if not drawn:
+            missed = left_out(ways, tree)
+            self._note(*filter(None, [said(missed, self.device.name, ways.device)]))
+        return tree, entry.at_end, arch
 
+    def _choose_device(self, entry) -> None:
+        """The thinnest device where the usual one passes less than half of the tree."""
+        ways, ends = self._ways, self._ends
+        if self._given or extract.fits(ways, ends, entry):
+            return
+        ways.device = self._scale * THINNEST.outer_radius
+        usual, self.device = self.device, THINNEST
+        self._note(
+            f"a {usual.name} ({2e3 * usual.outer_radius:.2f} mm) passes less than half "
+            f"of the vessels: the tree is that of a {self.device.name} (--device "
+            "chooses another)"
+        )
 
-def _computed(ways, ends, entry, places, changes, note):
-    """Entry, computed curves by name, and names of the right branches."""
-    seen, end = Arch.of(ways, ends, places.get("heart")), ""
-    arch = None if isinstance(seen, str) else seen
-    if arch is None:
-        note(f"no aortic arch recognised, so branches get no anatomical names: {seen}")
-        end = ", the widest end, which may be that at the heart"
-    else:
-        if arch.entry.position is arch.ends[1].position:
-            end = ", at the heart: the descending aorta is cut off beside a branch"
-        entry = arch.entered(places.get("inlet"), entry)
-        wrong = mirrored(arch.bend.azimuth(heart_last=True))
-        if wrong and arch.heart >= SURE:
-            raise ValueError(wrong)
-    known = arch.found if arch is not None and entry is arch.entry else None
-    found, thin = known or extract.centrelines(ways, ends, entry)
-    if not found:
-        raise ValueError(
-            "no branch of the lumen lets a 5 Fr catheter "
-            f"({DEVICE_RADIUS * 2e3:.2f} mm) in for 15 mm, so there is no goal; its "
-            f"ends are {listed(ends)}."
-        )
-    if arch is None:
-        names, notes, right = Naming(neutral_names(found))
-    else:
-        names, notes, right = arch.named(found, entry.far)
-    note(*notes)
-    computed, names = names, renamed(names, changes)
-    curves = dict(zip(names, found, strict=True))
-    for old, new in zip(computed, names, strict=True):
-        if old != new:
-            note(f"{old}, which ends at {shown(curves[new][-1])}, is renamed {new}")
-    nameless = [
-        f"{key} (ends at {shown(curve[-1])})"
-        for key, curve in curves.items()
-        if key.startswith("branch_")
-    ]
-    if nameless:
-        note(
-            f"geometry gives no anatomical name to {', '.join(nameless)}; rename "
-            "(--rename) does"
-        )
-    if thin:
-        note(f"{thin} branches too thin or short for a 5 Fr catheter left out")
-    end = f"{end} (--inlet takes another)" if end and "inlet" not in places else ""
-    note(f"inlet chosen at {shown(entry.position)}{end}")
-    return entry, curves, frozenset(names[row] for row in right)
+    def _computed(self, entry):
+        """Entry, computed curves by name, names of right branches and of the root."""
+        ways, ends, places, note = self._ways, self._ends, self._places, self._note
+        seen, end = Arch.of(ways, ends, places.get("heart")), ""
+        arch = None if isinstance(seen, str) else seen
+        if arch is None:
+            note(
+                f"no aortic arch recognised, so vessels get no anatomical names: {seen}"
+            )
+            end = ", the widest end"
+        else:
+            if arch.entry.position is arch.ends[1].position:
+                end = ", at the heart: the descending aorta is cut off beside a branch"
+            entry = arch.entered(places.get("inlet"), entry)
+            wrong = mirrored(arch.bend.azimuth(heart_last=True))
+            if wrong and arch.heart >= SURE:
+                raise ValueError(wrong)
+        known = arch.found if arch is not None and entry is arch.entry else None
+        if known is None:
+            known = extract.centrelines(ways, ends, entry, rooted=arch is not None)
+        if not known and (arch is None or entry.far is None):
+            raise ValueError(
+                f"no branch of the lumen lets a {self.device.name} "
+                f"({2e3 * self.device.outer_radius:.2f} mm) in for "
+                f"{mm(extract.BRANCH):.2g} mm, so there is no goal; its ends are "
+                f"{listed(ends)}. Choose a thinner device (--device)."
+            )
+        if arch is None:
+            far, known = extract.trunk(ways, known)
+            entry = entry._replace(far=far)
+            names, notes, right = Naming(naming.neutral_names(known))
+        else:
+            names, notes, right = arch.named(known, entry.far)
+        note(*notes)
+        root, *names = self._renamed([TRUNK if arch is None else ROOT, *names], known)
+        end = f"{end} (--inlet takes another)" if end and "inlet" not in places else ""
+        note(f"inlet chosen at {shown(entry.position)}{end}")
+        curves = dict(zip(names, known, strict=True))
+        return entry, curves, frozenset(names[row] for row in right), root, bool(arch)
+
+    def _renamed(self, computed, found) -> list[str]:
+        """Names of root and curves as the user wants them; notes the nameless."""
+        names = naming.renamed(computed, self._changes)
+        curves = dict(zip(names[1:], found, strict=True))
+        for old, new in zip(computed, names, strict=True):
+            if old != new:
+                which = (
+                    f", which ends at {shown(curves[new][-1])},"
+                    if new in curves
+                    else ""
+                )
+                self._note(f"{old}{which} is renamed {new}")
+        nameless = [
+            f"{key} (ends at {shown(curve[-1])})"
+            for key, curve in curves.items()
+            if key.startswith("branch_")
+        ]
+        if nameless:
+            self._note(
+                f"geometry gives no anatomical name to {', '.join(nameless)}; rename "
+                "(--rename) does"
+            )
+        return names
 
 
 def _opened(
@@ -250,9 +352,9 @@ def _placed(
     away = -float(measure(place[None])[0])
     if away > NEAR_INLET:
         raise ValueError(
-            f"{key} {shown(place)} is {away * 1e3:.1f} mm away from the lumen, whose "
+            f"{key} {shown(place)} is {mm(away):.1f} mm away from the lumen, whose "
             f"middle is {middle}; give a point in the lumen, or at most "
-            f"{NEAR_INLET * 1e3:g} mm from the end "
+            f"{mm(NEAR_INLET):.2g} mm from the end "
             f"{'at the heart' if key == 'heart' else 'by which the device enters'}, in "
             "the unit and frame of the mesh (units, mesh_frame)."
         )

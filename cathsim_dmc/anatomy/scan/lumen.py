@@ -9,19 +9,33 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.anatomy.scan import labels as label_maps
 from cathsim_dmc.anatomy.scan import mesh
 from cathsim_dmc.anatomy.scan.repair import mend
 from cathsim_dmc.anatomy.scan.topology import areas, merged
 from cathsim_dmc.anatomy.scan.units import UNITS, file_frame, to_lps, upright
 from cathsim_dmc.anatomy.surface import sampled
 
-SIZE = (15e-3, 2.0)  # m across: an intracranial segment, an aorta with arms and legs
-WIDTH = (1.2e-3, 35e-3)  # m, 95th percentile of radii: cerebral artery, aneurysm
+SIZE = (12e-3, 2.0)  # m across: an intracranial segment, an aorta with arms and legs
+WIDTH = (1.0e-3, 35e-3)  # m, 95th percentile of radii: cerebral artery, aneurysm
 NO_WIDTH = (0.5e-3, 50e-3)  # m: beyond this a unit that is given is refused
 VOLUME = 2e-3  # m^3, most that is searched for ways, at 10^9 points per m^3
-# Of scans, to tell units apart: that radius and the size, m, and deviations of their
-# logarithms; they span from cerebral arteries to aneurysms of the aorta.
-TYPICAL, SPREAD = np.array((6e-3, 200e-3)), np.array((0.6, 0.65))
+# What is scanned, to tell units apart: that radius and the size, m, the deviations of
+# their logarithms, and how often.
+SCANS = {
+    "cerebral arteries": ((1.8e-3, 45e-3), (0.35, 0.6), 1.0),
+    "coronary arteries": ((1.8e-3, 90e-3), (0.25, 0.3), 1.0),
+    "carotid, limb or access": ((3.5e-3, 120e-3), (0.35, 0.5), 1.0),
+    "a child's arch": ((6e-3, 110e-3), (0.35, 0.4), 1.0),
+    "arch or pulmonary arteries": ((12e-3, 200e-3), (0.25, 0.35), 1.0),
+    "abdominal aorta and iliacs": ((9.5e-3, 260e-3), (0.3, 0.35), 1.0),
+    "whole aorta": ((12e-3, 550e-3), (0.2, 0.25), 1.0),
+    "aneurysm of the aorta": ((22e-3, 260e-3), (0.35, 0.4), 0.4),
+}
+# m, radius of a lumen that is imported as it is, and to which narrower ones are
+# enlarged, so that every length of the import suits them as an adult's aorta.
+WIDE, ENLARGED = 8e-3, 12e-3
+MOST = 4e-4  # m^3 that a lumen is enlarged to at most, for the time that it takes
 SURE = 0.95  # probability of a unit that is not asked for
 _SAMPLES = 1000
 _VERTICES = 20_000  # of the surface between those samples, about, at most
@@ -32,11 +46,15 @@ _MOST = 100  # times
 
 
 class Lumen(NamedTuple):
-    """A closed surface (m, LPS), its file's unit, and what was guessed and mended."""
+    """A closed surface (m, LPS), its file's unit, and what was guessed and mended.
+
+    `scale` is by how much it is enlarged while it is imported.
+    """
 
     surface: Surface
     units: str
     notes: tuple[str, ...]
+    scale: float
 
 
 def read_lumen(
@@ -54,17 +72,18 @@ def read_lumen(
         ValueError: if it is no such surface; says how to mend it.
     """
     to_lps("mm" if units is None else units, frame, axes)  # before anything is read
-    if str(path).lower().endswith(mesh.LABEL_MAPS):
-        vertices, faces, why = mesh.label_surface(path, labels)
+    if str(path).lower().endswith(label_maps.LABEL_MAPS):
+        vertices, faces, why = label_maps.label_surface(path, labels)
         units, vertices = "mm", vertices @ upright(axes).T
+        radius = typical_radius(vertices, faces)
     else:
         if len(labels):
             raise ValueError(
-                f"label is for label maps (NIfTI, NRRD); {path} is a surface."
+                f"label is for label maps (NIfTI, NRRD, MHA); {path} is a surface."
             )
         vertices, faces = mesh.read_triangles(path)
         say(f"mesh: {len(faces):,} triangles read")
-        units, why = guess_units(str(path), vertices, faces, units)
+        units, why, radius = guess_units(str(path), vertices, faces, units)
         vertices = vertices @ to_lps(units, frame, axes).T
     say(f"note: {why}")
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
@@ -74,31 +93,41 @@ def read_lumen(
             f"vessel tree is (allowed {SIZE[0]:g} to {SIZE[1]:g} m). Check the unit in "
             f"which the mesh was exported ({why})."
         )
-    with file_frame(to_lps(units, frame, axes), units):
-        surface, changed = mend(str(path), vertices, faces)
-    for text in changed:
-        say(f"note: {text}")
+    scale = enlargement(radius, Surface(vertices - vertices.mean(axis=0), faces).volume)
+    with file_frame(to_lps(units, frame, axes), units, scale):
+        surface, changed = mend(str(path), scale * vertices, faces)
+    if scale != 1.0:
+        surface = Surface(surface.vertices / scale, surface.faces)
     if surface.volume > VOLUME:
         raise ValueError(
             f"{path} holds {surface.volume * 1e3:.3g} litres when its unit is "
             f"{units!r}, which no lumen does (at most {VOLUME * 1e3:g}). Check the "
             f"unit in which the mesh was exported ({why})."
         )
-    return Lumen(surface, units, (why, *changed))
+    return Lumen(surface, units, (why, *changed), scale)
+
+
+def enlargement(radius: float, volume: float) -> float:
+    """By how much a lumen of a radius (m) and a volume (m^3) is enlarged, 1 or more."""
+    if not radius < WIDE:
+        return 1.0
+    most = (MOST / max(abs(volume), 1e-12)) ** (1 / 3)
+    return float(max(1.0, min(ENLARGED / radius, most)))
 
 
 def guess_units(
     name: str, vertices: np.ndarray, faces: np.ndarray, units: str | None
-) -> tuple[str, str]:
-    """The unit given, or the one in which width and size are likely; a line on why.
+) -> tuple[str, str, float]:
+    """The unit given or likely, a line on why, and the radius of the wide part, m.
 
+    The likely unit makes width and size those of something that is scanned, `SCANS`.
     ValueError if the width is implausible in the unit, or two units are likely.
     """
     found = typical_radius(vertices, faces), np.linalg.norm(np.ptp(vertices, axis=0))
     scaled = {unit: scale * np.array(found) for unit, scale in UNITS.items()}
     limits = np.transpose((WIDTH, SIZE))
     odds = {
-        unit: float(np.exp(-0.5 * ((np.log(x / TYPICAL) / SPREAD) ** 2).sum()))
+        unit: _likelihood(x)
         for unit, x in scaled.items()
         if (limits[0] <= x).all() and (x <= limits[1]).all()
     }
@@ -113,7 +142,7 @@ def guess_units(
     if np.isnan(found[0]):
         raise ValueError(f"{name} is no tube: too few walls face others; {better}.")
     if units in odds:
-        return units, f"unit: {units}, as given"
+        return units, f"unit: {units}, as given", float(scaled[units][0])
     if units is not None:
         why = (
             f"unit: {units}, as given, which makes {makes[units]} (lumens "
@@ -122,7 +151,7 @@ def guess_units(
         )
         if not NO_WIDTH[0] <= scaled[units][0] <= NO_WIDTH[1]:
             raise ValueError(f"{name}: {why}.")
-        return units, why
+        return units, why, float(scaled[units][0])
     if not odds:
         listed = "; ".join(f"{unit} makes {text}" for unit, text in makes.items())
         raise ValueError(f"{name} has the size of a vessel tree in no unit: {listed}.")
@@ -134,7 +163,16 @@ def guess_units(
     said = f"unit guessed: {best}, which makes {makes[best]}"
     others = " or ".join(repr(unit) for unit in odds if unit != best)
     doubt = f" ({sure:.0%} sure; else pass units={others})" if sure < 0.995 else ""
-    return best, said + doubt
+    return best, said + doubt, float(scaled[best][0])
+
+
+def _likelihood(seen: np.ndarray) -> float:
+    """Density of the logarithms of a radius and a size (2,) m among `SCANS`."""
+    total = 0.0
+    for typical, spread, share in SCANS.values():
+        off = np.log(seen / typical) / spread
+        total += share * float(np.exp(-0.5 * (off**2).sum())) / np.prod(spread)
+    return float(total)
 
 
 def typical_radius(vertices: np.ndarray, faces: np.ndarray) -> float:

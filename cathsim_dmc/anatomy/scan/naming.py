@@ -13,7 +13,7 @@ from cathsim_dmc.anatomy.scan.offshoots import EXTRA, SPREAD, SURE, Offshoot, no
 from cathsim_dmc.anatomy.scan.units import shown
 from cathsim_dmc.anatomy.scan.ways import Ways, common
 
-ROOT = "aorta"  # the vessel that starts at the inlet
+ROOT, TRUNK = "aorta", "trunk"  # the vessel that starts at the inlet; without an arch
 ARCH_BRANCHES = ("bca", "lcca", "lsa")  # in their order from the heart
 # Patterns of branches in their order from the heart, with their frequency and what they
 # are called. "bovine" is the common trunk of BCA and LCCA.
@@ -135,7 +135,7 @@ def renamed(names: Sequence[str], changes: Mapping[str, str]) -> list[str]:
             )
     out = [changes.get(name, name) for name in names]
     for name in out:
-        if out.count(name) > 1 or name == ROOT:
+        if out.count(name) > 1:
             raise ValueError(f"the vessel name {name!r} is taken; choose another.")
     return out
 

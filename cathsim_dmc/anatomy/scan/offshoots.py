@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.special import softmax
 
 from cathsim_dmc.anatomy.centreline import arc_lengths
-from cathsim_dmc.anatomy.scan.aorta import BRANCH, Bend, chord
+from cathsim_dmc.anatomy.scan.aorta import ARM, BRANCH, THIRD, Bend, chord
 from cathsim_dmc.anatomy.scan.centring import resample
 from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common
@@ -68,13 +68,7 @@ def offshoots(
     """Branches along an aorta of depths (n,) m, which curves (m_i, 3) m leave."""
     aorta = cKDTree(bend.line)
     groups_: list[tuple[list[int], list[np.ndarray], float]] = []
-    for number, curve in enumerate(curves):
-        distance, near = aorta.query(curve)
-        inside = np.flatnonzero(distance < OUT * depth[near])
-        start = int(inside[-1]) + 1 if len(inside) else 0
-        row = curve[start:]
-        if len(row) <= 2:
-            continue
+    for number, row, s in departures(bend, depth, curves):
         for members, rows, _ in groups_:
             shared = arc_lengths(rows[0][: max(common(rows[0], row), 1)])[-1]
             # They leave in one lumen, even if they part at once.
@@ -84,7 +78,7 @@ def offshoots(
                 rows.append(row)
                 break
         else:
-            groups_.append(([number], [row], 1e-3 * near[start]))
+            groups_.append(([number], [row], s))
     found: list[Offshoot] = []
     for members, rows, s in groups_:
         if max((row[-1] - row[0]) @ bend.up for row in rows) > 0.0:
@@ -101,6 +95,38 @@ def offshoots(
             found.append(stub)
     found = [f for f in found if abs(f.s - 1e-3 * bend.apex) < NEAR]
     return sorted(found, key=lambda f: f.s)
+
+
+def departures(
+    bend: Bend, depth: np.ndarray, curves: Sequence[np.ndarray]
+) -> Iterator[tuple[int, np.ndarray, float]]:
+    """Curves as they leave an aorta: number, points (k, 3) beyond it, arc length."""
+    aorta = cKDTree(bend.line)
+    for number, curve in enumerate(curves):
+        distance, near = aorta.query(curve)
+        inside = np.flatnonzero(distance < OUT * depth[near])
+        start = int(inside[-1]) + 1 if len(inside) else 0
+        if len(curve) - start > 2:
+            yield number, curve[start:], 1e-3 * near[start]
+
+
+def third_limb(
+    ways: Ways, bend: Bend, depth: np.ndarray, curves: Sequence[np.ndarray]
+) -> tuple[np.ndarray, float] | None:
+    """Place (3,) and radius (m) of the widest branch at a bend, by the aorta's width.
+
+    None if all are much narrower than the aorta, as those of an arch are.
+    """
+    widest, found = THIRD, None
+    for _, row, s in departures(bend, depth, curves):
+        if abs(s - 1e-3 * bend.apex) > ARM:
+            continue
+        at = round(1e3 * s)
+        radius = _calibre(ways, row, None)
+        share = radius / float(np.median(depth[max(at - 10, 0) : at + 10]))
+        if share > widest:
+            widest, found = share, (row[0], radius)
+    return found
 
 
 def depth_of(ways: Ways, line: np.ndarray) -> np.ndarray:

@@ -5,22 +5,23 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
-from cathsim_dmc.anatomy.parts import End, Goal, Inlet
-from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
 from cathsim_dmc.anatomy.scan.topology import adjacent, groups
 from cathsim_dmc.anatomy.scan.units import shown
+from cathsim_dmc.anatomy.scan.ways import DEVICE_RADIUS
 
 GOAL_PAST_OSTIUM = 30e-3  # m along a branch, its first goal
 GOAL_DISTAL = 0.8  # of the passable part of a branch, its second goal
+ROOT_REST = 3.0  # radii, least length of a root past its last branch that has a goal
 INLET_WIDTH = 0.8  # of the lumen near the inlet; the rest of the blind end is cut off
 INLET_SEARCH = 40e-3  # m of the root in which that width is looked for
 
 
-def passable_length(vessel: Vessel) -> float:
-    """Arc length (m) up to which a 5 Fr catheter fits a vessel."""
+def passable_length(vessel: Vessel, device: float = DEVICE_RADIUS) -> float:
+    """Arc length (m) up to which a device of a radius (m) fits a vessel."""
     line = vessel.centreline
-    narrow = (line.radii < DEVICE_RADIUS) & (line.arc_length > vessel.ostium)
+    narrow = (line.radii < device) & (line.arc_length > vessel.ostium)
     return float(line.arc_length[narrow.argmax()] if narrow.any() else line.length)
 
 
@@ -100,19 +101,33 @@ def cut_open(
     return points, shell, cap
 
 
-def place_goals(tree: VesselTree) -> dict[str, Goal]:
-    """One goal past the ostium of each branch and one far along it, by name."""
+def place_goals(tree: VesselTree, device: float = DEVICE_RADIUS) -> dict[str, Goal]:
+    """One goal past the ostium of each branch and one far along it, by name.
+
+    The root has one, past its last branch; none if it ends in its branches. A device
+    of a radius (m) passes on all ways to them.
+    """
     goals = {}
     for key, vessel in tree.vessels.items():
         if vessel.parent is None:
             continue
-        reach = passable_length(vessel) - vessel.ostium
+        reach = passable_length(vessel, device) - vessel.ostium
         first = vessel.ostium + min(GOAL_PAST_OSTIUM, 0.5 * reach)
         places = {key: first}
         if GOAL_DISTAL * reach > 1.3 * (first - vessel.ostium):
             places[f"{key}_distal"] = vessel.ostium + GOAL_DISTAL * reach
         for name, s in places.items():
             goals[name] = Goal(name, key, vessel.centreline.at(s).position, float(s))
+    root = tree.root
+    last = max(
+        (tree.origin(k) for k, v in tree.vessels.items() if v.parent == root.name),
+        default=0.0,
+    )
+    rest = passable_length(root, device) - last
+    s = last + GOAL_DISTAL * rest
+    if rest > ROOT_REST * float(root.centreline.at(max(s, 0.0)).radius):
+        place = root.centreline.at(s).position
+        goals[root.name] = Goal(root.name, root.name, place, float(s))
     return goals
 
 
@@ -131,8 +146,29 @@ def flat_ends(tree: VesselTree, opening: Inlet) -> tuple[End, ...]:
     return tuple(ends)
 
 
-def describe(anatomy: Anatomy) -> dict[str, Any]:
-    """Figures of an imported anatomy, JSON values in millimetres."""
+def resized(
+    tree: VesselTree, inlet: Inlet, surface: Surface, factor: float
+) -> tuple[VesselTree, Inlet, Surface]:
+    """A tree, its inlet and its surface, `factor` times as large."""
+    if factor == 1.0:
+        return tree, inlet, surface
+    vessels = {}
+    for key, vessel in tree.vessels.items():
+        line = vessel.centreline
+        line = Centreline(factor * line.points, factor * line.radii)
+        vessels[key] = Vessel(key, line, vessel.parent, factor * vessel.ostium)
+    inlet = Inlet(
+        inlet.vessel, factor * inlet.position, inlet.direction, factor * inlet.radius
+    )
+    surface = Surface(factor * surface.vertices, surface.faces)
+    return VesselTree(vessels), inlet, surface
+
+
+def describe(anatomy: Anatomy, device: float = DEVICE_RADIUS) -> dict[str, Any]:
+    """Figures of an imported anatomy, JSON values in millimetres.
+
+    How far a device of a radius (m) passes is among them.
+    """
     vessels, goals, inlet = {}, {}, anatomy.inlet
     for key, vessel in anatomy.tree.vessels.items():
         line = vessel.centreline
@@ -142,7 +178,7 @@ def describe(anatomy: Anatomy) -> dict[str, Any]:
             "length_mm": round(line.length * 1e3, 1),
             "ostium_mm": round(vessel.ostium * 1e3, 1),
             "median_radius_mm": round(float(np.median(own)) * 1e3, 2),
-            "passable_mm": round(passable_length(vessel) * 1e3, 1),
+            "passable_mm": round(passable_length(vessel, device) * 1e3, 1),
         }
     for key, goal in anatomy.goals.items():
         route = anatomy.route(key)

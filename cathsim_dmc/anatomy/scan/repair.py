@@ -5,7 +5,7 @@ import numpy as np
 from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import topology
 from cathsim_dmc.anatomy.scan.places import cut_open
-from cathsim_dmc.anatomy.scan.units import shown
+from cathsim_dmc.anatomy.scan.units import enlargement, mm, shown
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 PART_AREA = 0.03  # of the surface's area: smaller separate parts are dropped
@@ -14,6 +14,7 @@ NON_MANIFOLD = 0.01  # of the triangles: more at non-manifold edges are not mend
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
 FOLD = 2.5e-3  # m, most that a vertex of a self-intersection is moved
+WIDE_HOLE = 14e-3  # m, and of a lumen that is enlarged to 24 mm
 CUT = 16e-3  # m, widest hole that is filled where it was cut out
 END_AREA = 0.5e-6  # m^2, least area of an open end
 END = 0.55  # largest |cosine| between an end's axis and the normals around it
@@ -104,8 +105,8 @@ class _Work:
         off = np.abs(SurfaceDepth(Surface(points, faces))(some))
         self.notes.append(
             f"decimated from {len(self.faces):,} to {len(faces):,} triangles; the "
-            f"surface moved by {off.mean() * 1e3:.2f} mm in the mean, "
-            f"{off.max() * 1e3:.2f} mm at most"
+            f"surface moved by {mm(off.mean()):.2f} mm in the mean, "
+            f"{mm(off.max()):.2f} mm at most"
         )
         self.vertices, self.faces = points, faces
 
@@ -163,17 +164,19 @@ class _Work:
             total = 0.5 * np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0)
             area = float(np.linalg.norm(total))
             axis = total / max(area, 1e-30)
-            widest = CUT if self._cut & set(map(tuple, points)) else HOLE
+            hole = min(HOLE * enlargement(), WIDE_HOLE)
+            cut = bool(self._cut & set(map(tuple, points)))
+            widest = CUT if cut else hole
             end = len(loop) > 3 and area > END_AREA
-            if end and self._is_end(loop, axis, wide > widest):
+            if end and self._is_end(loop, axis, wide > widest and not cut):
                 self._ends += 1
                 if self._cut_back(loop, middle, axis):
                     continue
             elif wide > widest:
                 raise ValueError(
-                    f"{self.name} is not closed: a hole {wide * 1e3:.1f} mm wide in "
+                    f"{self.name} is not closed: a hole {mm(wide):.1f} mm wide in "
                     f"the side of a vessel at {shown(middle)} (at most "
-                    f"{widest * 1e3:g} mm are filled). Fill holes (3D Slicer: Surface "
+                    f"{mm(widest):.2g} mm are filled). Fill holes (3D Slicer: Surface "
                     "Toolbox, Fill holes), then export again."
                 )
             else:
@@ -187,12 +190,12 @@ class _Work:
         if filled:
             wide, where = max(filled)
             self.notes.append(
-                f"{len(filled)} holes filled, the widest {wide * 1e3:.1f} mm at {where}"
+                f"{len(filled)} holes filled, the widest {mm(wide):.1f} mm at {where}"
             )
         if self._ends:
             note = f"{self._ends} open vessel ends capped"
             if self._ragged:
-                note += f", ragged rims cut back by up to {self._ragged * 1e3:.1f} mm"
+                note += f", ragged rims cut back by up to {mm(self._ragged):.1f} mm"
             self.notes.append(note)
         edges, times = topology.edge_counts(self.faces)
         if (times != 2).any():
@@ -331,7 +334,7 @@ class _Work:
         if far <= FOLD:
             self.vertices = vertices
             self.notes.append(
-                f"{count} self-intersecting triangles smoothed, by {far * 1e3:.1f} mm "
+                f"{count} self-intersecting triangles smoothed, by {mm(far):.1f} mm "
                 "at most"
             )
         return far <= FOLD

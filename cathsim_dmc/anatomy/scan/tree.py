@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Collection
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -9,11 +10,13 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.scan.centring import STEP, centred, resample, section_radii
 from cathsim_dmc.anatomy.scan.naming import ROOT
-from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.scan.ways import DEVICE_RADIUS, Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 TAIL = 15e-3  # m, end of a centreline that is cut off where it is too narrow
-TAIL_RADIUS = 1.1e-3  # m, of a 6 Fr device (1.0 mm) and a tenth to spare
+# m, least radius of a vessel's end, of a 6 Fr device (1.0 mm) and a tenth to spare, for
+# a 5 Fr device; of others in proportion.
+TAIL_RADIUS = 1.1e-3
 END_TRIM = 8e-3  # m, most that is cut off where a curve runs into its end
 TRUNKS = ("rsa", "lsa")  # keep what they share with others, such as vertebral arteries
 STEMS = ("bca", "lcca", "rcca")  # keep what they share with what has no name
@@ -51,7 +54,9 @@ def grow_tree(
     else:
         root = _shared_beginning(list(raw.values()), field)
     root = _deep_start(root, field)
-    lines, vessels = {ROOT: root}, {ROOT: Vessel(ROOT, _finish(field, root, None))}
+    tail = TAIL_RADIUS * (ways.device / DEVICE_RADIUS)
+    lines, trunk = {ROOT: root}, _finish(field, root, None, tail)
+    vessels = {ROOT: Vessel(ROOT, trunk)}
     first = TRUNKS if drawn else (*TRUNKS, *STEMS)
     ranks = {k: (k not in TRUNKS, k not in first, -_bulk(field, raw[k])) for k in raw}
     for name in sorted(raw, key=ranks.__getitem__):
@@ -60,7 +65,7 @@ def grow_tree(
         trunk = vessels[parent].centreline
         anchor = trunk.at(trunk.project(curve[at]).arc_length).position
         own = resample(np.concatenate([anchor[None], curve[at + 1 :]]))
-        line = _finish(field, own, anchor)
+        line = _finish(field, own, anchor, tail)
         lines[name] = curve
         vessels[name] = Vessel(name, line, parent, ostium_of(line, trunk))
     # Report in the order in which the files were given, parents first.
@@ -134,9 +139,9 @@ def _deep_start(curve: np.ndarray, field: SurfaceDepth) -> np.ndarray:
 
 
 def _finish(
-    field: SurfaceDepth, curve: np.ndarray, anchor: np.ndarray | None
+    field: SurfaceDepth, curve: np.ndarray, anchor: np.ndarray | None, tail: float
 ) -> Centreline:
-    """Centre a curve in the lumen and measure its radii."""
+    """Centre a curve in the lumen, end it at a `tail` radius (m), measure its radii."""
     # Towards a blind end the depth tells the distance to the end, not the middle.
     last = min(len(curve) // 2, int(END_TRIM / STEP))
     deep = field(curve[-last:])
@@ -145,10 +150,10 @@ def _finish(
     points = centred(field, curve, fixed_start=anchor is not None)
     depth = field(points)
     # A tail that no device can follow is cut off; a stenosis farther up is kept.
-    tail = max(2, len(points) - int(TAIL / STEP))
-    narrow = np.nonzero(depth[tail:] < TAIL_RADIUS)[0]
+    first = max(2, len(points) - int(TAIL / STEP))
+    narrow = np.nonzero(depth[first:] < tail)[0]
     if narrow.size:
-        points, depth = points[: tail + narrow[0]], depth[: tail + narrow[0]]
+        points, depth = points[: first + narrow[0]], depth[: first + narrow[0]]
     radii = section_radii(field, points)
     return Centreline(points, np.maximum(radii, MIN_RADIUS))
 
@@ -198,3 +203,13 @@ def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
                 vessels[key] = other
         return VesselTree(vessels)
     return tree
+
+
+def with_root(tree: VesselTree, name: str) -> VesselTree:
+    """The tree whose root is called `name`."""
+    old, vessels = tree.root.name, {}
+    for key, vessel in tree.vessels.items():
+        key = name if key == old else key
+        parent = name if vessel.parent == old else vessel.parent
+        vessels[key] = replace(vessel, name=key, parent=parent)
+    return VesselTree(vessels)

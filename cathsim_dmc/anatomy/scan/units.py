@@ -13,29 +13,50 @@ from cathsim_dmc import bounds
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6}  # metres per unit
 _SYSTEMS = {"LPS": 1.0, "RAS": -1.0}
 _AXES = dict(zip("LPSRAI", np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
-# Frame in which places are shown: matrix (3, 3) from there to m, LPS, and its unit.
-_FILE: contextvars.ContextVar[tuple[np.ndarray, str]] = contextvars.ContextVar(
-    "file", default=(1e-3 * np.eye(3), "mm")
+# Frame in which places are shown: matrix (3, 3) from there to m, LPS, its unit, and by
+# how much places and lengths are enlarged.
+_FILE: contextvars.ContextVar[tuple[np.ndarray, str, float]] = contextvars.ContextVar(
+    "file", default=(1e-3 * np.eye(3), "mm", 1.0)
 )
 _OFF = 0.05  # most by which directions given by numbers may differ from a rotation
 
 
 def shown(point: np.ndarray) -> str:
     """A place (3,) m, LPS, as text: in mm, or in the frame of a `file_frame`."""
-    matrix, unit = _FILE.get()
+    matrix, unit, scale = _FILE.get()
     decimals = max(round(np.log10(UNITS[unit] / UNITS["mm"])), 0)
-    numbers = np.linalg.solve(matrix, point)
+    numbers = np.linalg.solve(matrix, point) / scale
     return "(" + ", ".join(f"{x:.{decimals}f}" for x in numbers) + f") {unit}"
 
 
+def mm(length: float | np.ndarray) -> float:
+    """A length (m) in mm, as it is in the patient; see `file_frame`."""
+    return 1e3 * float(length) / _FILE.get()[2]
+
+
+def enlargement() -> float:
+    """By how much places and lengths are enlarged; see `file_frame`."""
+    return _FILE.get()[2]
+
+
 @contextlib.contextmanager
-def file_frame(matrix: np.ndarray, unit: str) -> Iterator[None]:
-    """Has places `shown` in the unit and frame of a file; see `to_lps`."""
-    before = _FILE.set((matrix, unit))
+def file_frame(matrix: np.ndarray, unit: str, scale: float = 1.0) -> Iterator[None]:
+    """Has places `shown` in the unit and frame of a file; see `to_lps`.
+
+    Places and lengths are given `scale` times as large as in the patient.
+    """
+    before = _FILE.set((matrix, unit, scale))
     try:
         yield
     finally:
         _FILE.reset(before)
+
+
+@contextlib.contextmanager
+def enlarged(scale: float) -> Iterator[None]:
+    """As `file_frame`, of the same file, `scale` times as large."""
+    with file_frame(*_FILE.get()[:2], scale):
+        yield
 
 
 def to_lps(

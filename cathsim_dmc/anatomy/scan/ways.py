@@ -10,8 +10,10 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy import geodesic
 from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.scan.centring import resample
+from cathsim_dmc.anatomy.scan.units import mm
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
+DEVICE_RADIUS = 0.84e-3  # m, 5 Fr catheter (1 Fr = 1/3 mm diameter)
 LATTICE = 1e-3  # m, spacing of the lattice on which ways are searched
 CELL = 0.2e-3  # m by which depths of its points are less than radii, in the mean
 CORRIDOR = 2e-3  # m, distance from a drawn curve at which a way costs twice
@@ -24,10 +26,15 @@ class Ways:
 
     Its lattice has `points` (n, 3) m with their `depth` (n,) m and `links` (e, 2) of
     neighbours; `main` (n,) bool is the largest connected piece, `nodes` (m,) its rows.
+    The `device` is the radius (m) of what is to pass.
     """
 
-    def __init__(self, field: SurfaceDepth):
-        """Build the lattice graph of a depth ``field`` (26 neighbours)."""
+    def __init__(self, field: SurfaceDepth, device: float = DEVICE_RADIUS):
+        """Build the lattice graph of a depth ``field`` (26 neighbours).
+
+        The radius of the ``device`` (m) is that for which ways are looked for.
+        """
+        self.device = device
         low, high = field.box
         size = np.ceil((high - low) / LATTICE).astype(int) + 1
         ijk, depth = geodesic.inside(field, low, size, LATTICE, SHALLOW)
@@ -70,6 +77,13 @@ class Ways:
         """Lattice point nearest to ``position`` (3,) m in the largest piece."""
         return int(self.nodes[self._lookup.query(position)[1]])
 
+    def walled(self, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+        """Whether there is wall between places (n, 3) m in the lumen: (n,) bool."""
+        share = np.linspace(0.0, 1.0, 7)[1:-1, None, None]
+        between = first + share * (last - first)
+        off = self._lookup.query(between, distance_upper_bound=1.5 * LATTICE)[0]
+        return np.asarray(np.isinf(off).any(axis=0))
+
     def around(self, node: int, radius: float) -> np.ndarray:
         """Rows (m,) of the points in a ball (m) that are joined to its middle in it."""
         near = self.nodes[self._lookup.query_ball_point(self.points[node], radius)]
@@ -94,7 +108,7 @@ class Ways:
                 raise ValueError(
                     f"the {which} of centreline {name!r} lies in a part of the lumen "
                     "that is closed off: between it and the rest the lumen is narrower "
-                    f"than {LATTICE * 1e3:g} mm. Open the vessel in the segmentation, "
+                    f"than {mm(LATTICE):.2g} mm. Open the vessel in the segmentation, "
                     "or leave this branch out."
                 )
         far = 5.0 * CORRIDOR

@@ -1,0 +1,222 @@
+"""The surface of the labels of a segmented scan."""
+
+import bz2
+import gzip
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.anatomy.scan.mesh import parsed
+from cathsim_dmc.anatomy.scan.units import to_lps
+
+LABEL_MAPS = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
+BLUR = 0.7  # voxels, standard deviation that takes the steps off a surface
+MOST_VOXELS = 500_000_000  # of a label map: 512 x 512 x 1,900
+_PAD = 3  # voxels around the labels
+_MOST_LABELS = 500
+_DIFFER = 0.3  # of neighbours in an image, at least; of labels far less
+_HEADER = 16_384  # bytes of a MetaImage that hold its header
+_NIFTI_UNITS = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6, "unknown": 1e-3}
+
+
+def label_surface(
+    path: str | Path, labels: Sequence[int] = ()
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Surface of the labels of a label map that are the lumen, or of its only one.
+
+    Returns:
+        (vertices (V, 3) m in LPS, faces (F, 3), a line that says what was taken).
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no label map, the package that reads it is missing, or
+            the labels are not in it; lists those that are.
+    """
+    from scipy.ndimage import find_objects, gaussian_filter
+    from skimage.measure import marching_cubes
+
+    path = Path(path)
+    ending = path.suffix.lower().lstrip(".")
+    read, kind, extra = _READERS.get(ending, _READERS["nii"])
+    voxels, matrix, origin, names = parsed(path, kind, read, extra)
+    if voxels.ndim != 3:
+        raise ValueError(
+            f"{path} has the shape {voxels.shape}; give one label map in three "
+            "dimensions (3D Slicer: export the segmentation as a label map)."
+        )
+    values, counts = np.unique(voxels, return_counts=True)
+    if grey := _grey(voxels, values):
+        raise ValueError(
+            f"{path} holds {grey}, so it is an image; segment its lumen first (3D "
+            "Slicer, TotalSegmentator) and give the label map."
+        )
+    seen = {int(k): int(n) for k, n in zip(values, counts, strict=True) if k != 0}
+    chosen = [int(k) for k in labels] or list(seen)
+    if (not labels and len(seen) != 1) or not set(chosen) <= set(seen):
+        listed = ", ".join(
+            f"{k} {names.get(k, '')}".strip() + f" ({n:,} voxels)"
+            for k, n in list(seen.items())[:20]
+        )
+        missing = [k for k in chosen if k not in seen]
+        lacks = f"no label {missing[0]}; it has " if missing else ""
+        raise ValueError(
+            f"{path} has {lacks}{len(seen)} labels: {listed or 'all voxels are 0'}; "
+            "choose those of the lumen (--label)."
+        )
+    mask = np.isin(voxels, chosen)
+    (box,) = find_objects(mask.astype(np.uint8))
+    low = [rows.start for rows in box]
+    part = gaussian_filter(np.pad(mask[box], _PAD).astype(np.float32), BLUR)
+    points, faces, _, _ = marching_cubes(part, 0.5)
+    vertices = (points + low - _PAD) @ matrix.T + origin
+    if np.linalg.det(matrix) > 0.0:
+        faces = faces[:, ::-1]
+    size = " x ".join(f"{x * 1e3:.2g}" for x in np.linalg.norm(matrix, axis=0))
+    called = ", ".join(f"{k} {names.get(k, '')}".strip() for k in chosen)
+    taken = f"label {called} of {path.name}: {int(mask.sum()):,} voxels of {size} mm"
+    return vertices, faces.astype(np.int64), f"{taken}; unit and frame are the file's"
+
+
+def _require_few(shape: Sequence[int]) -> int:
+    """Number of voxels that a header announces; ValueError if there are too many."""
+    count = math.prod(map(int, shape))
+    if not 0 <= count <= MOST_VOXELS:
+        raise ValueError(
+            f"it announces {count / 1e6:,.0f} million voxels; at most "
+            f"{MOST_VOXELS / 1e6:,.0f} million are read: crop it to the lumen"
+        )
+    return count
+
+
+def _require_end(path: Path, count: int, encoding: str, detached: bool) -> None:
+    """ValueError if the packed voxels of a NRRD file go on after its last voxel.
+
+    Its reader unpacks the file to its end.
+    """
+    opened = {"gz": gzip.open, "bz": bz2.open}
+    if encoding[:2] not in opened:
+        return
+    left = 8 * count + 2**16  # bytes; no voxel has more than 8
+    with path.open("rb") as stream:
+        while not detached and stream.readline().strip():
+            pass
+        unpacked = opened[encoding[:2]](stream)
+        while left > 0 and (part := unpacked.read(2**20)):
+            left -= len(part)
+    if left <= 0:
+        raise ValueError(f"it holds more than the {count:,} voxels that it announces")
+
+
+def _grey(voxels: np.ndarray, values: np.ndarray) -> str:
+    """What shows that voxels are the grey values of an image, or nothing."""
+    if not np.array_equal(np.rint(values), values):
+        return "numbers that are not whole"
+    if values[0] < 0:
+        return f"negative numbers (from {values[0]:g} on)"
+    if len(values) > _MOST_LABELS:
+        return f"{np.count_nonzero(values):,} different numbers"
+    # Labels are the same in whole regions; grey values differ from voxel to voxel.
+    differ = both = 0
+    for axis in range(3):
+        one, other = (np.delete(voxels, end, axis) for end in (0, -1))
+        inside = (one != 0) & (other != 0)
+        both += int(inside.sum())
+        differ += int((inside & (one != other)).sum())
+    if differ > _DIFFER * both:
+        return f"neighbours that differ at {differ / both:.0%} of the places"
+    return ""
+
+
+def _nifti(path: Path):
+    """Voxels, matrix (3, 3) and origin (3,) to m in LPS, names of labels."""
+    import nibabel
+
+    image: Any = nibabel.load(path)
+    unit = _NIFTI_UNITS.get(image.header.get_xyzt_units()[0], 1e-3)
+    affine = unit * to_lps("m", "RAS") @ image.affine[:3]
+    _require_few(image.shape)
+    voxels = np.asanyarray(image.dataobj)
+    shape = voxels.shape[:3] + tuple(n for n in voxels.shape[3:] if n != 1)
+    return voxels.reshape(shape), affine[:, :3], affine[:, 3], {}
+
+
+def _nrrd(path: Path):
+    """As `_nifti`; Slicer's files name their labels."""
+    import nrrd
+
+    header = nrrd.read_header(str(path))
+    data, detached = path, {"datafile", "data file"} & set(header)
+    if detached:
+        # Only a file beside it: a header may name any.
+        named = str(header[detached.pop()])
+        data = path.parent / named
+        if path.suffix.lower() != ".nhdr" or Path(named).name != named:
+            raise ValueError(
+                "its voxels are in another file; save both as one .nrrd file"
+            )
+    count = _require_few(np.atleast_1d(header["sizes"]).tolist())
+    _require_end(data, count, str(header.get("encoding")), data is not path)
+    voxels, header = nrrd.read(str(path))
+    space = str(header.get("space", "LPS")).upper()
+    space = "".join(re.findall(r"\b\w", space)) if "-" in space else space
+    to = to_lps("mm", space)
+    if "space directions" not in header:
+        raise ValueError(
+            "its header lacks 'space directions', the size and place of its voxels"
+        )
+    rows = np.asarray(header["space directions"], dtype=float)
+    origin = np.asarray(header.get("space origin", np.zeros(3)), dtype=float)
+    names = {
+        int(value): str(header.get(key.replace("_LabelValue", "_Name"), ""))
+        for key, value in header.items()
+        if key.endswith("_LabelValue")
+    }
+    return voxels, to @ rows.T, to @ origin, names
+
+
+def _meta(path: Path):
+    """As `_nifti`, of a MetaImage."""
+    from vtkmodules import vtkIOImage
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    lines = path.read_bytes()[:_HEADER].decode("latin-1").splitlines()
+    entries = {}
+    for line in lines:
+        key, _, value = line.partition("=")
+        entries[key.strip()] = value.split()
+        if key.strip() == "ElementDataFile":
+            break
+    if entries.get("NDims") != ["3"]:
+        raise ValueError("its header does not say NDims = 3")
+
+    def numbers(names: str, default: np.ndarray) -> np.ndarray:
+        given = [entries[name] for name in names.split() if name in entries]
+        return np.array(given[0], dtype=float) if given else default
+
+    # A row is the direction of an axis.
+    turn = numbers("TransformMatrix Rotation Orientation", np.eye(3).ravel())
+    spacing = numbers("ElementSpacing ElementSize", np.ones(3))
+    origin = numbers("Offset Position Origin", np.zeros(3))
+    _require_few([int(size) for size in entries.get("DimSize", [])])
+    reader = vtkIOImage.vtkMetaImageReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    image = reader.GetOutput()
+    if reader.GetErrorCode() or not image.GetNumberOfPoints():
+        raise ValueError("it is damaged, or no MetaImage")
+    data = vtk_to_numpy(image.GetPointData().GetScalars())
+    voxels = data.reshape(image.GetDimensions()[::-1]).transpose()
+    return voxels, 1e-3 * turn.reshape(3, 3).T * spacing, 1e-3 * origin, {}
+
+
+_READERS = {
+    "nii": (_nifti, "nii", "segmentation"),
+    "nrrd": (_nrrd, "nrrd", "segmentation"),
+    "nhdr": (_nrrd, "nrrd", "segmentation"),
+    "mha": (_meta, "mha", "vtp"),
+    "mhd": (_meta, "mha", "vtp"),
+}

@@ -1,0 +1,186 @@
+"""Files of other programs: VTK's surfaces and centrelines, label maps, and images."""
+
+import zlib
+
+import numpy as np
+import pytest
+from synthetic_scans import marched, y_tree
+
+from cathsim_dmc.anatomy.scan.curves import read_curves
+from cathsim_dmc.anatomy.scan.labels import label_surface
+from cathsim_dmc.anatomy.scan.mesh import read_triangles
+
+
+def poly_data(points, faces=(), lines=(), **cells):
+    """A vtkPolyData of points, triangles, lines and arrays of its cells."""
+    core = pytest.importorskip("vtkmodules.vtkCommonCore")
+    model = pytest.importorskip("vtkmodules.vtkCommonDataModel")
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+
+    data, places = model.vtkPolyData(), core.vtkPoints()
+    places.SetData(numpy_to_vtk(np.asarray(points, dtype=float), deep=True))
+    data.SetPoints(places)
+    for rows, put in ((faces, data.SetPolys), (lines, data.SetLines)):
+        array = model.vtkCellArray()
+        for row in rows:
+            array.InsertNextCell(len(row), [int(k) for k in row])
+        put(array)
+    for name, values in cells.items():
+        array = numpy_to_vtk(np.asarray(values), deep=True)
+        array.SetName(name)
+        data.GetCellData().AddArray(array)
+    return data
+
+
+def written(data, path):
+    """The file of a vtkPolyData, in VTK's old or new format."""
+    from vtkmodules import vtkIOLegacy, vtkIOXML
+
+    old = path.suffix == ".vtk"
+    writer = (vtkIOLegacy.vtkPolyDataWriter if old else vtkIOXML.vtkXMLPolyDataWriter)()
+    writer.SetFileName(str(path))
+    writer.SetInputData(data)
+    writer.Write()
+    return path
+
+
+def test_surfaces_in_the_old_format_of_vtk(tmp_path):
+    vertices, faces = marched(y_tree(), 3e-3)
+    path = written(poly_data(vertices, faces), tmp_path / "lumen.vtk")
+    points, triangles = read_triangles(path)
+    np.testing.assert_allclose(points[triangles], vertices[faces], atol=1e-4)
+    line = written(poly_data(vertices, (), [range(9)]), tmp_path / "line.vtk")
+    with pytest.raises(ValueError, match="0 triangles.*lines are centrelines"):
+        read_triangles(line)
+    volume = tmp_path / "volume.vtk"
+    text = path.read_bytes().replace(b"DATASET POLYDATA", b"DATASET UNSTRUCTURED_GRID")
+    volume.write_bytes(text)
+    with pytest.raises(ValueError, match="no PolyData; extract the surface first"):
+        read_triangles(volume)
+
+
+@pytest.mark.parametrize("ending", [".vtp", ".vtk"])
+def test_the_centrelines_of_vmtk(tmp_path, ending):
+    """A file holds all ways; those that are split at forks are joined again."""
+    t = np.linspace(0.0, 1.0, 11)[:, None]
+    stem, one, other = (
+        a + t * (np.array(b) - a)
+        for a, b in (
+            (np.zeros(3), (0, 0, 30)),
+            (np.array((0, 0, 30)), (10, 0, 60)),
+            (np.array((0, 0, 30)), (-10, 0, 60)),
+        )
+    )
+    points = np.concatenate([stem, one, other])
+    rows = [np.arange(11), np.arange(11, 22), np.arange(22, 33)]
+    whole = [[*rows[0], *rows[1]], [*rows[0], *rows[2]]]
+    path = written(poly_data(points, (), whole), tmp_path / f"centreline-A{ending}")
+    curves = read_curves([path], "mm", "RAS", None)
+    assert list(curves) == ["a_1", "a_2"]
+    np.testing.assert_allclose(curves["a_1"][-1], (-10e-3, 0, 60e-3), atol=1e-6)
+    assert len(curves["a_1"]) == 21  # the fork is in both pieces
+    # The second piece of the first way comes before its first.
+    split = [rows[1], rows[0], rows[0], rows[2]]
+    ids = {"CenterlineIds": [0, 0, 1, 1], "TractIds": [1, 0, 0, 1]}
+    path = written(poly_data(points, (), split, **ids), tmp_path / f"b{ending}")
+    again = read_curves([path], "mm", "RAS", None)
+    for name, curve in curves.items():
+        np.testing.assert_allclose(again[name.replace("a", "b")], curve, atol=1e-9)
+    single = written(poly_data(points, (), [rows[0]]), tmp_path / f"lcca{ending}")
+    assert list(read_curves([single], "mm", "LPS", None)) == ["lcca"]
+    none = written(poly_data(points, [(0, 11, 22)]), tmp_path / f"none{ending}")
+    with pytest.raises(ValueError, match="holds no lines"):
+        read_curves([none], "mm", "LPS", None)
+
+
+SPACING, ORIGIN = np.array((0.8, 0.9, 1.0)), np.array((5.0, -3.0, 20.0))
+TURN = np.array([(0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])  # rows: axes
+
+
+def ball():
+    """Labels of a ball off the middle of a box of voxels."""
+    ijk = np.stack(np.meshgrid(*map(np.arange, (30, 26, 22)), indexing="ij"), -1)
+    return (np.linalg.norm((ijk - (16, 11, 10)) * SPACING, axis=-1) < 6).astype("u1")
+
+
+def meta(path, voxels, element="MET_UCHAR", packed=True):
+    """A MetaImage, its voxels in the same file."""
+    data = voxels.transpose().tobytes()
+    body = zlib.compress(data) if packed else data
+    entries = {
+        "ObjectType": "Image",
+        "NDims": 3,
+        "BinaryData": True,
+        "BinaryDataByteOrderMSB": False,
+        "CompressedData": packed,
+        **({"CompressedDataSize": len(body)} if packed else {}),
+        "TransformMatrix": " ".join(f"{x:g}" for x in TURN.ravel()),
+        "Offset": " ".join(f"{x:g}" for x in ORIGIN),
+        "ElementSpacing": " ".join(f"{x:g}" for x in SPACING),
+        "DimSize": " ".join(map(str, voxels.shape)),
+        "ElementType": element,
+        "ElementDataFile": "LOCAL",
+    }
+    head = "".join(f"{key} = {value}\n" for key, value in entries.items())
+    path.write_bytes(head.encode() + body)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["mha", "mha packed", "nhdr"])
+def test_label_maps_of_itk_lie_where_they_were_saved(tmp_path, kind):
+    if kind == "nhdr":
+        nrrd = pytest.importorskip("nrrd")
+        path = tmp_path / "map.nhdr"
+        header = {
+            "space": "left-posterior-superior",
+            "space directions": TURN * SPACING[:, None],
+            "space origin": ORIGIN,
+        }
+        nrrd.write(str(path), ball(), header, detached_header=True)
+    else:
+        pytest.importorskip("vtkmodules")
+        path = meta(tmp_path / "map.mha", ball(), packed="packed" in kind)
+    vertices, faces, why = label_surface(path)
+    middle = 1e-3 * (ORIGIN + (np.array((16, 11, 10)) * SPACING) @ TURN)
+    np.testing.assert_allclose(vertices.mean(axis=0), middle, atol=0.1e-3)
+    assert np.linalg.norm(vertices - middle, axis=1).max() < 7e-3
+    assert len(faces) > 100 and "label 1" in why
+
+
+def test_a_header_names_no_file_elsewhere(tmp_path):
+    nrrd = pytest.importorskip("nrrd")
+    path = tmp_path / "map.nhdr"
+    nrrd.write(str(path), ball(), detached_header=True)
+    text = path.read_bytes()
+    start = text.index(b"data file: ") + 11
+    stop = text.index(b"\n", start)
+    path.write_bytes(text[:start] + b"/etc/hostname" + text[stop:])
+    with pytest.raises(ValueError, match="its voxels are in another file"):
+        label_surface(path)
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (lambda noise: (40 * noise - 900).astype("i2"), "negative numbers"),
+        (lambda noise: (40 * noise + 2000).astype("i2"), "neighbours that differ"),
+        (lambda noise: (300 * noise + 9000).astype("i2"), "different numbers"),
+    ],
+    ids=["CT", "few grey values", "many"],
+)
+def test_images_are_told_from_label_maps(tmp_path, image, words):
+    nibabel = pytest.importorskip("nibabel")
+    noise = np.random.default_rng(0).normal(size=(16, 16, 16))
+    path = tmp_path / "image.nii.gz"
+    nibabel.save(nibabel.Nifti1Image(image(noise), np.eye(4)), path)
+    with pytest.raises(
+        ValueError, match=f"{words}.*so it is an image; segment"
+    ) as error:
+        label_surface(path, (1,))
+    assert "\n" not in str(error.value)
+    # Many labels in thin vessels are none.
+    labels = ball().astype("i2") * 300
+    labels[:, :12] = np.where(labels[:, :12], 120, 0)
+    labels[2:20:3] = 7
+    nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), path)
+    assert "label 300" in label_surface(path, (300,))[2]
