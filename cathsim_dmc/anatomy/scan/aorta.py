@@ -19,8 +19,11 @@ WIDEST = 4  # ends from which the aorta may start
 SMOOTH = 6e-3  # m, standard deviation along the way, which steps from node to node
 ARM = 60e-3  # m to both sides of a place, over which the bend there is taken
 TURN = np.radians(75.0)  # least bend of an arch
+ADULT = 6.0  # mm, least median radius of an aorta that may be cut off at its branches
 LOOP = np.radians(140.0)  # least bend of an arch of which one branch is seen
-THIRD = 0.7  # of the aorta's width: a branch at the bend that is wider is a limb
+# Of the aorta's width: a branch at the bend that is wider is a limb; and the same where
+# an end of the aorta is narrower than the last number.
+THIRD, THIRD_OF_TAPERED, TAPERED = 0.85, 0.65, 0.7
 TURN_OF_STUMP = np.radians(60.0)  # the same of one that is cut off past its branches
 LEG = 80e-3  # m of each leg that are compared, from 10 mm past the branches on
 # m of a limb from the bend on, at most half, that has no direction yet; its length from

@@ -11,7 +11,12 @@ from cathsim_dmc.anatomy.scan import aorta, extract, naming
 from cathsim_dmc.anatomy.scan.aorta import Bend
 from cathsim_dmc.anatomy.scan.extract import FreeEnd, LumenEntry, listed
 from cathsim_dmc.anatomy.scan.naming import SURE, Naming
-from cathsim_dmc.anatomy.scan.offshoots import Offshoot, offshoots, third_limb
+from cathsim_dmc.anatomy.scan.offshoots import (
+    Offshoot,
+    departures,
+    offshoots,
+    third_limb,
+)
 from cathsim_dmc.anatomy.scan.units import mm, shown
 from cathsim_dmc.anatomy.scan.ways import Ways
 
@@ -95,9 +100,12 @@ class Arch:
                 f"{shown(limb[0])}, where that bends; the branches of an arch are much "
                 "narrower than the aorta"
             )
-        turn = aorta.TURN if len(found) > 1 else aorta.LOOP
-        if not found or bend.turn < turn:
-            count = "no branch leaves" if not found else "one branch leaves"
+        count = len(found)
+        if bend.turn < aorta.TURN and mm(float(np.median(width))) > aorta.ADULT:
+            # Cut off past its branches, where it would turn.
+            count = len(list(departures(bend, width, self.found)))
+        if not count or (count == 1 and bend.turn < aorta.LOOP):
+            count = "one branch leaves" if count else "no branch leaves"
             return (
                 f"{count} the widest way where it bends, by "
                 f"{np.degrees(bend.turn):.0f} degrees"

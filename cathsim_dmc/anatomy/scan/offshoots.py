@@ -11,7 +11,15 @@ from scipy.spatial import cKDTree
 from scipy.special import softmax
 
 from cathsim_dmc.anatomy.centreline import arc_lengths
-from cathsim_dmc.anatomy.scan.aorta import ARM, BRANCH, THIRD, Bend, chord
+from cathsim_dmc.anatomy.scan.aorta import (
+    ARM,
+    BRANCH,
+    TAPERED,
+    THIRD,
+    THIRD_OF_TAPERED,
+    Bend,
+    chord,
+)
 from cathsim_dmc.anatomy.scan.centring import resample
 from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common
@@ -117,7 +125,10 @@ def third_limb(
 
     None if all are much narrower than the aorta, as those of an arch are.
     """
-    widest, found = THIRD, None
+    sixth = max(1, len(depth) // 6)
+    ends = min(float(np.median(end)) for end in (depth[:sixth], depth[-sixth:]))
+    tapered = ends < TAPERED * float(np.median(depth))
+    widest, found = THIRD_OF_TAPERED if tapered else THIRD, None
     for _, row, s in departures(bend, depth, curves):
         if abs(s - 1e-3 * bend.apex) > ARM:
             continue
