@@ -92,6 +92,13 @@ def test_the_command_draws_what_it_imports(y_anatomy, tmp_path, monkeypatch, cap
     said = json.loads(capsys.readouterr().out)
     assert Path(said["picture"]).parent == tmp_path / "one"
     assert Path(said["picture"]).stat().st_size > 20_000
+    first, second = said["next"]
+    assert first.startswith("cathsim eval pretrained:navigator --anatomy")
+    assert "--goal left" in first and second.endswith("check.png")
+    options = {"out": tmp_path / "two", "device": "microcatheter_021"}
+    phantoms.import_phantom(Path("lumen.obj"), **options)
+    first, _ = json.loads(capsys.readouterr().out)["next"]
+    assert "eval push" in first and "--device microcatheter_021" in first
 
 
 @pytest.mark.slow

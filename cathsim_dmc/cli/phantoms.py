@@ -98,14 +98,23 @@ def import_phantom(
 
 
 def _next_commands(anatomy: Anatomy, out: Path, device: str | None) -> list[str]:
-    """What to type after an import: the navigator to a goal, and the picture."""
+    """What to type after an import: the navigator to a goal, and the picture.
+
+    The navigator steers one device; others are pushed.
+    """
     picture = shlex.join([sys.executable, "-m", "webbrowser", str(out / _PICTURE)])
     if not anatomy.goals:
         return [picture]
     goal = next((name for name in _FIRST if name in anatomy.goals), None)
-    command = ["cathsim", "eval", "pretrained:navigator", "--anatomy", str(out)]
-    command += ["--goal", goal or next(iter(anatomy.goals)), "--episodes", "10"]
-    if device is not None:
+    goal = goal or next(iter(anatomy.goals))
+    narrow = float(anatomy.route(goal).radii.min())
+    if device is None and narrow < devices.STEERABLE_5F.outer_radius:
+        device = "wire_014_micro"  # as the import has it
+    own = device in (None, devices.STEERABLE_5F.name)
+    policy = "pretrained:navigator" if own else "push"
+    command = ["cathsim", "eval", policy, "--anatomy", str(out), "--goal", goal]
+    command += ["--episodes", "10"]
+    if device is not None and not own:
         command += ["--device", device]
     return [shlex.join([*command, "--no-baseline"]), picture]
 
