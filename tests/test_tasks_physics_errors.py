@@ -1,3 +1,4 @@
+import json
 import logging
 
 import numpy as np
@@ -6,7 +7,7 @@ from conftest import twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
-from cathsim_dmc.simulation import batch
+from cathsim_dmc.simulation import batch, error_files
 from cathsim_dmc.tasks import physics_errors
 
 
@@ -99,3 +100,80 @@ def test_an_unstable_model_ends_with_a_reason_and_disturbs_nobody(task):
     assert none == [None] * 3
     np.testing.assert_array_equal(disturbed[:, [0, 2]], alone[:, [0, 2]])
     assert (disturbed[0, 1] != alone[0, 1]).any()
+
+
+# Files of physics errors.
+
+
+def _failing(task_name, folder, monkeypatch, num_envs=2, **options):
+    """An environment whose episodes fail at the first contact, and their errors."""
+    from cathsim_dmc.simulation.torchrl import BatchedEnv
+
+    monkeypatch.setattr(physics_errors, "MAX_FORCE", 1e-5)
+    env = BatchedEnv(
+        task_name, num_envs, num_threads=1, seed=3, task_kwargs={**options}
+    )
+    env.record_errors(folder)
+    simulation = env.simulation
+    simulation.reset()
+    action = np.zeros((num_envs, simulation.num_actions))
+    action[:, 0] = action[:, -1] = 1.0
+    for _ in range(200):
+        step = simulation.step(action)
+        if step.physics_error.all():
+            return simulation, step
+    raise AssertionError("nothing was touched")
+
+
+def test_an_error_leaves_a_file_that_a_command_plays_again(
+    tmp_path, monkeypatch, cathsim, caplog
+):
+    simulation, step = _failing(
+        "simple1_bca", tmp_path / "errors", monkeypatch, randomisation=True
+    )
+    paths = sorted((tmp_path / "errors").glob("*.npz"))
+    assert len(paths) == 2
+    assert all(str(path) in caplog.text for path in paths)
+    again = [error_files.PhysicsError.load(path).replay() for path in paths]
+    forces = [one.wall_force.peak_max[0] for one in again]
+    assert all(one.errors == (physics_errors.EXPLODED,) for one in again)
+    assert set(step.wall_force.peak_max) & set(forces)
+    code, out, err = cathsim("replay-error", paths[0], "--json")
+    assert code == 0, err
+    check = json.loads(out)["checks"][0]
+    assert check["value"] == check["bound"] == physics_errors.EXPLODED
+    monkeypatch.undo()  # where nothing fails
+    code, out, err = cathsim("replay-error", paths[0])
+    assert code == 1 and "now: no error" in out
+    (tmp_path / "other.npz").write_bytes(paths[0].read_bytes()[:-100])
+    code, _, err = cathsim("replay-error", tmp_path / "other.npz")
+    assert code == 2 and "no file of a physics error" in err
+
+
+def test_a_folder_keeps_the_last_few_errors_one_of_an_episode(
+    tmp_path, monkeypatch, small_disk, caplog
+):
+    simulation, _ = _failing("simple1_bca", tmp_path, monkeypatch, 1)
+    written = list(tmp_path.glob("*.npz"))
+    for _ in range(error_files.KEPT + 1):
+        simulation.reset()
+        simulation.batch.qvel[:] = 1e12
+        for _ in range(2):  # stepping on adds none
+            simulation.step(np.zeros((1, simulation.num_actions)))
+        (new,) = set(tmp_path.glob("*.npz")) - set(written)
+        written.append(new)
+    assert set(tmp_path.iterdir()) == set(written[-error_files.KEPT :])
+    held = set(tmp_path.iterdir())
+    simulation.reset()
+    simulation.batch.qvel[:] = 1e12
+    with small_disk(100):
+        step = simulation.step(np.zeros((1, simulation.num_actions)))
+    assert step.physics_error.all() and "is lost" in caplog.text
+    assert set(tmp_path.iterdir()) == held
+
+
+def test_objects_among_the_options_are_named(tmp_path):
+    files = error_files.ErrorFiles(tmp_path, "simple1_bca", {"effects": [object()]})
+    assert not files._whole and "object" in files._options["effects"][0]
+    files = error_files.ErrorFiles(tmp_path, "simple1_bca", {"rotation": True})
+    assert files._whole and files._options == {"rotation": True}

@@ -29,6 +29,7 @@ from cathsim_dmc.analysis.force_statistics import QUANTITIES, STATISTICS
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 EnvFactory = Callable[..., EnvBase]
 # Called after every step with the environment and which episodes (n,) bool still run.
@@ -160,6 +161,7 @@ def evaluate(
     num_threads: int | None = None,
     out_dir: str | Path | None = None,
     observer: Observer | None = None,
+    start: Snapshot | None = None,
     make_env: EnvFactory = environments.make_env,
     on_cluster: bool = False,
 ) -> EvaluationResult:
@@ -180,8 +182,11 @@ def evaluate(
         task_kwargs: Further options of the task; None takes those that the policy was
             trained with. A device among them is played in all episodes.
         num_threads: Number of threads of the simulation; None takes one per core.
-        out_dir: Directory for evaluation.json; None writes none.
+        out_dir: Directory for evaluation.json and, in errors/, the last physics errors;
+            None writes none.
         observer: Function that is called after every step, before any reset.
+        start: State in the middle of as many episodes, which are played on and counted
+            from there; None for the starts of the task.
         make_env: Function with the arguments of `environments.make_env`; "info" of its
             environment has "success", "physics_error", "path_ratio" and the forces
             `physics.forces.NAMES`.
@@ -192,10 +197,12 @@ def evaluate(
 
     Raises:
         ValueError: no task is known, episodes < 1, the protocol sets a given option, or
-            the cluster has too few processors.
+            `start` does not fit, or the cluster has too few processors.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     conditions = protocols.get(protocol)
+    if start is not None:
+        episodes = _started(start, episodes, protocol)
     episodes = conditions.episodes if episodes is None else episodes
     bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
     bounds.seed("seed", seed)
@@ -212,11 +219,12 @@ def evaluate(
     if out_dir is not None:
         # Now: an evaluation that cannot be written would be lost.
         files.require_folder(out_dir, make=True)
+    errors = None if out_dir is None else Path(out_dir).absolute() / "errors"
     wholes = [
         _Group(
             part, range(len(part.seeds)), player, bool(conditions.task_kwargs),
-            functools.partial(make_env, task, observation=observed),
-            num_threads, torch.get_num_threads(),
+            functools.partial(_recorded, make_env, errors, task, observation=observed),
+            num_threads, torch.get_num_threads(), start,
         )
         for part in parts
     ]  # fmt: skip
@@ -236,7 +244,7 @@ def evaluate(
             "protocol": protocol, "observation": observed, "task_kwargs": options,
             "frames": trained and trained.frames,
         },
-        protocols.distinct(task, parts[0].task_kwargs, episodes),
+        start is not None or protocols.distinct(task, parts[0].task_kwargs, episodes),
         tuple(drawn for part in parts for drawn in part.conditions),
     )  # fmt: skip
     if out_dir is not None:
@@ -256,6 +264,7 @@ class _Group:
         make_env: Function of num_envs, num_threads, seed and task_kwargs.
         num_threads: Number of threads of the simulation; None for one per core.
         torch_threads: Number of threads of torch, which rounding depends on.
+        start: State at which the episodes of the part begin; None for their starts.
     """
 
     part: protocols.Part
@@ -265,6 +274,7 @@ class _Group:
     make_env: EnvFactory
     num_threads: int | None
     torch_threads: int
+    start: Snapshot | None
 
     def pieces(self, size: int) -> list["_Group"]:
         """Groups of so many of its episodes each, or of fewer."""
@@ -274,6 +284,14 @@ class _Group:
         return [replace(self, rows=rows, num_threads=threads) for rows in cut]
 
 
+def _recorded(make_env: EnvFactory, folder: Path | None, *args, **kwargs) -> EnvBase:
+    """An environment that writes physics errors to a folder, None for none."""
+    env = make_env(*args, **kwargs)
+    if folder is not None:
+        environments.record_errors(env, folder)
+    return env
+
+
 def _play(group: _Group, observer: Observer | None) -> list[EpisodeOutcome]:
     seeds = group.part.seeds[group.rows.start : group.rows.stop]
     env = group.make_env(
@@ -281,9 +299,10 @@ def _play(group: _Group, observer: Observer | None) -> list[EpisodeOutcome]:
         seed=seeds if group.varied else seeds[0], task_kwargs=group.part.task_kwargs,
     )  # fmt: skip
     first = group.rows.start
+    start = None if group.start is None else group.start[first : group.rows.stop]
     policy = group.player.among(first, len(group.part.seeds))
     with contextlib.closing(env):
-        found = _first_episodes(env, policy, observer)
+        found = _first_episodes(env, policy, observer, start)
     return [replace(outcome, env=first + outcome.env) for outcome in found]
 
 
@@ -319,14 +338,30 @@ def _play_apart(job: tuple[_Group, bool]) -> tuple[list[EpisodeOutcome], "Contac
     return _play(group, contacts if wanted else None), contacts
 
 
+def _started(start: Snapshot, episodes: int | None, protocol: str) -> int:
+    """Number of episodes that begin at a snapshot; ValueError for other settings."""
+    if protocol != "published":
+        raise ValueError(
+            f"start has the conditions of its episodes, so the protocol {protocol!r} "
+            "cannot draw them; leave it out"
+        )
+    if episodes not in (None, len(start)):
+        raise ValueError(
+            f"episodes is {bounds.shown(episodes)}, but start is of {len(start)} "
+            "simulations; leave episodes out, or choose some with snapshot[...]"
+        )
+    return len(start)
+
+
 @torch.no_grad()
 def _first_episodes(
-    env: EnvBase, policy: Policy, observer: Observer | None
+    env: EnvBase, policy: Policy, observer: Observer | None, start: Snapshot | None
 ) -> tuple[EpisodeOutcome, ...]:
     (count,) = env.batch_size
     view, tracker = view_of(env), EpisodeTracker(count)
     outcomes: dict[int, EpisodeOutcome] = {}
-    state, begun = env.reset(), np.ones(count, dtype=bool)
+    begun = np.ones(count, dtype=bool)
+    state = env.reset() if start is None else env.reset(snapshot=start)
     running = begun
     while running.any():
         state = env.maybe_reset(state)

@@ -77,10 +77,11 @@ def train(
     """Train an agent, or continue a run from its newest checkpoint.
 
     The directory receives config.json, metrics.csv and checkpoints/<frames>/ (SAC:
-    also replay/). SIGINT or SIGTERM end the run after the current batch with a
-    checkpoint. After kill -9, `resume=True` continues from the newest complete
-    checkpoint: frames are counted from there, rows of metrics.csv beyond it are
-    dropped, episodes that were running start anew. One process at a time trains there.
+    also replay/), and errors/ with the last physics errors. SIGINT or SIGTERM end the
+    run after the current batch with a checkpoint. After kill -9, `resume=True`
+    continues from the newest complete checkpoint: frames are counted from there, rows
+    of metrics.csv beyond it are dropped, episodes that were running start anew. One
+    process at a time trains there.
 
     Args:
         resume: Whether to continue the run there. One that was killed before its
@@ -122,6 +123,7 @@ def train(
             num_envs=config.num_envs, num_threads=config.num_threads, seed=seed,
             task_kwargs=config.training_kwargs,
         )  # fmt: skip
+        environments.record_errors(env, run / "errors")
         torch.manual_seed(config.seed)
         shapes = NetworkShapes.of(env.observation_spec, env.action_spec)
         learner = LEARNERS[config.algorithm].learner(config, shapes, run)

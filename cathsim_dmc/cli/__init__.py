@@ -27,6 +27,10 @@ COMMANDS = {
     "record": ("agents:record", "Record one episode: as a Rerun file, or as a film."),
     "demos": ("agents:demos", "Write demonstrations of the expert as a dataset."),
     "replay": ("recordings:replay", "Open a recording in the Rerun viewer."),
+    "replay-error": (
+        "recordings:replay_error",
+        "Do the control step of a physics error again.",
+    ),
     "play": ("agents:play", "Cannulate by keyboard, with the forces on the screen."),
     "doctor": ("checks:doctor", "Check what is installed; say what to do."),
     "export": ("exporting:export", "Write a task's scene as MJCF for other programs."),

@@ -41,6 +41,7 @@ from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 _POLICY = (
     "Directory of a run or checkpoint, or name of a policy: random, push, expert, "
@@ -76,6 +77,7 @@ def evaluate(
     protocol: Literal["published", "varied"] = "published",
     out: Path | None = None,
     baseline: bool = True,
+    start: Path | None = None,
     threads: Threads = None,
     ray: Ray = False,
     report: bool = False,
@@ -93,8 +95,11 @@ def evaluate(
         protocol: Conditions: "published", where episodes differ by 1 mm of the start,
             or "varied", where start, roll, friction, stiffness, damping, delay, device
             and noise differ from episode to episode.
-        out: Directory for evaluation.json and, of one anatomy, heatmap.png.
+        out: Directory for evaluation.json, of one anatomy heatmap.png, and errors/ with
+            the last physics errors.
         baseline: Whether to compare with the random policy on the same seeds.
+        start: File of a snapshot (`snapshot().save`): one episode for each of its
+            simulations, from there on.
         report: Whether to print each episode too: seed, anatomy, device, end, time,
             path and forces (docs/start.md).
         options: Options of the task, over those that the policy was trained with.
@@ -107,6 +112,7 @@ def evaluate(
     contacts = evaluation.ContactLog()
     common: Any = {"protocol": protocol, "task_kwargs": task_kwargs}
     common |= {"num_threads": threads, "on_cluster": ray}
+    common |= {"start": None if start is None else Snapshot.load(start)}
 
     def play(who: Any, out_dir: Path | None = None) -> EvaluationResult:
         name, asked = getattr(who, "name", who), (task, episodes, seed)

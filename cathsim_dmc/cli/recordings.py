@@ -1,4 +1,4 @@
-"""`cathsim dataset` and `replay`."""
+"""`cathsim dataset`, `replay` and `replay-error`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,9 +6,18 @@ from typing import Annotated
 from tyro import conf
 
 from cathsim_dmc import bounds
-from cathsim_dmc.cli.options import Json, Ray, print_json, say, told_of_losses
+from cathsim_dmc.cli.options import (
+    CHECK_FAILED,
+    Json,
+    Modules,
+    Ray,
+    print_json,
+    say,
+    told_of_losses,
+)
 from cathsim_dmc.recording import viewer
 from cathsim_dmc.recording.image_set import ImageSetOptions, write
+from cathsim_dmc.tasks.snapshot import versions
 
 
 def dataset(
@@ -59,3 +68,38 @@ def replay(
             bounds.whole(name, one, 1, 65535)
     viewer.open_viewer(recording, web=web, port=port, data_port=data_port)
     return 0
+
+
+def replay_error(
+    file: Annotated[Path, conf.Positional], /, json: Json = False, modules: Modules = ()
+) -> int:
+    """Do a control step again in which the physics failed; say whether it fails again.
+
+    Args:
+        file: File of a folder `errors` of a training or an evaluation.
+    """
+    from cathsim_dmc.simulation.error_files import PhysicsError
+
+    error = PhysicsError.load(file)
+    step, now = error.replay(), versions()
+    found, force = step.errors[0], float(step.wall_force.peak_max[0])
+    same = found == error.reason
+    if json:
+        check = {"name": "same error", "value": found, "unit": "", "passed": same}
+        print_json(
+            {
+                "checks": [{**check, "bound": error.reason}],
+                "task": error.task,
+                "options": dict(error.options),
+                "largest_contact_N": force,
+                "versions": {"file": dict(error.snapshot.versions), "now": now},
+            }
+        )
+    else:
+        steps = int(error.snapshot.arrays["rollout.steps"][0]) + 1
+        print(f"{error.task} {dict(error.options)}, control step {steps}")
+        print(f"it failed by: {error.reason}; now: {found or 'no error'}")
+        print(f"largest contact {force:.3g} N in a physics step")
+        if now != error.snapshot.versions:
+            print(f"versions then {dict(error.snapshot.versions)}, now {now}")
+    return 0 if same else CHECK_FAILED

@@ -104,7 +104,9 @@ class Effect:
             `ModelIndex.FIELDS`.
         model_fields: Fields of `mujoco.MjModel` that it writes.
         state: Names of its attributes, arrays with a leading axis N, that are its state
-            beside parameters and fields: what an episode goes on from.
+            beside parameters and fields: what an episode goes on from. A snapshot keeps
+            them, and writes into them in place; what MuJoCo derives it does not keep,
+            so `act` reads that from its argument `state`.
         parameters: NamedTuple of what its law reads, see `laws.parameters`; None for
             none.
         law: Static method, plain loops that numba compiles and MuJoCo calls in every

@@ -73,7 +73,7 @@ class Flow(StillBlood):
         radius: (N, L), of the lumen around each link, m, 0 where it is in none.
     """
 
-    state = ("_wave_speed", "radius")
+    state = ("_wave_speed", "radius", "_link_radii")
     radius: np.ndarray
 
     def __init__(self, options: FlowOptions | None, moving: Moving | None = None):

@@ -265,6 +265,8 @@ class RandomisedModel(Effect):
 class ActionDelay(Effect):
     """Actions take effect as many control steps later as was drawn."""
 
+    state = ("_past", "_delay")
+
     def __init__(self, longest: int):
         """Bounds the delay, control steps."""
         self._longest = longest

@@ -140,6 +140,16 @@ class ModelIndex:
         self.load_cell = sensor(model, "load_cell")
         self.wall_contacts = sensor(model, "wall_contacts")
 
+    def handles(self, motions: np.ndarray) -> np.ndarray:
+        """Orientations (..., 3, 3) of the handles, axes in columns, from MuJoCo's cdof.
+
+        Args:
+            motions: (..., nv, 6), axes of the degrees of freedom.
+        """
+        slide, hinge = self.handle_dofs
+        z, x = motions[..., slide, 3:], motions[..., hinge, :3]
+        return np.stack([x, np.cross(z, x), z], axis=-1)
+
     def reader(self, data) -> Callable[[], Readings]:
         """Finds the readings in a simulator's arrays.
 

@@ -7,7 +7,7 @@
 import abc
 import math
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -37,10 +37,12 @@ class Stepper(abc.ABC):
             for `forces.DEEPEST`.
         num_simulations: N.
         substeps: S, physics steps in a control step.
+        has_snapshots: Whether `kept` and `put_back` work.
     """
 
     arrays: Any
     warnings: np.ndarray
+    has_snapshots = False
 
     def __init__(self, model: mujoco.MjModel, num_simulations: int, substeps: int):
         """Finds the wall, its sensor and what touches it in the compiled scene."""
@@ -148,6 +150,40 @@ class Stepper(abc.ABC):
         if self._shortened:
             self._change(indices, "timestep", lambda _: self._timestep)
 
+    def kept(self, indices: np.ndarray, fields: Sequence[str]) -> dict[str, np.ndarray]:
+        """What some simulations (K,) go on from, arrays (K, ...) by name.
+
+        Args:
+            fields: Names of fields of the model that differ between simulations.
+        """
+        return {
+            "state": self.states(indices),
+            "contacts": self.contact_rows[indices, -1],
+            "repeated": self.repeated[indices],
+            **{f"field_{name}": self._fields_of(indices, name) for name in fields},
+        }
+
+    def _fields_of(self, indices: np.ndarray, name: str) -> np.ndarray:
+        """A field of the models of some simulations, (K, ...), a copy."""
+        return np.stack([self.field(index, name) for index in indices.tolist()])
+
+    def put_back(self, indices: np.ndarray, kept: Mapping[str, np.ndarray]) -> None:
+        """Puts some simulations (K,), with their cases loaded, to `kept` arrays."""
+        self.restore(indices)
+        for name, values in kept.items():
+            if name.startswith("field_"):
+                for index, value in zip(indices.tolist(), values, strict=True):
+                    self.field(index, name.removeprefix("field_"))[:] = value
+        self.set_states(indices, kept["state"])
+        self._forward(indices)  # for who looks at what MuJoCo derives
+        self.set_states(indices, kept["state"])
+        self.repeated[indices] = kept["repeated"]
+        self._put_contacts(indices, kept["contacts"])
+
+    def _put_contacts(self, indices: np.ndarray, rows: np.ndarray) -> None:
+        """Writes the last of `contact_rows` (K, M * 14) of some simulations."""
+        raise NotImplementedError
+
     def forward_unactuated(self, indices: np.ndarray) -> None:
         """What dm_control does at a reset, when there is no control yet."""
         try:
@@ -201,6 +237,8 @@ class Stepper(abc.ABC):
 
 class SingleStepper(Stepper):
     """One simulation, stepped by somebody else who calls `keep` after each step."""
+
+    has_snapshots = True
 
     def __init__(
         self,
@@ -280,6 +318,9 @@ class SingleStepper(Stepper):
 
     def _keep_still(self, indices: np.ndarray) -> None:
         self._rows[:-1], self._rows[-1] = 0.0, self._sensor
+
+    def _put_contacts(self, indices: np.ndarray, rows: np.ndarray) -> None:
+        self._rows[:-1], self._rows[-1], self._sensor[:] = 0.0, rows[0], rows[0]
 
     def _forward(self, indices: np.ndarray) -> None:
         mujoco.mj_forward(self._model, self._data)

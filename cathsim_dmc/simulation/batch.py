@@ -22,6 +22,7 @@ from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
+from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.tasks.step import Step
 
 # What composer calls on a task; the batch steps the rollout instead, so a task that
@@ -56,6 +57,7 @@ class BatchSimulation:
         num_actions: A, entries of an action.
         rollout: Objectives, readings and forces of all simulations.
         batch: The simulations; `expand` gives model fields of their own to each.
+        error_files: Writes physics errors, an `error_files.ErrorFiles`; None for none.
         stepper: Does their physics steps; `rows` (N, S, nsensordata) are the sensors in
             the S physics steps of the last step.
     """
@@ -95,6 +97,7 @@ class BatchSimulation:
         self.batch: mujoco_batch.Batch = self.stepper.batch
         self.rollout: Rollout = task.make_rollout(self._model, self.stepper)
         self.seed(seeds)
+        self.error_files: Any = None
         self._begun = np.zeros(num_simulations, dtype=bool)
         self._process = os.getpid()
         _ALIVE.add(self)
@@ -152,16 +155,64 @@ class BatchSimulation:
                 its last step, or the process has forked.
         """
         self._refuse_fork()
-        if not self._begun.all():
-            waiting = np.flatnonzero(~self._begun).tolist()
+        self._refuse_waiting(np.arange(self.num_simulations))
+        action = bounds.actions(action, (self.num_simulations, self.num_actions))
+        watched = self.error_files
+        before = None if watched is None else watched.before(self.rollout)
+        self.rollout.command(action)
+        self.stepper.run()
+        step = self.rollout.finish()
+        if watched is not None and before is not None and step.physics_error.any():
+            watched.after(before, action, step, self.rollout)
+        return _own(step)
+
+    def snapshot(self, indices: np.ndarray | None = None) -> Snapshot:
+        """The state between two steps, from which episodes go on bit for bit.
+
+        Args:
+            indices: (K,) numbers of the simulations, K > 0; None for all.
+
+        Raises:
+            ValueError: if the indices are no such numbers.
+            RuntimeError: if one of them has not been reset, or an error has interrupted
+                its last step.
+            NotImplementedError: if these simulations have no snapshots.
+        """
+        indices = bounds.indices("indices", indices, self.num_simulations)
+        self._refuse_waiting(indices)
+        return self.rollout.snapshot(indices)
+
+    def restore(self, snapshot: Snapshot, indices: np.ndarray | None = None) -> Step:
+        """Puts simulations to a snapshot, in place of a reset.
+
+        Args:
+            snapshot: Of K simulations of the same task, batched or composer's, perhaps
+                of another process.
+            indices: (K,) numbers of the simulations, in ascending order; None for all.
+
+        Returns:
+            All simulations as they stand.
+
+        Raises:
+            ValueError: if the snapshot is of another task, or of another number of
+                simulations.
+            RuntimeError: if the process has forked.
+            NotImplementedError: if these simulations have no snapshots.
+        """
+        self._refuse_fork()
+        indices = bounds.indices("indices", indices, self.num_simulations)
+        waiting = indices[~self._begun[indices] | self.rollout.half_done[indices]]
+        if len(waiting):
+            self.reset(waiting)
+        return _own(self.rollout.restore(indices, snapshot, self._random_states))
+
+    def _refuse_waiting(self, indices: np.ndarray) -> None:
+        waiting = indices[~self._begun[indices]].tolist()
+        if waiting:
             raise RuntimeError(
                 f"simulations {bounds.shown(waiting)} have no episode; call reset() "
                 "first"
             )
-        action = bounds.actions(action, (self.num_simulations, self.num_actions))
-        self.rollout.command(action)
-        self.stepper.run()
-        return _own(self.rollout.finish())
 
     def _refuse_fork(self) -> None:
         if os.getpid() != self._process:
@@ -177,6 +228,8 @@ class BatchSimulation:
 
 class _BatchStepper(Stepper):
     """Simulations on a thread pool, in one anatomy."""
+
+    has_snapshots = True
 
     def __init__(
         self,
@@ -210,6 +263,9 @@ class _BatchStepper(Stepper):
         self._own_fields.add(name)
         return self.batch.expand(name)[index]
 
+    def _fields_of(self, indices: np.ndarray, name: str) -> np.ndarray:
+        return self.batch.expand(name)[indices]
+
     def _model_of(self, index: int) -> mujoco.MjModel:
         for name in self._own_fields:
             getattr(self._copy, name)[:] = self.batch.expand(name)[index]
@@ -235,6 +291,10 @@ class _BatchStepper(Stepper):
     def _keep_still(self, indices: np.ndarray) -> None:
         self.rows[indices] = self.batch.sensordata[indices, None]
 
+    def _put_contacts(self, indices: np.ndarray, rows: np.ndarray) -> None:
+        self.rows[indices] = 0.0
+        self.rows[indices, -1, self._contacts] = rows
+
     def _forward(self, indices: np.ndarray) -> None:
         self.batch.forward(indices)
 
@@ -259,7 +319,7 @@ class _PoolStepper(_BatchStepper):
         self._models = [copy.copy(model) if own else model for _ in self.rows]
         self._loaded: dict[int | Case, Any] = {}
 
-    field = Stepper.field
+    field, _fields_of = Stepper.field, Stepper._fields_of
 
     def _model_of(self, index: int) -> mujoco.MjModel:
         return self._models[index]

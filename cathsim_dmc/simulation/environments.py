@@ -1,6 +1,7 @@
 """TorchRL environments of the tasks, with observations for networks."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -45,6 +46,16 @@ def make_env(
     options: Any = {"observation": observation, "task_kwargs": task_kwargs}
     env = BatchedEnv(task, num_envs, num_threads=num_threads, seed=seed, **options)
     return standard_observations(env)
+
+
+def record_errors(env: envs.EnvBase, folder: str | Path) -> None:
+    """Has the simulations of an environment write physics errors to a folder.
+
+    Environments of other packages write none.
+    """
+    base = getattr(env, "base_env", env)
+    if hasattr(base, "record_errors"):
+        base.record_errors(folder)
 
 
 def standard(

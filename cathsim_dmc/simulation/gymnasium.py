@@ -15,6 +15,7 @@ from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.rollout import Rollout
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 RENDER_MODES = ("rgb_array",)
 VERSION = 0  # of the ids
@@ -129,6 +130,24 @@ class CathSimEnv(gymnasium.Env):
         observation = _converted(timestep.observation, self._dtype)
         reward, truncated = float(timestep.reward), self._ended and not terminated
         return observation, reward, terminated, truncated, self.environment.task.info()
+
+    def snapshot(self) -> Snapshot:
+        """The state between two steps; see `tasks.environment.Environment.snapshot`."""
+        return self.environment.snapshot()
+
+    def restore(self, snapshot: Snapshot):
+        """Puts the environment to a snapshot of one simulation of its task.
+
+        Returns:
+            Observation and figures, as `reset` does.
+
+        Raises:
+            ValueError: if the snapshot is of another task, or of several simulations.
+        """
+        timestep = self.environment.restore(snapshot)
+        self._ended = timestep.last()
+        info = self.environment.task.info()
+        return _converted(timestep.observation, self._dtype), info
 
     def render(self) -> np.ndarray | None:
         """Fluoroscopy (rows, columns, 3) uint8, two planes side by side."""
@@ -259,6 +278,27 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         observation = _converted(step.observation, self._dtype)
         infos = {**_masked(step.info(), np.ones(self.num_envs, bool)), **final}
         return observation, reward, terminated, truncated, infos
+
+    def snapshot(self) -> Snapshot:
+        """The state of all simulations; see `BatchSimulation.snapshot`."""
+        return self.simulation.snapshot()
+
+    def restore(self, snapshot: Snapshot):
+        """Puts all simulations to a snapshot of as many.
+
+        Episodes that had ended wait for their reset, as `autoreset_mode` says.
+
+        Returns:
+            Observations and infos, as `reset` does.
+
+        Raises:
+            ValueError: if the snapshot is of another task or number of simulations.
+        """
+        step = self.simulation.restore(snapshot)
+        self._ended = step.terminated | step.truncated
+        everyone = np.ones(self.num_envs, bool)
+        info = _masked(step.info(), everyone)
+        return _converted(step.observation, self._dtype), info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Fluoroscopy of each simulation, see `CathSimEnv.render`."""

@@ -1,17 +1,20 @@
 """The batched simulation as a TorchRL environment."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from dm_env import specs
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.simulation.error_files import ErrorFiles
+from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.tasks.step import Step
 
 
@@ -55,6 +58,7 @@ class BatchedEnv(EnvBase):
             if given in options:
                 own = f"without {given}, for which there is the argument {argument}"
                 bounds.refuse("task_kwargs", options, own)
+        self._made = task_name, {**options, "observation": observation}
         self.simulation = BatchSimulation(
             suite.make_task(task_name, **{**options, "observation": observation}),
             num_envs,
@@ -80,7 +84,37 @@ class BatchedEnv(EnvBase):
             done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape
         )
 
-    def _reset(self, tensordict: TensorDict | None = None, **kwargs) -> TensorDict:
+    def snapshot(self, indices: np.ndarray | None = None) -> Snapshot:
+        """The state of some or all simulations; see `BatchSimulation.snapshot`."""
+        return self.simulation.snapshot(indices)
+
+    def restore(self, snapshot: Snapshot) -> TensorDictBase:
+        """Puts all simulations to a snapshot of as many; returns what `reset` does.
+
+        Where the environment is within transforms, `env.reset(snapshot=snapshot)` puts
+        it there and they see it.
+
+        Raises:
+            ValueError: if the snapshot is of another task or number of simulations.
+        """
+        return self.reset(snapshot=snapshot)
+
+    def record_errors(self, folder: str | Path) -> None:
+        """Writes physics errors to a folder from now on, see `error_files`.
+
+        Simulations without snapshots write none.
+        """
+        if self.simulation.stepper.has_snapshots:
+            self.simulation.error_files = ErrorFiles(folder, *self._made)
+
+    def _reset(
+        self,
+        tensordict: TensorDict | None = None,
+        snapshot: Snapshot | None = None,
+        **kwargs,
+    ) -> TensorDict:
+        if snapshot is not None:
+            return self._tensors(self.simulation.restore(snapshot))
         chosen = None
         if tensordict is not None and "_reset" in tensordict.keys():
             mask = tensordict["_reset"].reshape(self.batch_size).numpy()

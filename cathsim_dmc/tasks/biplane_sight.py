@@ -25,11 +25,18 @@ _LEAST_RADIUS = 1e-3  # m, of the route
 class BiplaneSight:
     """Reconstructs what the planes show; remembers each simulation's episode."""
 
+    state = ("_routes", "_lines")  # see `snapshot`
+
     def __init__(self, num_simulations: int):
         """Begins with nothing seen of N simulations."""
         self._routes: list[Route | None] = [None] * num_simulations
         self._lines = [np.zeros((0, 3))] * num_simulations
         self._machines: dict[int, Biplane] = {}
+
+    def changed(self, numbers: np.ndarray) -> None:
+        """Takes other planes before some simulations (K,) from now on."""
+        for number in numbers.tolist():
+            self._machines.pop(number, None)
 
     def see(
         self,

@@ -5,6 +5,7 @@ import numpy as np
 from dm_control import composer
 
 from cathsim_dmc.tasks.observation_kind import FrameObservable
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 # What composer does with an observable between physics steps, or to its values.
 _SETTINGS = ("buffer_size", "delay", "aggregator", "corruptor")
@@ -60,14 +61,53 @@ class Environment(composer.Environment):
         hooks.before_step(self._physics_proxy, action, self._random_state)
         self.task.stepper.run()
         hooks.after_step(self._physics_proxy, self._random_state)
-        task, physics = self.task, self._physics_proxy
-        seen = task.observation
+        seen = self.task.observation
         observation = {name: np.array(seen[name][0]) for name in self._enabled}
+        return self._timestep(observation)
+
+    def _timestep(self, observation) -> dm_env.TimeStep:
+        task, physics = self.task, self._physics_proxy
         ends = task.should_terminate_episode(physics)
         self._reset_next_step = ends or self._physics.time() >= self._time_limit
         kind = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
         reward, discount = task.get_reward(physics), task.get_discount(physics)
         return dm_env.TimeStep(kind, reward, discount, observation)
+
+    def snapshot(self) -> Snapshot:
+        """The state between two steps, from which an episode goes on bit for bit.
+
+        Observables of one's own with a delay, buffer or corruptor of composer begin
+        anew.
+
+        Raises:
+            RuntimeError: if no episode has begun, or an error has interrupted its last
+                step.
+        """
+        return self.task.snapshot()
+
+    def restore(self, snapshot: Snapshot) -> dm_env.TimeStep:
+        """Puts the environment to a snapshot, in place of a reset.
+
+        Args:
+            snapshot: Of one simulation of the same task, perhaps of a batch or of
+                another process.
+
+        Returns:
+            The time step that was the last one when the snapshot was taken.
+
+        Raises:
+            ValueError: if the snapshot is of another task, or of several simulations.
+        """
+        task, physics = self.task, self._physics_proxy
+        if not task.rollout.begun or task.rollout.half_done.any():
+            self.reset()
+        task.restore(physics, snapshot, self._random_state)
+        self._observation_updater.reset(physics, self._random_state)
+        observation = self._observation_updater.get_observation()
+        if not task.rollout.steps[0]:
+            self._reset_next_step = False
+            return dm_env.restart(observation)
+        return self._timestep(observation)
 
     def __repr__(self) -> str:
         """The task and how long a control step is."""

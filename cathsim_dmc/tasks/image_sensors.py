@@ -19,7 +19,10 @@ class ImageSensors:
     Attributes:
         planes: Of the machine before each simulation; none without fluoroscopy.
         images: The last images (N, ...) by name; "past_1" is the one before "past_0".
+        sight: What two planes show, over an episode.
     """
+
+    state = ("images",)  # see `snapshot`
 
     def __init__(
         self, names: Sequence[str], case: Case, num_simulations: int, chain: CommonChain
@@ -27,7 +30,7 @@ class ImageSensors:
         """Prepares the sensors for observations of these names, before any episode."""
         self._names, self._chain, self._count = names, chain, num_simulations
         self.planes: list[angiographs.Planes] = []
-        self._sight, self._noise = BiplaneSight(num_simulations), False
+        self.sight, self._noise = BiplaneSight(num_simulations), False
         if observations.needs(names, FLUOROSCOPY, BIPLANE):
             options = case.angiograph.options
             self.planes = [case.angiograph.planes()] * num_simulations
@@ -82,7 +85,7 @@ class ImageSensors:
                 resting = [self.planes[index] for index in rows]
                 marked = angiographs.pixels(resting, points[-1][rows, None])[:, :, 0]
                 given = resting, image, marked, handles[rows], rows, begins
-                for key, value in self._sight.see(*given).items():
+                for key, value in self.sight.see(*given).items():
                     self.hold(f"biplane_{key}", value, rows)
         if self._wants("segmentation"):
             self.hold("masks", angiographs.masks(planes, own), rows)

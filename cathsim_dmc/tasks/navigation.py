@@ -24,6 +24,7 @@ from cathsim_dmc.tasks.objectives import Objective, Shiftable
 from cathsim_dmc.tasks.observation_kind import FrameObservable, Sizes
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.tasks.step import Step, info_types
 
 _ONLY = np.zeros(1, dtype=int)  # number of the one simulation
@@ -201,6 +202,21 @@ class Navigation(composer.Task):
         """Draws what differs between episodes and puts the device to its start."""
         self._step = None
         self.rollout.begin(_ONLY, [random_state])
+        self._place_goal(physics)
+
+    def snapshot(self) -> Snapshot:
+        """The state between two steps; see `Environment.snapshot`."""
+        if self.rollout.begun:
+            self._current()
+        return self.rollout.snapshot(_ONLY)
+
+    def restore(self, physics, snapshot: Snapshot, random_state) -> None:
+        """Puts the episode to a snapshot; see `Environment.restore`."""
+        self._current()  # measures the start where nothing has been observed
+        self._step = self.rollout.restore(_ONLY, snapshot, [random_state])
+        self._place_goal(physics)
+
+    def _place_goal(self, physics) -> None:
         goal = self._scene.phantom.goals.get(self._scene.goal.name)
         if goal is not None and self.config.randomisation.goal_shift:
             physics.bind(goal).pos = self.goal_position

@@ -1,8 +1,11 @@
 """Physics errors: detection and names."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.tasks.cases import Case
 
 DIVERGED = "diverged"
 ESCAPED = "escaped through the wall"
@@ -39,3 +42,29 @@ def escaped(anatomy: Anatomy, centreline: np.ndarray, along: np.ndarray) -> np.n
     outside = aside & ~in_sheath
     outside[outside] = anatomy.lumen(centreline[outside]) < -_ESCAPE_DEPTH
     return outside.any(-1)
+
+
+def found(
+    case: Callable[[int], Case],
+    steps: np.ndarray,
+    nodes: np.ndarray,
+    warned: np.ndarray,
+    force: np.ndarray,
+) -> tuple[str | None, ...]:
+    """What went wrong in the last control step of N simulations, None for nothing.
+
+    Args:
+        case: Gives the case of a simulation by its number.
+        steps: (N,), control steps of the episodes.
+        nodes: (N, n, 3), nodes of the devices where they are in the vessel at rest, m.
+        warned: (N,) bool, whether MuJoCo has warned.
+        force: (N,), largest contact force in any physics step, N.
+    """
+    errors: list[str | None] = [None] * len(steps)
+    for index in np.flatnonzero(steps % ESCAPE_INTERVAL == 0).tolist():
+        scene = case(index).scene
+        if escaped(scene.anatomy, nodes[index], scene.placement.direction):
+            errors[index] = ESCAPED
+    for index in np.flatnonzero(warned | ~(force <= MAX_FORCE)).tolist():
+        errors[index] = DIVERGED if warned[index] else EXPLODED
+    return tuple(errors)

@@ -20,7 +20,7 @@ from cathsim_dmc.physics import forces
 from cathsim_dmc.physics import vessel as vessels
 from cathsim_dmc.physics.effects import Layout, World, of_kind
 from cathsim_dmc.physics.motion import Moving
-from cathsim_dmc.physics.readings import ModelIndex, Readings
+from cathsim_dmc.physics.readings import ModelIndex, Readings, merged, part
 from cathsim_dmc.physics.sliding import SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, Stepper
 from cathsim_dmc.tasks import observations, physics_errors
@@ -36,6 +36,7 @@ from cathsim_dmc.tasks.objectives import (
     straight,
 )
 from cathsim_dmc.tasks.observation_kind import ROUTE, Frame, Observation
+from cathsim_dmc.tasks.restorable import Restorable, describe
 from cathsim_dmc.tasks.route import Route, look_ahead
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.tasks.tracking_noise import TrackingNoise
@@ -43,7 +44,7 @@ from cathsim_dmc.tasks.tracking_noise import TrackingNoise
 _LOG = logging.getLogger(__name__)
 
 
-class Rollout:
+class Rollout(Restorable):
     """Episodes of N simulations of one task.
 
     Attributes:
@@ -62,6 +63,12 @@ class Rollout:
         devices: State of coaxial devices; None for one alone.
         vessel: State of the vessels; None for rigid ones with blood at rest.
     """
+
+    state = ("steps", "deviations", "readings", "wall_force", "devices", "vessel")
+    state += ("_goal_shift", "_action", "_previous_action", "_way", "_shortest")
+    state += ("_errors", "_case_of", "_random_states")  # see `snapshot`
+    readings: Readings
+    wall_force: forces.WallForce
 
     def __init__(
         self,
@@ -103,6 +110,7 @@ class Rollout:
             parameters=state.userdata,
         )
         self._layout = Layout(self.effects, world)
+        self._description = describe(scene, cases, self.effects, model)
         for index in range(count):
             self._enter(index)
         self._routes: list[Route] = []
@@ -171,10 +179,7 @@ class Rollout:
         ranges = self._config.randomisation
         number, episode = ranges.draw_in(random_state, len(self._cases))
         if len(self._cases) > 1:
-            self.case(index).scene.anatomy.lumen.release()
-            self._case_of[index] = number
-            self._stepper.load(index, self.case(index))
-            self._enter(index)
+            self._load(index, number)
         case = self.case(index)
         case.start.write(self._state.qpos[index], episode, random_state)
         self._layout.begin(index)
@@ -183,9 +188,20 @@ class Rollout:
         primary, secondary = episode.view
         deviation = Deviation(primary, secondary, episode.gain, episode.kerma)
         self.deviations[index] = deviation
-        if self._sensors.planes:
-            self._sensors.planes[index] = case.angiograph.planes(deviation)
+        self._place_machine(index)
         self._goal_shift[index] = episode.goal_shift or 0.0
+
+    def _place_machine(self, index: int) -> None:
+        if self._sensors.planes:
+            machine = self.case(index).angiograph
+            self._sensors.planes[index] = machine.planes(self.deviations[index])
+
+    def _load(self, index: int, number: int) -> None:
+        """Puts one simulation into one of several cases."""
+        self.case(index).scene.anatomy.lumen.release()
+        self._case_of[index] = number
+        self._stepper.load(index, self.case(index))
+        self._enter(index)
 
     def _enter(self, index: int) -> None:
         for effect in self.effects:
@@ -235,7 +251,7 @@ class Rollout:
             ValueError: if an observation is not as its row declares.
         """
         # The others have not moved: what is measured of them stays.
-        self._measure(self._stepper.still(indices))
+        self._measure(self._stepper.still(indices), indices)
         self._way[indices] = 0.0
         shortest = np.empty(len(self._way))
         for objective, rows in self.objectives:
@@ -252,38 +268,28 @@ class Rollout:
         force, warned = self._stepper.end()
         self._layout.raise_fault()
         self.steps += 1
-        before = self.resting.head
-        self._measure(force)
-        # A new array: that handed out before stays what it was.
+        before, everyone = self.resting.head, np.arange(len(self.steps))
+        self._measure(force, everyone)
         self._way = self._way + straight(before, self.resting.head)
-        old, self._errors = self._errors, self._find_errors(warned, force.peak_max)
+        old, where = self._errors, (self.case, self.steps, self.resting.centreline)
+        self._errors = physics_errors.found(*where, warned, force.peak_max)
         for error, last, steps in zip(self._errors, old, self.steps, strict=True):
             if error is not None and last is None:
                 _LOG.error("%s after %d steps", error, steps)
-        step = self._step(np.arange(len(self.steps)))
+        step = self._step(everyone)
         self._open[:] = False
         return step
 
-    def _find_errors(
-        self, warned: np.ndarray, force: np.ndarray
-    ) -> tuple[str | None, ...]:
-        """What went wrong where MuJoCo has warned or a contact was so hard, N."""
-        errors: list[str | None] = [None] * len(self.steps)
-        due = self.steps % physics_errors.ESCAPE_INTERVAL == 0
-        for index in np.flatnonzero(due).tolist():
-            scene, nodes = self.case(index).scene, self.resting.centreline[index]
-            along = scene.placement.direction
-            if physics_errors.escaped(scene.anatomy, nodes, along):
-                errors[index] = physics_errors.ESCAPED
-        wrong = warned | ~(force <= physics_errors.MAX_FORCE)
-        for index in np.flatnonzero(wrong).tolist():
-            kind = physics_errors.DIVERGED if warned[index] else physics_errors.EXPLODED
-            errors[index] = kind
-        return tuple(errors)
-
-    def _measure(self, force: forces.WallForce) -> None:
-        self.readings, self.wall_force = self._read(), force
-        self.devices = self._devices.read(self.readings)
+    def _measure(self, force: forces.WallForce, begun: np.ndarray) -> None:
+        """Measures simulations that have moved or begun an episode (K,)."""
+        new = self._read()
+        devices = self._devices.read(new)
+        if len(begun) < len(self.steps) and "readings" in vars(self):
+            # Restored ones have other derived quantities in MuJoCo.
+            force = merged(self.wall_force, part(force, begun), begun)
+            new = merged(self.readings, part(new, begun), begun)
+            devices = merged(self.devices, part(devices, begun), begun)
+        self.readings, self.devices, self.wall_force = new, devices, force
         time, last = CONTROL_TIMESTEP * self.steps, self._stepper.contact_rows[:, -1]
         self.vessel = vessels.read(self.effects, time, self.readings, last)
         self.resting = self._at_rest(self.readings)
@@ -302,7 +308,7 @@ class Rollout:
             Measurement(self.resting, self.wall_force, *actions, distance),
             failed if failed.any() else None,
         )
-        ended = np.zeros(len(failed), bool) if begins else outcome.success | failed
+        ended = (outcome.success | failed) & (not begins) & (self.steps > 0)
         return Step(
             observation=self._observe(rows, begins),
             outcome=outcome,
@@ -319,14 +325,15 @@ class Rollout:
     def _observe(self, rows: np.ndarray, begins: bool) -> Observation:
         random, sensors, goal = self._random_states, self._sensors, self.goal
         state, devices = self._tracking.seen(self.readings, self.devices, random, rows)
-        if sensors.planes:
+        if sensors.planes and len(rows):
             ends = np.zeros((len(goal), 0, 3))
             if devices is not None:
                 ends = devices.points.reshape(len(goal), -1, 3)
             points = state.centreline, ends, goal
-            own = points, self.shadows, self._handles(), random, self.around
+            handles = self.index.handles(self._state.cdof)
+            own = points, self.shadows, handles, random, self.around
             sensors.capture(rows, begins, *own)
-        if any(name.startswith("endoluminal") for name in self._names):
+        if len(rows) and any(n.startswith("endoluminal") for n in self._names):
             for name, view in self._endoscope(rows).items():
                 sensors.hold(name, view, rows)
         ahead = None
@@ -338,12 +345,6 @@ class Rollout:
             *(sensors.images, ahead, devices, self.vessel),
         )
         return observations.observe(self._names, frame)
-
-    def _handles(self) -> np.ndarray:
-        """Orientations (N, 3, 3) of the handles, axes in columns."""
-        slide, hinge = self.index.handle_dofs
-        z, x = self._state.cdof[:, slide, 3:], self._state.cdof[:, hinge, :3]
-        return np.stack([x, np.cross(z, x), z], axis=-1)
 
     def _endoscope(self, indices: np.ndarray) -> dict[str, np.ndarray]:
         """What the heads of some simulations (K,) see of the wall, by name."""
@@ -357,6 +358,14 @@ class Rollout:
             self._config.endoluminal_size,
         )
         return {"endoluminal": grey, "endoluminal_distance": distance}
+
+    def _derive(self, indices: np.ndarray) -> Step:
+        for index in indices.tolist():
+            self._place_machine(index)
+        self._sensors.sight.changed(indices)
+        self._choose_objectives()
+        self.resting = self._at_rest(self.readings)
+        return self._step(indices[:0])
 
     # What others may read.
 

@@ -16,6 +16,8 @@ class TrackingNoise:
         deviation: Standard deviation of each coordinate, m; 0 for no errors.
     """
 
+    state = ("_errors",)  # see `snapshot`
+
     def __init__(self, deviation: float):
         self.deviation = deviation
         self._errors: np.ndarray | None = None

@@ -1,0 +1,159 @@
+"""Snapshots of a rollout: its whole state, gathered and put back in one place.
+
+The state is what holders name in their attribute `state`, and what the stepper keeps.
+`tests/test_tasks_snapshot.py` fails where an attribute of a holder changes during an
+episode and is neither named nor derived from what is.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.random import RandomState
+
+from cathsim_dmc.physics.effects import Effect, Layout
+from cathsim_dmc.physics.stepper import Stepper
+from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.image_sensors import ImageSensors
+from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.snapshot import Snapshot, packed, restored
+from cathsim_dmc.tasks.step import Step
+from cathsim_dmc.tasks.tracking_noise import TrackingNoise
+
+
+def describe(
+    scene: Scene,
+    cases: Sequence[Case],
+    effects: Sequence[Effect],
+    model: mujoco.MjModel,
+) -> dict[str, Any]:
+    """What tasks have in common that can go on from each other's snapshots.
+
+    Friction, time limit, reward and what an agent sees may differ.
+    """
+    anatomies = {case.scene.anatomy.name: case.scene.placement.start for case in cases}
+    return {
+        "goal": scene.goal.name,
+        "anatomies": {n: np.round(1e3 * p, 2).tolist() for n, p in anatomies.items()},
+        "devices": [device.name for device in scene.catheter.devices],
+        "actions": list(scene.catheter.action_names),
+        "effects": [
+            [type(effect).__name__, *getattr(effect.parameters, "_fields", ())]
+            for effect in effects
+        ],
+        "timestep": model.opt.timestep,
+    }
+
+
+class Restorable:
+    """The part of a `Rollout` that takes and restores snapshots."""
+
+    effects: list[Effect]
+    _cases: Sequence[Case]
+    _description: Mapping[str, Any]
+    _layout: Layout
+    _open: np.ndarray
+    _random_states: list[RandomState] | None
+    _sensors: ImageSensors
+    _stepper: Stepper
+    _tracking: TrackingNoise
+
+    def holders(self) -> dict[str, Any]:
+        """What has a state in Python; each names its attributes in `state`."""
+        sensors, tracking = self._sensors, self._tracking
+        numbered = enumerate(self.effects)
+        return {
+            "rollout": self,
+            "tracking": tracking,
+            "images": sensors,
+            "sight": sensors.sight,
+            **{f"effect_{number}": effect for number, effect in numbered},
+        }
+
+    @property
+    def half_done(self) -> np.ndarray:
+        """(N,) bool, whose last step or reset an error or an interrupt has left."""
+        return self._open.copy()
+
+    def snapshot(self, indices: np.ndarray, random: bool = True) -> Snapshot:
+        """The state of some simulations (K,) between two control steps.
+
+        Args:
+            indices: Their numbers.
+            random: Whether with the sources of randomness.
+
+        Raises:
+            RuntimeError: if no episode has begun, or a step is half done.
+            NotImplementedError: if whoever steps them has no snapshots.
+        """
+        if not self._stepper.has_snapshots:
+            raise NotImplementedError(
+                f"{type(self._stepper).__name__} has no snapshots; simulate on the CPU "
+                "with BatchSimulation, or in a composer environment"
+            )
+        if self._random_states is None or self._open[indices].any():
+            raise RuntimeError("there is no episode to keep; call reset() first")
+        arrays: dict[str, np.ndarray] = {}
+        for name, holder in self.holders().items():
+            for attribute in holder.state:
+                if attribute == "_random_states" and not random:
+                    continue
+                value = getattr(holder, attribute)
+                arrays |= packed(f"{name}.{attribute}", value, indices)
+        fields = {name for effect in self.effects for name in effect.model_fields}
+        kept = self._stepper.kept(indices, sorted(fields))
+        arrays |= {f"stepper.{name}": array for name, array in kept.items()}
+        return Snapshot(self._description, arrays)
+
+    def restore(
+        self,
+        indices: np.ndarray,
+        snapshot: Snapshot,
+        random_states: Sequence[RandomState],
+    ) -> Step:
+        """Puts some simulations (K,), each of which has an episode, to a snapshot.
+
+        Args:
+            indices: Their numbers, in ascending order.
+            snapshot: Of K simulations of this task, perhaps of another process.
+            random_states: N sources of randomness, of which K are put back.
+
+        Returns:
+            All simulations as they stand.
+
+        Raises:
+            ValueError: if the snapshot is of another task.
+            RuntimeError, NotImplementedError: as of `snapshot`.
+        """
+        snapshot.require(self.snapshot(indices))
+        numbers = snapshot.arrays["rollout._case_of"]
+        if not ((numbers >= 0) & (numbers < len(self._cases))).all():
+            raise ValueError(f"the snapshot is of the anatomies {numbers.tolist()}")
+        self._open[indices] = True  # until it is put back whole
+        self._random_states = list(random_states)
+        if len(self._cases) > 1:
+            for index, number in zip(indices.tolist(), numbers.tolist(), strict=True):
+                self._load(index, number)
+        self._stepper.put_back(indices, snapshot.part("stepper"))
+        for name, holder in self.holders().items():
+            for attribute in holder.state:
+                old, full = getattr(holder, attribute), f"{name}.{attribute}"
+                new = restored(full, old, snapshot.arrays, indices)
+                if isinstance(holder, Effect) and isinstance(old, np.ndarray):
+                    old[:] = new  # others may hold the same array
+                else:  # others may have been given the old value
+                    setattr(holder, attribute, new)
+        for index in indices.tolist():
+            self._layout.begin(index)
+        step = self._derive(indices)
+        self._open[indices] = False
+        return step
+
+    def _load(self, index: int, number: int) -> None:
+        """Puts one simulation into one of several cases."""
+        raise NotImplementedError
+
+    def _derive(self, indices: np.ndarray) -> Step:
+        """What follows from the state, after some simulations (K,) are put back."""
+        raise NotImplementedError
