@@ -16,6 +16,7 @@ from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.cli import agents as commands
 from cathsim_dmc.cli import task_options
 from cathsim_dmc.physics.randomisation import Randomisation
+from cathsim_dmc.simulation.batch import BatchSimulation
 
 SORTED = sorted(synthetic_env.SIZES)
 # Where "position" begins in the concatenated observation.
@@ -302,3 +303,32 @@ def test_a_function_of_one_observation_is_told_what_to_do():
         return torch.stack([one(single) for single in many])
 
     assert evaluate(each, "type1_bca", 2, **options).summary()["length"] == 3
+
+
+def test_an_evaluation_goes_on_from_a_snapshot(tmp_path, cathsim):
+    options = {"max_steps": 12}
+    task = suite.make_task("simple1_bca", **options)
+    simulation = BatchSimulation(task, 2, num_threads=1, seeds=5)
+    simulation.reset()
+    push = np.zeros((2, simulation.num_actions))
+    push[:, -1] = 1.0
+    for _ in range(4):
+        simulation.step(push)
+    snapshot = simulation.snapshot()
+    path = snapshot.save(tmp_path / "state.npz")
+    expected = sum(simulation.step(push).outcome.reward for _ in range(8))
+    code, out, err = cathsim(
+        *("eval", "push", "--task", "simple1_bca", "--max-steps", "12", "--json"),
+        *("--no-baseline", "--threads", "1", "--start", path),
+    )
+    assert code == 0, err
+    episodes = json.loads(out)["policy"]["episodes"]
+    assert [one["length"] for one in episodes] == [8, 8]
+    rewards = [one["reward"] for one in episodes]
+    np.testing.assert_allclose(rewards, expected, rtol=1e-6)
+    for wrong, text in (
+        ({"protocol": "varied"}, "the protocol 'varied' cannot draw them"),
+        ({"episodes": 3}, "episodes is 3, but start is of 2 simulations"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            evaluate("push", "simple1_bca", start=snapshot, **wrong)

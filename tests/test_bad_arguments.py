@@ -58,6 +58,8 @@ COMMANDS = [
     (("phantom", "import", "none.stl", "--out", "OUT"), "--axes", NAME),
     (("phantom", "import", "none.stl", "--out", "OUT"), "--wall", NAME),
     (("replay",), "", NAME),
+    (("replay-error",), "", NAME),
+    (EVAL, "--start", NAME),
     (("validate",), "", NAME),
     (("benchmark",), "", NAME),
 ]

@@ -14,8 +14,9 @@ import torch
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
-from cathsim_dmc import bounds, cluster, files, suite
+from cathsim_dmc import bounds, cluster, files
 from cathsim_dmc.agents import protocols
+from cathsim_dmc.agents.contact_log import ContactLog
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.policies import (
     PolicyLike,
@@ -24,7 +25,6 @@ from cathsim_dmc.agents.policies import (
     view_of,
 )
 from cathsim_dmc.agents.training_log import progress_bar
-from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, STATISTICS
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.policies import Policy
@@ -391,41 +391,3 @@ def _checked(policy: Policy, given: Any, env: EnvBase) -> torch.Tensor:
             "for each: lambda many: torch.stack([f(one) for one in many])"
         )
     return actions
-
-
-_NONE = np.zeros((0, 3)), np.zeros(0)
-
-
-class ContactLog:
-    """An observer that keeps the contacts with the wall."""
-
-    def __init__(self):
-        self._steps = [_NONE]
-
-    def __call__(self, env: EnvBase, running: np.ndarray) -> None:
-        """Adds the contacts at the end of a control step."""
-        found = env.base_env.simulation.contacts()
-        present = found.present & running[:, None]
-        self._steps.append((found.position[present], found.magnitude[present]))
-
-    def join(self, logs: Sequence["ContactLog"]) -> None:
-        """Adds contacts of episodes that were played apart, as if side by side."""
-        for step in itertools.zip_longest(
-            *(log._steps for log in logs), fillvalue=_NONE
-        ):
-            positions, magnitudes = map(np.concatenate, zip(*step, strict=True))
-            self._steps.append((positions, magnitudes))
-
-    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (K, 3), m, world frame, and magnitudes (K,), N."""
-        positions, magnitudes = map(np.concatenate, zip(*self._steps, strict=True))
-        return positions, magnitudes
-
-    def draw(self, result: EvaluationResult, path: Path) -> None:
-        """Writes the heatmap of an evaluation in one anatomy as PNG."""
-        task = suite.make_task(result.task, **result.settings["task_kwargs"])
-        if task.num_anatomies > 1:  # whose contacts lie in different places
-            return
-        title = f"{result.task}, {result.policy}: {len(result.episodes)} episodes"
-        surface = task.scene.anatomy.surface
-        heatmap.heatmap(*self.contacts(), surface, path, title)

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc.imaging.angiograph import Deviation
 from cathsim_dmc.physics.effects import Effect, Layout
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks.cases import Case
@@ -49,7 +50,9 @@ def describe(
 class Restorable:
     """The part of a `Rollout` that takes and restores snapshots."""
 
+    deviations: list[Deviation]
     effects: list[Effect]
+    _case_of: np.ndarray
     _cases: Sequence[Case]
     _description: Mapping[str, Any]
     _layout: Layout
@@ -149,6 +152,16 @@ class Restorable:
         step = self._derive(indices)
         self._open[indices] = False
         return step
+
+    def _place_machine(self, index: int) -> None:
+        """Puts the angiography machine before one simulation."""
+        if self._sensors.planes:
+            machine = self.case(index).angiograph
+            self._sensors.planes[index] = machine.planes(self.deviations[index])
+
+    def case(self, index: int = 0) -> Case:
+        """Anatomy and objective of the episode of one simulation."""
+        return self._cases[self._case_of[index]]
 
     def _load(self, index: int, number: int) -> None:
         """Puts one simulation into one of several cases."""

@@ -191,11 +191,6 @@ class Rollout(Restorable):
         self._place_machine(index)
         self._goal_shift[index] = episode.goal_shift or 0.0
 
-    def _place_machine(self, index: int) -> None:
-        if self._sensors.planes:
-            machine = self.case(index).angiograph
-            self._sensors.planes[index] = machine.planes(self.deviations[index])
-
     def _load(self, index: int, number: int) -> None:
         """Puts one simulation into one of several cases."""
         self.case(index).scene.anatomy.lumen.release()
@@ -368,10 +363,6 @@ class Rollout(Restorable):
         return self._step(indices[:0])
 
     # What others may read.
-
-    def case(self, index: int = 0) -> Case:
-        """Anatomy and objective of the episode of one simulation."""
-        return self._cases[self._case_of[index]]
 
     @property
     def begun(self) -> bool:

@@ -1,0 +1,49 @@
+"""Contacts with the wall of an evaluation, for its heatmap."""
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torchrl.envs import EnvBase
+
+from cathsim_dmc import suite
+from cathsim_dmc.analysis import heatmap
+
+_NONE = np.zeros((0, 3)), np.zeros(0)
+
+
+class ContactLog:
+    """An observer that keeps the contacts with the wall."""
+
+    def __init__(self):
+        self._steps = [_NONE]
+
+    def __call__(self, env: EnvBase, running: np.ndarray) -> None:
+        """Adds the contacts at the end of a control step."""
+        found = env.base_env.simulation.contacts()
+        present = found.present & running[:, None]
+        self._steps.append((found.position[present], found.magnitude[present]))
+
+    def join(self, logs: Sequence["ContactLog"]) -> None:
+        """Adds contacts of episodes that were played apart, as if side by side."""
+        for step in itertools.zip_longest(
+            *(log._steps for log in logs), fillvalue=_NONE
+        ):
+            positions, magnitudes = map(np.concatenate, zip(*step, strict=True))
+            self._steps.append((positions, magnitudes))
+
+    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (K, 3), m, world frame, and magnitudes (K,), N."""
+        positions, magnitudes = map(np.concatenate, zip(*self._steps, strict=True))
+        return positions, magnitudes
+
+    def draw(self, result: Any, path: Path) -> None:
+        """Writes the heatmap of an `EvaluationResult` in one anatomy as PNG."""
+        task = suite.make_task(result.task, **result.settings["task_kwargs"])
+        if task.num_anatomies > 1:  # whose contacts lie in different places
+            return
+        title = f"{result.task}, {result.policy}: {len(result.episodes)} episodes"
+        surface = task.scene.anatomy.surface
+        heatmap.heatmap(*self.contacts(), surface, path, title)
