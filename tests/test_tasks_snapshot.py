@@ -192,7 +192,7 @@ DERIVED = {
     "Moving": {"_motions", "_surfaces", "_inlets"},
     "Flow": {"_circulations"},
     "SingleDevice": {"_bends"},  # scratch
-    "SlidingDevices": {"_fields"},
+    "SlidingDevices": {"_fields", "_memory", "_chain"},  # scratch, too
 }
 _CONSTANT = (World, Layout, Stepper, Case, NavigationConfig, mjcf.Element)
 
