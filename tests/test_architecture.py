@@ -76,7 +76,7 @@ CONFINED = {
     "igl": {"anatomy/"},
     "llvmlite": {"collision/"},
     "fast_simplification": {"anatomy/scan/topology.py"},
-    "numba": {"compiled.py", "compiled_cache.py", "collision/"},
+    "numba": {"compiled.py", "compiled_cache.py", "collision/", "simulation/warp/"},
     "gymnasium": {"simulation/gymnasium.py", "gym.py"},
     "tyro": {"cli/"},
 }

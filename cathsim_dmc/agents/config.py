@@ -161,8 +161,9 @@ class TrainingConfig:
         logger: Logger that gets these rows too: csv (a file for each column),
             tensorboard, trackio or wandb, offline unless WANDB_MODE is online; each
             but csv is an extra of that name. None takes metrics.csv alone.
-        torch_device: Torch device of the networks, such as "cpu" or "cuda"; the
-            simulation is always on the CPU.
+        torch_device: Torch device of the networks, such as "cpu" or "cuda".
+        simulation_device: Where the simulations run: "cpu", or "cuda" for MuJoCo Warp
+            on a GPU (docs/gpu.md), with hundreds of simulations or more.
         torch_threads: Number of threads of one torch operation. One is fastest for
             the small published MLP; images profit from all cores.
         modules: Modules that define what the run uses, such as a task of your own. They
@@ -184,6 +185,7 @@ class TrainingConfig:
     resumable: ClassVar[frozenset[str]] = frozenset(
         {"total_frames", "checkpoint_frames", "checkpoint_seconds", "keep_checkpoints"}
         | {"metrics_frames", "logger", "num_threads", "torch_threads", "torch_device"}
+        | {"simulation_device"}
         | {"demonstrations", "modules", "collector", "collectors"}
     )
 
@@ -218,6 +220,7 @@ class TrainingConfig:
     metrics_frames: int = positive(2_048)
     logger: Literal["csv", "tensorboard", "trackio", "wandb"] | None = None
     torch_device: str = "cpu"
+    simulation_device: str = "cpu"
     torch_threads: int = positive(1)
     modules: tuple[str, ...] | None = None
     collector: Literal["local", "ray"] = "local"

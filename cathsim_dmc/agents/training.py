@@ -121,7 +121,7 @@ def train(
         env = make_env(
             config.task, observation=config.collected_observation,
             num_envs=config.num_envs, num_threads=config.num_threads, seed=seed,
-            task_kwargs=config.training_kwargs,
+            task_kwargs=config.training_kwargs, **_place(config),
         )  # fmt: skip
         environments.record_errors(env, run / "errors")
         torch.manual_seed(config.seed)
@@ -142,6 +142,12 @@ def train(
         interruption = stack.enter_context(_interruption())
         call = on_checkpoint or (lambda checkpoint: None)
         return _loop(run, iter(collector), learner, log, interruption, call)
+
+
+def _place(config: TrainingConfig) -> dict[str, str]:
+    """Where the environment simulates; its tensors are on the CPU."""
+    name = config.simulation_device
+    return {} if name == "cpu" else {"device": f"warp:{name}"}
 
 
 @contextlib.contextmanager

@@ -105,6 +105,12 @@ class _Table:
         # Last: threads may look for other entries meanwhile.
         self._kept[key], row[0] = kept, key
 
+    def at(self, key: int) -> tuple[int, list[np.ndarray]]:
+        """Kind and arrays of an entry; KeyError for a key that is not there."""
+        kept = self._kept[key]
+        row = self._rows[np.flatnonzero(self._rows[:, 0] == key)[0]]
+        return int(row[1]), kept
+
     def move(self, key: int, lattice: np.ndarray) -> None:
         """Gives the field of an entry a motion, for simulations that have one."""
         self._kept[key].append(lattice)
@@ -143,6 +149,28 @@ def register(field: Field | Bore) -> tuple[float, ...]:
     (low, high), kind = field.box, LUMEN if whole else BORE
     _get_table().put(_key(parts), kind, (low + high) / 2, field.arrays)
     return (MARK, *map(float, parts))
+
+
+def registered(
+    user: Sequence[float],
+) -> tuple[bool, np.ndarray, list[np.ndarray]] | None:
+    """The wall that a carrier's `geom_user` names, as this process knows it.
+
+    Returns:
+        Whether it is a bore; place (3,) m of the carrier's middle in the frame of the
+        wall; its arrays. None for a geom that carries no wall.
+
+    Raises:
+        KeyError: if the process does not know the wall.
+    """
+    from cathsim_dmc.collision.table import BORE, MARK, USER
+
+    if len(user) < USER or user[0] != MARK:
+        return None
+    kind, (middle, *arrays) = _get_table().at(
+        _key([int(part) for part in user[1:USER]])
+    )
+    return kind == BORE, middle, arrays
 
 
 def carrier(field: Field | Bore, motion: np.ndarray | None = None) -> dict[str, Any]:

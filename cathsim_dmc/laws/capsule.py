@@ -85,7 +85,7 @@ def _refine(wall, capsule, t, value, step):
 
 
 @inlined
-def _is_far(wall, capsule, limit):
+def is_far(wall, capsule, limit):
     """Whether a capsule is farther from the wall than the limit, m, by its middle."""
     middle = clearance_along(wall, capsule, 0.0)
     if middle < FREE:
@@ -165,7 +165,7 @@ def nearest_places(wall, capsule, limit, samples):
     if is_straight_bore(wall):
         return straight_bore_places(wall.line, capsule, limit)
     places = Places(0, 0.0, FREE, 0.0, FREE)
-    if _is_far(wall, capsule, limit):
+    if is_far(wall, capsule, limit):
         return places
     count, step = _sample(wall, capsule, limit, samples)
     deepest = 0

@@ -118,7 +118,7 @@ class Stepper(abc.ABC):
         Returns:
             Force on the wall over it, and whether MuJoCo has warned in it, (N,) bool.
         """
-        warned, (force, depth) = self._warned(), forces.wall_force(self.contact_rows)
+        warned, (force, depth) = self._warned(), self._forces()
         limit = forces.DEEPEST if self.deepest is None else self.deepest
         depth = self._depth_at_end(depth, warned, limit)
         peaks = None
@@ -132,17 +132,25 @@ class Stepper(abc.ABC):
             if peaks is None:
                 peaks = np.zeros((2, self.num_simulations))
             peaks[:, indices] = finer.peak_sum, finer.peak_max
-            rows = self.contact_rows
-            warned, (force, depth) = self._warned(), forces.wall_force(rows)
+            warned, (force, depth) = self._warned(), self._forces()
         if peaks is not None:
             peak_sum, peak_max = np.maximum(peaks, [force.peak_sum, force.peak_max])
             force = force._replace(peak_sum=peak_sum, peak_max=peak_max)
         return force, warned
 
+    def _forces(self) -> tuple[forces.WallForce, np.ndarray]:
+        """Force on the wall over a control step, and its deepest contact (N,), m."""
+        return forces.wall_force(self.contact_rows)
+
+    @property
+    def last_contacts(self) -> np.ndarray:
+        """Rows (N, M * 14) of the wall's sensor in the last physics step."""
+        return self.contact_rows[:, -1]
+
     def still(self, indices: np.ndarray) -> forces.WallForce:
         """Force on the wall where some simulations have not moved yet."""
         self._keep_still(indices)
-        return forces.wall_force(self.contact_rows)[0]
+        return self._forces()[0]
 
     def restore(self, indices: np.ndarray) -> None:
         """Restores options that an interrupted reset or control step leaves changed."""

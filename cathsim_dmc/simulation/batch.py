@@ -56,7 +56,6 @@ class BatchSimulation:
         num_simulations: N.
         num_actions: A, entries of an action.
         rollout: Objectives, readings and forces of all simulations.
-        batch: The simulations; `expand` gives model fields of their own to each.
         error_files: Writes physics errors, an `error_files.ErrorFiles`; None for none.
         stepper: Does their physics steps; `rows` (N, S, nsensordata) are the sensors in
             the S physics steps of the last step.
@@ -91,16 +90,23 @@ class BatchSimulation:
         self.task = task
         physics = mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model)
         self._model = physics.model.ptr
-        steppers = _PoolStepper if task.num_anatomies > 1 else _BatchStepper
-        self.stepper = steppers(task, self._model, num_simulations, num_threads)
+        self.stepper = self._made_stepper(num_simulations, num_threads)
         self.num_simulations, self.num_actions = num_simulations, task.num_actions
-        self.batch: mujoco_batch.Batch = self.stepper.batch
         self.rollout: Rollout = task.make_rollout(self._model, self.stepper)
         self.seed(seeds)
         self.error_files: Any = None
         self._begun = np.zeros(num_simulations, dtype=bool)
         self._process = os.getpid()
         _ALIVE.add(self)
+
+    def _made_stepper(self, num_simulations: int, num_threads: int) -> Any:
+        kind = _PoolStepper if self.task.num_anatomies > 1 else _BatchStepper
+        return kind(self.task, self._model, num_simulations, num_threads)
+
+    @property
+    def batch(self) -> mujoco_batch.Batch:
+        """The simulations; `expand` gives model fields of their own to each."""
+        return self.stepper.batch
 
     def seed(self, seeds: Sequence[int] | int) -> None:
         """Gives each simulation its own source of randomness.
@@ -223,7 +229,7 @@ class BatchSimulation:
 
     def contacts(self) -> forces.Contacts:
         """Contacts with the wall in the last physics step, arrays (N, K, ...)."""
-        return self.rollout.index.contacts(self.stepper.rows[:, -1])
+        return forces.Contacts.from_sensor(self.stepper.last_contacts)
 
 
 class _BatchStepper(Stepper):

@@ -24,6 +24,7 @@ def make_env(
     num_threads: int | None = None,
     seed: int | Sequence[int] = 0,
     task_kwargs: Mapping[str, Any] | None = None,
+    device: str = "cpu",
 ) -> envs.EnvBase:
     """A seeded environment of batch size [num_envs] whose observations are standard.
 
@@ -32,6 +33,7 @@ def make_env(
         num_threads: Number of threads of the batched simulation, None for one per
             core.
         seed: Seed of each simulation, or of the first.
+        device: Of the simulation, see `torchrl.BatchedEnv`.
 
     Returns:
         An environment with "observation_vector" (num_envs, n) float32 and/or
@@ -44,7 +46,8 @@ def make_env(
     from cathsim_dmc.simulation.torchrl import BatchedEnv
 
     options: Any = {"observation": observation, "task_kwargs": task_kwargs}
-    env = BatchedEnv(task, num_envs, num_threads=num_threads, seed=seed, **options)
+    options |= {"seed": seed, "device": device}
+    env = BatchedEnv(task, num_envs, num_threads=num_threads, **options)
     return standard_observations(env)
 
 

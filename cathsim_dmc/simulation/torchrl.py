@@ -14,12 +14,13 @@ from torchrl.envs import EnvBase
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.simulation.error_files import ErrorFiles
+from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.tasks.step import Step
 
 
 class BatchedEnv(EnvBase):
-    """N simulations of a task of the suite; batch size [N], CPU.
+    """N simulations of a task of the suite; batch size [N], on one device.
 
     Keys: the task's observations (float32, images uint8), "action" (N, A), "reward",
     "terminated" (success or physics error), "truncated", and under "info" the
@@ -40,6 +41,7 @@ class BatchedEnv(EnvBase):
         seed: int | Sequence[int] = 0,
         observation: str | Sequence[str] = "internal",
         task_kwargs: Mapping[str, Any] | None = None,
+        device: str = "cpu",
     ):
         """Builds the simulations.
 
@@ -49,8 +51,13 @@ class BatchedEnv(EnvBase):
             seed: Seed of each simulation, or of the first, the others counting up.
             observation: Name or names of observations.
             task_kwargs: Other options of the task.
+            device: "cpu"; "cuda" or "cuda:1" for MuJoCo Warp on a GPU, where the
+                tensors are then; "warp:cuda" and "warp:cpu" for MuJoCo Warp there with
+                tensors on the CPU (docs/gpu.md).
 
         Raises:
+            ImportError: if the device needs an extra that is not installed.
+            NotImplementedError: if the task has what is not simulated on the device.
             ValueError: an option is not allowed.
         """
         options = bounds.options("task_kwargs", task_kwargs)
@@ -59,13 +66,15 @@ class BatchedEnv(EnvBase):
                 own = f"without {given}, for which there is the argument {argument}"
                 bounds.refuse("task_kwargs", options, own)
         self._made = task_name, {**options, "observation": observation}
-        self.simulation = BatchSimulation(
+        self.simulation = _simulation(
             suite.make_task(task_name, **{**options, "observation": observation}),
             num_envs,
+            bounds.text("device", device),
             num_threads=num_threads or 0,
             seeds=seed,
         )
-        super().__init__(device="cpu", batch_size=[num_envs])
+        place = "cpu" if device.startswith("warp:") else device
+        super().__init__(device=place, batch_size=[num_envs])
         task, shape = self.simulation.task, self.batch_size
         entries = {k: _spec(spec, shape) for k, spec in task.observation_specs.items()}
         flag = Binary(1, (*shape, 1), dtype=torch.bool)
@@ -117,24 +126,32 @@ class BatchedEnv(EnvBase):
             return self._tensors(self.simulation.restore(snapshot))
         chosen = None
         if tensordict is not None and "_reset" in tensordict.keys():
-            mask = tensordict["_reset"].reshape(self.batch_size).numpy()
+            mask = tensordict["_reset"].reshape(self.batch_size).cpu().numpy()
             chosen = np.flatnonzero(mask)
         return self._tensors(self.simulation.reset(chosen))
 
     def _step(self, tensordict: TensorDict) -> TensorDict:
-        step = self.simulation.step(tensordict["action"].numpy())
+        step = self.simulation.step(tensordict["action"].cpu().numpy())
         result = self._tensors(step)
-        result["reward"] = _tensor(step.outcome.reward)[:, None]
-        result["terminated"] = _tensor(step.terminated)[:, None]
-        result["truncated"] = _tensor(step.truncated)[:, None]
+        result["reward"] = self._tensor(step.outcome.reward)[:, None]
+        result["terminated"] = self._tensor(step.terminated)[:, None]
+        result["truncated"] = self._tensor(step.truncated)[:, None]
         result["done"] = result["terminated"] | result["truncated"]
         return result
 
     def _tensors(self, step: Step) -> TensorDict:
-        entries = {key: _tensor(value) for key, value in step.observation.items()}
-        info = {key: _tensor(value)[:, None] for key, value in step.info().items()}
-        entries["info"] = TensorDict(info, batch_size=self.batch_size)
-        return TensorDict(entries, batch_size=self.batch_size)
+        own = self._tensor
+        entries = {key: own(value) for key, value in step.observation.items()}
+        info = {key: own(value)[:, None] for key, value in step.info().items()}
+        here = {"batch_size": self.batch_size, "device": self.device}
+        entries["info"] = TensorDict(info, **here)
+        return TensorDict(entries, **here)
+
+    def _tensor(self, values: np.ndarray) -> torch.Tensor:
+        """On the device; numbers as float32."""
+        tensor = torch.as_tensor(values)
+        kept = tensor.dtype in (torch.uint8, torch.bool)
+        return (tensor if kept else tensor.float()).to(self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         self.simulation.seed(0 if seed is None else seed)
@@ -154,6 +171,13 @@ def _spec(spec: specs.Array, batch: torch.Size) -> TensorSpec:
     return Bounded(spec.minimum.item(), spec.maximum.item(), shape, dtype=dtype)
 
 
-def _tensor(values: np.ndarray) -> torch.Tensor:
-    tensor = torch.as_tensor(values)
-    return tensor if tensor.dtype in (torch.uint8, torch.bool) else tensor.float()
+def _simulation(
+    task: Navigation, num_envs: int, device: str, **options: Any
+) -> BatchSimulation:
+    """Simulations on a device."""
+    if device == "cpu":
+        return BatchSimulation(task, num_envs, **options)
+    from cathsim_dmc.simulation.warp.simulation import WarpSimulation  # an extra
+
+    name = device.removeprefix("warp:")
+    return WarpSimulation(task, num_envs, device=name, **options)

@@ -52,10 +52,14 @@ class Case:
 
     def write(self, model: mujoco.MjModel) -> None:
         """Puts the anatomy into a model of the task, in place of the one in it."""
-        for name, value in self._statistics.items():
-            setattr(model.stat, name, value)
+        self.write_statistics(model)
         for name, value in self.fields.items():
             getattr(model, name)[: len(value)] = value
+
+    def write_statistics(self, model: mujoco.MjModel) -> None:
+        """Puts what MuJoCo derives from the whole anatomy into a model of the task."""
+        for name, value in self._statistics.items():
+            setattr(model.stat, name, value)
 
     @functools.cached_property
     def angiograph(self) -> Angiograph:

@@ -285,8 +285,10 @@ class Rollout(Restorable):
             new = merged(self.readings, part(new, begun), begun)
             devices = merged(self.devices, part(devices, begun), begun)
         self.readings, self.devices, self.wall_force = new, devices, force
-        time, last = CONTROL_TIMESTEP * self.steps, self._stepper.contact_rows[:, -1]
-        self.vessel = vessels.read(self.effects, time, self.readings, last)
+        self.vessel = None
+        if self._config.vessel.living:
+            time, last = CONTROL_TIMESTEP * self.steps, self._stepper.last_contacts
+            self.vessel = vessels.read(self.effects, time, self.readings, last)
         self.resting = self._at_rest(self.readings)
 
     def _at_rest(self, state: Readings) -> Readings:

@@ -1,0 +1,235 @@
+"""Where compiled laws run on Warp's arrays: kernels on a GPU, loops on the CPU.
+
+A *thread function* is a compiled function of a thread's number and of named tuples of
+arrays. `Device.launch` runs it for many threads: numba-cuda compiles the same source
+for the GPU and launches it on Warp's stream, so that a captured CUDA graph has it.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cathsim_dmc import bounds, extras
+from cathsim_dmc.compiled import compiled, for_cuda
+
+_THREADS = 128  # of a block
+_NEEDED = ("warp", "mujoco_warp")
+
+Scratch = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
+NONE: Scratch = ((1,), (1,), (1,))
+
+
+class Chosen(NamedTuple):
+    """Threads that a test has chosen, in any order.
+
+    Attributes:
+        threads: (T,) int32, the first of which are chosen.
+        found: (1,) int32, how many they are.
+    """
+
+    threads: Any
+    found: Any
+
+
+def warp_modules() -> tuple[Any, Any]:
+    """The modules `warp` and `mujoco_warp`; ImportError says what to install."""
+    extras.require("gpu", *_NEEDED)
+    found = [importlib.import_module(name) for name in _NEEDED]
+    found[0].config.quiet = True
+    return found[0], found[1]
+
+
+class Device:
+    """A device of Warp, "cpu" or "cuda:0".
+
+    Attributes:
+        name: Warp's name of it.
+        is_cuda: Whether it is a GPU.
+    """
+
+    def __init__(self, name: str):
+        """Finds the device; ValueError if this machine does not have it."""
+        self._warp, _ = warp_modules()
+        self._warp.init()
+        names = [device.alias for device in self._warp.get_devices()]
+        alias = "cuda:0" if name == "cuda" else name
+        if alias not in names:
+            bounds.refuse("device", name, f"one of this machine: {', '.join(names)}")
+        self.name, self.is_cuda = alias, alias != "cpu"
+
+    def constant(self, values: np.ndarray) -> Any:
+        """A copy of an array on the device, for thread functions."""
+        values = np.ascontiguousarray(values)
+        if not self.is_cuda:
+            return values.copy()
+        return _cuda().to_device(values)
+
+    def view(self, array: Any) -> Any:
+        """Warp's array as thread functions take it, without a copy."""
+        if not self.is_cuda:
+            return array.numpy()
+        return _cuda().as_cuda_array(array)
+
+    def write(self, array: Any, values: np.ndarray) -> None:
+        """Writes into what `constant` returned."""
+        if self.is_cuda:
+            array.copy_to_device(np.ascontiguousarray(values, array.dtype))
+        else:
+            array[...] = values
+
+    def host(self, array: Any) -> np.ndarray:
+        """What `constant` returned, on the host, a copy."""
+        return array.copy_to_host() if self.is_cuda else array.copy()
+
+    def launch(
+        self, function: Any, count: int | Chosen, scratch: Scratch, *arguments: Any
+    ) -> None:
+        """Runs `function(thread, scratch, *arguments)` in many threads.
+
+        Args:
+            function: Compiled thread function.
+            count: Number of threads, or those of `select`.
+            scratch: Shapes of arrays of float64 that each thread has for itself.
+            arguments: Numbers, arrays and named tuples of them.
+        """
+        chosen = count if isinstance(count, Chosen) else None
+        if self.is_cuda:
+            kernel = _chosen_kernel if chosen else _kernel
+            total = len(chosen.threads) if chosen else count
+            given = (chosen or count), arguments
+            self._run(kernel(function, scratch), total, *given)
+            return
+        loop = (_chosen_loop if chosen else _loop)(function)
+        loop(chosen or count, tuple(map(np.zeros, scratch)), arguments)
+
+    def select(self, test: Any, chosen: Chosen, *arguments: Any) -> Chosen:
+        """Chooses the threads in which `test(thread, scratch, *arguments)` is true."""
+        if self.is_cuda:
+            self._run(_clear_kernel(), 1, chosen.found)
+            total = len(chosen.threads)
+            self._run(_test_kernel(test), total, chosen, arguments)
+        else:
+            _test_loop(test)(chosen, tuple(map(np.zeros, NONE)), arguments)
+        return chosen
+
+    def _run(self, kernel: Any, count: int, *arguments: Any) -> None:
+        stream = _cuda().external_stream(self._warp.get_stream(self.name).cuda_stream)
+        blocks = (count + _THREADS - 1) // _THREADS
+        kernel[blocks, _THREADS, stream](*arguments)
+
+
+def _cuda() -> Any:
+    extras.require("gpu", "numba_cuda")
+    from numba import cuda
+
+    return cuda
+
+
+# Loops and kernels refer to the function: none is kept on disk.
+
+
+@functools.cache
+def _loop(function: Any) -> Any:
+    """A compiled loop over the threads of a thread function."""
+
+    def loop(count, scratch, arguments):
+        for thread in range(count):
+            function(thread, scratch, *arguments)
+
+    return compiled(loop, cache=False)
+
+
+@functools.cache
+def _chosen_loop(function: Any) -> Any:
+    """A compiled loop over the chosen threads of a thread function."""
+
+    def loop(chosen, scratch, arguments):
+        for n in range(chosen.found[0]):
+            function(chosen.threads[n], scratch, *arguments)
+
+    return compiled(loop, cache=False)
+
+
+@functools.cache
+def _test_loop(test: Any) -> Any:
+    """A compiled loop that chooses threads."""
+
+    def loop(chosen, scratch, arguments):
+        found = 0
+        for thread in range(len(chosen.threads)):
+            if test(thread, scratch, *arguments):
+                chosen.threads[found] = thread
+                found += 1
+        chosen.found[0] = found
+
+    return compiled(loop, cache=False)
+
+
+@functools.cache
+def _kernel(function: Any, scratch: Scratch) -> Any:
+    """A kernel of a thread function."""
+    cuda, inner = _cuda(), for_cuda(function)
+    one, two, three = scratch
+
+    @cuda.jit
+    def kernel(count, arguments):
+        thread = cuda.grid(1)
+        if thread < count:
+            own = (
+                cuda.local.array(one, np.float64),
+                cuda.local.array(two, np.float64),
+                cuda.local.array(three, np.float64),
+            )
+            inner(thread, own, *arguments)
+
+    return kernel
+
+
+@functools.cache
+def _chosen_kernel(function: Any, scratch: Scratch) -> Any:
+    """A kernel of the chosen threads of a thread function."""
+    cuda, inner = _cuda(), for_cuda(function)
+    one, two, three = scratch
+
+    @cuda.jit
+    def kernel(chosen, arguments):
+        n = cuda.grid(1)
+        if n < chosen.found[0]:
+            own = (
+                cuda.local.array(one, np.float64),
+                cuda.local.array(two, np.float64),
+                cuda.local.array(three, np.float64),
+            )
+            inner(chosen.threads[n], own, *arguments)
+
+    return kernel
+
+
+@functools.cache
+def _test_kernel(test: Any) -> Any:
+    """A kernel that chooses threads."""
+    cuda, inner = _cuda(), for_cuda(test)
+
+    @cuda.jit
+    def kernel(chosen, arguments):
+        thread = cuda.grid(1)
+        if thread < len(chosen.threads) and inner(thread, 0, *arguments):
+            chosen.threads[cuda.atomic.add(chosen.found, 0, 1)] = thread
+
+    return kernel
+
+
+@functools.cache
+def _clear_kernel() -> Any:
+    """A kernel that writes 0 into the first place of an array."""
+    cuda = _cuda()
+
+    @cuda.jit
+    def kernel(array):
+        array[0] = 0
+
+    return kernel

@@ -1,0 +1,194 @@
+"""Passive forces of a task's effects, added in MuJoCo Warp.
+
+The laws are those that `physics.dispatcher` has MuJoCo call, `laws.blood` and
+`laws.springs`. One thread takes one world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.compiled import compiled
+from cathsim_dmc.laws.blood import Blood, drag
+from cathsim_dmc.laws.device import Device as DeviceState
+from cathsim_dmc.laws.hinges import Bends
+from cathsim_dmc.laws.springs import Scratch, Springs, shape_torques
+from cathsim_dmc.physics.dispatcher import Places
+from cathsim_dmc.physics.effects import Effect
+from cathsim_dmc.simulation.warp.devices import NONE, Device
+
+
+class Arrays(NamedTuple):
+    """Arrays of Warp's data and model, (1 or N, ...), as `laws.device.Device`.
+
+    Attributes:
+        first_link: Number of the first link among the bodies.
+        body_dofadr: (L,) of the links.
+        body_dofnum: (L,) of the links.
+        geoms: (L,) of the links.
+        hinges: (3, 2 J) joints of the hinges, places in `qpos`, degrees of freedom.
+    """
+
+    first_link: Any
+    xipos: Any
+    xmat: Any
+    cvel: Any
+    subtree_com: Any
+    cdof: Any
+    qpos: Any
+    qfrc_passive: Any
+    geom_size: Any
+    jnt_stiffness: Any
+    qpos_spring: Any
+    body_dofadr: Any
+    body_dofnum: Any
+    geoms: Any
+    hinges: Any
+
+
+@compiled
+def device_of(world, arrays):
+    """`laws.device.Device` of a world."""
+    first = arrays.first_link
+    last = first + len(arrays.geoms)
+    return DeviceState(
+        arrays.xipos[world, first:last],
+        arrays.xmat[world, first:last],
+        arrays.cvel[world, first:last],
+        arrays.subtree_com[world, first:last],
+        arrays.geom_size[world % len(arrays.geom_size)],
+        arrays.geoms,
+        arrays.body_dofadr,
+        arrays.body_dofnum,
+        arrays.cdof[world],
+        arrays.qpos[world],
+        arrays.qfrc_passive[world],
+        arrays.jnt_stiffness[world % len(arrays.jnt_stiffness)],
+        arrays.qpos_spring[world % len(arrays.qpos_spring)],
+        arrays.hinges[0],
+        arrays.hinges[1],
+        arrays.hinges[2],
+    )
+
+
+@compiled
+def add_drag(world, scratch, given, arrays):
+    """Adds the drag of still blood, see `laws.blood`.
+
+    Args:
+        world: Its number.
+        scratch: Not used.
+        given: `Blood` of arrays (N, ...).
+        arrays: `Arrays`.
+    """
+    blood = Blood(
+        given.density[world],
+        given.viscosity[world],
+        given.peak[world],
+        given.rate[world],
+        given.phase[world],
+        given.velocity[world],
+        given.delay[world],
+        given.friction[world],
+        given.space_velocity[world],
+    )
+    drag(blood, 0.0, device_of(world, arrays))
+
+
+@compiled
+def add_springs(world, scratch, given, arrays, memory):
+    """Adds what the springs of a shaped device lack, see `laws.springs`.
+
+    Args:
+        world: Its number.
+        scratch: Not used.
+        given: `Springs` of arrays (N, ...).
+        arrays: `Arrays`.
+        memory: `laws.springs.Scratch` of arrays (N, ...).
+    """
+    bends = Bends(memory.bends.bends[world], memory.bends.twists[world])
+    own = Scratch(memory.angles[world], bends, memory.free[world])
+    springs = Springs(given.rest[world], given.compliance[world])
+    shape_torques(springs, device_of(world, arrays), own)
+
+
+class PassiveForces:
+    """Forces of the laws of a task's effects in N worlds."""
+
+    def __init__(
+        self, device: Device, places: Places, effects: Iterable[Effect], count: int
+    ):
+        """Takes the effects that have a law.
+
+        Args:
+            device: Where Warp's arrays are.
+            places: Of the links and hinges in the model.
+            effects: Bound to their worlds.
+            count: N.
+
+        Raises:
+            NotImplementedError: if there is a law that is not simulated on Warp.
+        """
+        self._device, self._places, self._count = device, places, count
+        self._laws: list[tuple[Any, Any, Any]] = []
+        for effect in effects:
+            if effect.adapter not in ("blood", "springs"):
+                if effect.law is None and effect.adapter is None:
+                    continue
+                raise NotImplementedError(
+                    f"the law of {type(effect).__qualname__} is not simulated on "
+                    "Warp; take the device 'cpu'"
+                )
+            given = effect.world.parameters
+            there = type(given)(*(device.constant(np.array(each)) for each in given))
+            law = add_drag if effect.adapter == "blood" else add_springs
+            self._laws.append((law, given, there))
+
+    def bind(self, model: Any, data: Any, host: mujoco.MjModel) -> None:
+        """Takes the arrays of Warp's model and data, which must not be replaced."""
+        view, constant, places = self._device.view, self._device.constant, self._places
+        links = slice(places.first_link, places.first_link + len(places.geoms))
+        rows = view(data.xmat)
+        names = ("cvel", "subtree_com", "cdof", "qpos", "qfrc_passive")
+        fields = ("geom_size", "jnt_stiffness", "qpos_spring")
+        joints = places.hinges.shape[1] // 2
+        bends = (
+            np.zeros((self._count, joints), complex),
+            np.zeros((self._count, joints)),
+        )
+        memory = Scratch(
+            constant(np.zeros((self._count, 2 * joints))),
+            Bends(*map(constant, bends)),
+            constant(np.zeros((self._count, joints, 2))),
+        )
+        arrays = Arrays(
+            places.first_link,
+            view(data.xipos),
+            rows.reshape(*rows.shape[:2], 9),
+            *(view(getattr(data, name)) for name in names),
+            *(view(getattr(model, name)) for name in fields),
+            constant(host.body_dofadr[links]),
+            constant(host.body_dofnum[links]),
+            constant(places.geoms.astype(np.int64)),
+            constant(places.hinges.astype(np.int64)),
+        )
+        self._calls = [
+            (law, there, arrays, *([memory] if law is add_springs else []))
+            for law, _, there in self._laws
+        ]
+
+    def write(self) -> None:
+        """Writes the parameters as they are on the host."""
+        for _, given, there in self._laws:
+            for values, array in zip(given, there, strict=True):
+                self._device.write(array, values)
+
+    def __call__(self, model: Any, data: Any) -> None:
+        """What mujoco_warp calls at the end of its own passive forces."""
+        del model, data
+        for law, *arguments in self._calls:
+            self._device.launch(law, self._count, NONE, *arguments)

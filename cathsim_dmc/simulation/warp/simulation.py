@@ -1,0 +1,54 @@
+"""N simulations of one task in MuJoCo Warp, with the contract of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.simulation.warp.devices import Device
+from cathsim_dmc.simulation.warp.stepper import WarpStepper
+from cathsim_dmc.tasks.navigation import Navigation
+
+
+class WarpSimulation(BatchSimulation):
+    """N simulations of one task on one device.
+
+    They follow those of `BatchSimulation` within single precision, and differ from run
+    to run on a GPU, which adds numbers in any order.
+
+    Attributes:
+        stepper: Does the physics steps.
+    """
+
+    stepper: WarpStepper
+
+    def __init__(
+        self,
+        task: Navigation,
+        num_simulations: int,
+        *,
+        device: str = "cuda",
+        num_threads: int = 0,
+        seeds: Sequence[int] | int = 0,
+    ):
+        """Compiles the task's model; the device gets it with the first step.
+
+        Args:
+            task: Task that no environment owns; the simulation takes it over.
+            num_simulations: N.
+            device: Of Warp, "cuda" for the first GPU.
+            num_threads: Threads of the host, 0 for one per core.
+            seeds: Seeds of the simulations, or of the first, the others counting up.
+
+        Raises:
+            ImportError: if the extra `gpu` is not installed.
+            NotImplementedError: if the task has what is not simulated there.
+            ValueError: as `BatchSimulation`, or if there is no such device.
+        """
+        self._device = Device(device)
+        super().__init__(task, num_simulations, num_threads=num_threads, seeds=seeds)
+        self.stepper.take(self.rollout)
+
+    def _made_stepper(self, num_simulations: int, num_threads: int) -> WarpStepper:
+        own = self.task, self._model, num_simulations
+        return WarpStepper(*own, self._device, num_threads)

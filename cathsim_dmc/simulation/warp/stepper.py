@@ -1,0 +1,334 @@
+"""Steps N simulations of one task in MuJoCo Warp.
+
+At the beginning of a control step the state of all worlds goes to the device, at its
+end the state and what an episode reads come back. MuJoCo itself, on the host, does the
+forward pass of a reset, the control steps that are done again in shorter steps, and the
+check of depths at the end of a control step.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import copy
+import os
+import threading
+import types
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.physics import forces
+from cathsim_dmc.physics.dispatcher import Places
+from cathsim_dmc.physics.stepper import Stepper
+from cathsim_dmc.simulation.warp.contacts import WallContacts
+from cathsim_dmc.simulation.warp.devices import Device
+from cathsim_dmc.simulation.warp.passive import PassiveForces
+from cathsim_dmc.simulation.warp.worlds import Worlds
+from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.navigation import Navigation
+from cathsim_dmc.tasks.rollout import Rollout
+
+# State of a simulation, in the order in which it is written.
+_STATE = ("qpos", "qvel", "act", "qacc_warmstart")
+
+
+class WarpStepper(Stepper):
+    """N simulations on one device.
+
+    Attributes:
+        lost: (N,) worlds that had more contacts than there are places for, counted.
+    """
+
+    def __init__(
+        self,
+        task: Navigation,
+        model: mujoco.MjModel,
+        num_simulations: int,
+        device: Device,
+        num_threads: int,
+    ):
+        """Puts the compiled scene on the device.
+
+        Raises:
+            NotImplementedError: if the task has what is not simulated there.
+        """
+        refuse(task)
+        super().__init__(model, num_simulations, task.substeps)
+        self._model, self._device = model, device
+        self.warnings = np.zeros((num_simulations, 1), np.int64)
+        self.lost = np.zeros(num_simulations, np.int64)
+        self._names = tuple(dict.fromkeys((*_STATE, *task.data_fields)))
+        self.arrays = types.SimpleNamespace(**self._empty(model, num_simulations))
+        self._force = np.zeros((5, num_simulations))
+        self._own: dict[str, np.ndarray] = {}
+        fields = [name for effect in task.effects for name in effect.model_fields]
+        self._expand(dict.fromkeys(fields))
+        self._dirty = set(self._own)
+        self._cases: dict[int, Case] = {}
+        self._statistics: list[Any] = [None] * num_simulations
+        self._threads = num_threads or os.cpu_count() or 1
+        self._pool = concurrent.futures.ThreadPoolExecutor(self._threads)
+        self._local = threading.local()
+        self.contacts = WallContacts(device, model, num_simulations)
+        self._begun = dict[str, np.ndarray]()
+        self._worlds: Worlds | None = None
+        self._stale = True
+
+    def _empty(self, model: mujoco.MjModel, count: int) -> dict[str, np.ndarray]:
+        """Arrays (N, ...) of the fields of `mujoco.MjData` that are read or written."""
+        data = mujoco.MjData(model)
+        names = (*self._names, "ctrl", "userdata", "time")
+        shapes = {name: np.shape(getattr(data, name)) for name in names}
+        return {name: np.zeros((count, *shape)) for name, shape in shapes.items()}
+
+    def take(self, rollout: Rollout) -> None:
+        """Takes the laws of the effects of the rollout that it steps.
+
+        Raises:
+            NotImplementedError: if there is a law that is not simulated on Warp.
+        """
+        places = Places.of(self._model, rollout.index)
+        own = rollout.effects, self.num_simulations
+        self._passive = PassiveForces(self._device, places, *own)
+
+    # Fields of the model that differ between worlds.
+
+    def _expand(self, names: Iterable[str]) -> None:
+        for name in names:
+            if name not in self._own:
+                value = getattr(self._model, name)
+                self._own[name] = np.repeat(value[None], self.num_simulations, axis=0)
+
+    def field(self, index: int, name: str) -> np.ndarray:
+        """A field of the model that one simulation has for itself, to be written."""
+        if name not in self._own:
+            raise KeyError(f"{name} is no field that an effect declares")
+        self._dirty.add(name)
+        return self._own[name][index]
+
+    def load(self, index: int, case: Case) -> None:
+        """Puts one simulation into an anatomy."""
+        if self._cases.get(index) is case:
+            return
+        self._cases[index] = case
+        self._expand(case.fields)
+        for name, value in case.fields.items():
+            self._own[name][index, : len(value)] = value
+            self._dirty.add(name)
+        users = self._own.get("geom_user")
+        if users is not None:
+            self.contacts.enter([index], users[index, self.contacts.carriers])
+
+    def _model_of(self, index: int) -> mujoco.MjModel:
+        """A model of this thread with the fields of one simulation."""
+        model = self._mine()[0]
+        for name, values in self._own.items():
+            getattr(model, name)[:] = values[index]
+        if (case := self._cases.get(index)) is not None:
+            case.write_statistics(model)
+        return model
+
+    def _mine(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Model and data of this thread."""
+        if not hasattr(self._local, "made"):
+            self._local.made = copy.copy(self._model), mujoco.MjData(self._model)
+        return self._local.made
+
+    # The course of a control step.
+
+    def reset(self, indices: np.ndarray) -> None:
+        """Begins anew in some simulations (K,), at the default pose."""
+        for name in (*_STATE, "ctrl", "userdata", "time"):
+            getattr(self.arrays, name)[indices] = 0.0
+        self.arrays.qpos[indices] = self._model.qpos0
+        self._stale = True
+
+    def begin(self, control: np.ndarray) -> None:
+        """Begins a control step with the control (N, U) of all its physics steps."""
+        self.arrays.ctrl[:] = control
+        names = (*_STATE, "userdata", "time")
+        self._begun = {name: getattr(self.arrays, name).copy() for name in names}
+        self._warnings_before = self.warnings.copy()
+
+    def step_device(self) -> None:
+        """Does the physics steps of a control step on the device alone, for timing."""
+        if self._worlds is not None:
+            self._worlds.step()
+            self._worlds.wait()
+
+    def profile(self) -> dict[str, float]:
+        """Seconds of the parts of the last control step on the device."""
+        return {} if self._worlds is None else dict(self._worlds.seconds)
+
+    def run(self) -> None:
+        """Does the physics steps of a control step on the device."""
+        if self._worlds is None or not self.contacts.is_bound:
+            laws = self.contacts, self._passive
+            given = self._device, self._model, self._own, laws, self.substeps
+            self._worlds = Worlds(*given)
+            self._dirty.clear()
+            self._stale = True
+        worlds = self._worlds
+        worlds.write_model(self._own, self._dirty)
+        self._dirty.clear()
+        worlds.write(self.arrays, self._stale)
+        worlds.step()
+        totals = worlds.read(self.arrays, self._names)
+        self._force[:] = totals.force
+        self.arrays.time += self.substeps * self._timestep
+        self._stale = False
+        self._note(totals.diverged != 0, worlds.overflowed())
+
+    def _note(self, diverged: np.ndarray, lost: np.ndarray) -> None:
+        """Counts worlds that diverged, put back to where they began, and overflows."""
+        self.lost += lost
+        for index in np.flatnonzero(diverged).tolist():
+            self.warnings[index] += 1
+            for name, value in self._begun.items():
+                getattr(self.arrays, name)[index] = value[index]
+            self._on_host(index, lambda model, data: mujoco.mj_forward(model, data))
+            self._stale = True
+
+    def _forces(self) -> tuple[forces.WallForce, np.ndarray]:
+        return forces.WallForce(*self._force[:4].copy()), self._force[4].copy()
+
+    @property
+    def contact_rows(self) -> np.ndarray:
+        """Rows (N, 1, M * 14) of the wall's sensor in the last physics step."""
+        return self.last_contacts[:, None]
+
+    @property
+    def last_contacts(self) -> np.ndarray:
+        """Rows (N, M * 14) of the wall's sensor in the last physics step."""
+        if self._worlds is not None:
+            self._worlds.read_sensors(self.arrays.sensordata)
+        return self.arrays.sensordata[:, self._contacts]
+
+    def states(self, indices: np.ndarray | None = None) -> np.ndarray:
+        """States (K, nstate) of some simulations, or all, mjSTATE_INTEGRATION."""
+        chosen = range(self.num_simulations) if indices is None else indices.tolist()
+        return np.array([self._state_of(index) for index in chosen])
+
+    def _state_of(self, index: int) -> np.ndarray:
+        model, data = self._mine()
+        self._write(index, data, vars(self.arrays))
+        kind = mujoco.mjtState.mjSTATE_INTEGRATION.value
+        state = np.empty(mujoco.mj_stateSize(model, kind))
+        mujoco.mj_getState(model, data, state, kind)
+        return state
+
+    def set_states(self, indices: np.ndarray, states: np.ndarray) -> None:
+        """Writes states (K, nstate) of some simulations (K,)."""
+        kind = mujoco.mjtState.mjSTATE_INTEGRATION.value
+        for index, state in zip(indices.tolist(), states, strict=True):
+            model, data = self._mine()
+            mujoco.mj_setState(model, data, state, kind)
+            for name in (*_STATE, "ctrl", "userdata", "time"):
+                getattr(self.arrays, name)[index] = getattr(data, name)
+        self._stale = True
+
+    def restore(self, indices: np.ndarray) -> None:
+        """Nothing: models of the host change while one simulation uses them."""
+
+    # What MuJoCo does on the host.
+
+    def _write(self, index: int, data: mujoco.MjData, arrays: Any) -> None:
+        for name in (*_STATE, "userdata", "time"):
+            value = arrays[name][index]
+            if name == "time":
+                data.time = value.item()
+            else:
+                getattr(data, name)[:] = value
+        data.ctrl[:] = self.arrays.ctrl[index]
+
+    def _on_host(
+        self, index: int, act: Callable[[mujoco.MjModel, mujoco.MjData], Any],
+        arrays: Any = None,
+    ) -> Any:  # fmt: skip
+        """Lets MuJoCo act on one simulation, and takes what an episode reads."""
+        model, data = self._model_of(index), self._mine()[1]
+        mujoco.mj_resetData(model, data)
+        self._write(index, data, vars(self.arrays) if arrays is None else arrays)
+        result = act(model, data)
+        for name in (*self._names, "time"):
+            getattr(self.arrays, name)[index] = getattr(data, name)
+        return result
+
+    def forward_unactuated(self, indices: np.ndarray) -> None:
+        """What dm_control does at a reset, when there is no control yet."""
+        flag = mujoco.mjtDisableBit.mjDSBL_ACTUATION.value
+
+        def forward(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+            model.opt.disableflags |= flag
+            try:
+                mujoco.mj_forward(model, data)
+            finally:
+                model.opt.disableflags &= ~flag
+
+        self._each(lambda index: self._on_host(index, forward), indices)
+
+    def still(self, indices: np.ndarray) -> forces.WallForce:
+        """Force on the wall where some simulations have not moved yet."""
+        rows = self.arrays.sensordata[indices][:, None, self._contacts]
+        force, depth = forces.wall_force(np.ascontiguousarray(rows))
+        self._force[:, indices] = *force, depth
+        return self._forces()[0]
+
+    def _each(self, act: Callable[[int], Any], indices: np.ndarray) -> list[Any]:
+        return list(self._pool.map(act, indices.tolist()))
+
+    def _refine(self, indices: np.ndarray, parts: int) -> np.ndarray:
+        """Does the control step of some simulations again, in shorter steps."""
+        self.repeated[indices] += 1
+        rows = np.stack(self._each(lambda i: self._again(i, parts), indices))
+        last = np.ascontiguousarray(rows[:, parts - 1 :: parts])
+        force, depth = forces.wall_force(last)
+        self._force[:, indices] = *force, depth
+        self._stale = True
+        return rows
+
+    def _again(self, index: int, parts: int) -> np.ndarray:
+        """Rows (S * parts, M * 14) of a control step in shorter physics steps."""
+        size = self._contacts.stop - self._contacts.start
+        rows = np.zeros((self.substeps * parts, size))
+
+        def step(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+            whole = model.opt.timestep
+            model.opt.timestep = whole / parts
+            try:
+                for row in rows:
+                    mujoco.mj_step(model, data)
+                    if data.warning.number.any():
+                        self.warnings[index] += 1
+                        break
+                    row[:] = data.sensordata[self._contacts]
+            finally:
+                model.opt.timestep = whole
+
+        self._on_host(index, step, self._begun)
+        return rows
+
+    def _keep_still(self, indices: np.ndarray) -> None:
+        """Nothing: `still` reads the sensors."""
+
+    def _forward(self, indices: np.ndarray) -> None:
+        self._each(lambda index: self._on_host(index, mujoco.mj_forward), indices)
+
+    def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
+        return np.stack(self._each(lambda i: self._again(i, parts), indices))
+
+
+def refuse(task: Navigation) -> None:
+    """NotImplementedError by name for what is not simulated on Warp."""
+    config, chain = task.config, task.scene.catheter
+    missing = {
+        "coaxial devices": chain.coaxial,
+        "a living vessel (vessel=)": config.vessel.living,
+    }
+    named = [name for name, there in missing.items() if there]
+    if named:
+        raise NotImplementedError(
+            f"{', '.join(named)}: not simulated on Warp; take simulation_device='cpu'"
+        )

@@ -1,0 +1,207 @@
+"""Model, data and graph of MuJoCo Warp for N worlds, and what goes to and fro."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.simulation.warp.contacts import WallContacts
+from cathsim_dmc.simulation.warp.devices import Device, warp_modules
+from cathsim_dmc.simulation.warp.passive import PassiveForces
+from cathsim_dmc.simulation.warp.reduction import Reduction, Totals
+
+# Places for contacts and for rows of constraints, in each world.
+CONTACTS, ROWS = 48, 128
+_WRITTEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl")
+_ALWAYS = ("qpos", "act", "ctrl")
+# Fields of a model that Warp's lacks or does not read: walls are found by `geom_user`,
+# boxes and bounding volumes serve MuJoCo's own collision.
+_HOST_ONLY = ("geom_user", "geom_aabb", "geom_rbound", "bvh_", "oct_", "mesh_", "name")
+
+
+class Worlds:
+    """N worlds on one device.
+
+    Attributes:
+        seconds: Wall time of the parts of the last control step.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        model: mujoco.MjModel,
+        own: Mapping[str, np.ndarray],
+        laws: tuple[WallContacts, PassiveForces],
+        substeps: int,
+    ):
+        """Puts the compiled scene on the device.
+
+        Args:
+            device: Where to simulate.
+            model: Scene of the task.
+            own: Fields (N, ...) that differ between worlds.
+            laws: Contacts of the links with the walls, and passive forces.
+            substeps: Physics steps in a control step.
+
+        Raises:
+            NotImplementedError: if a field differs that Warp has once for all worlds.
+        """
+        self._warp, self._mjwarp = warp_modules()
+        self._device, self._substeps = device, substeps
+        contacts, self._passive = laws
+        prepared = copy.copy(model)
+        # Their contacts come from the field.
+        prepared.geom_contype[contacts.carriers] = 0
+        wall = model.sensor("wall_contacts")
+        start, size = int(wall.adr[0]), int(wall.dim[0])
+        with self._warp.ScopedDevice(device.name):
+            self.model = self._mjwarp.put_model(prepared)
+            self.model.opt.contact_sensor_maxmatch = max(size // 14, CONTACTS)
+            self.model.opt.run_rne_postconstraint = True
+            self.model.opt.warn_overflow = 0  # counted instead
+            count = contacts.num_worlds
+            sizes = {"nconmax": CONTACTS, "njmax": ROWS}
+            self.data = self._mjwarp.make_data(prepared, nworld=count, **sizes)
+            for name in own:
+                self._expand(name, own[name])
+            contacts.bind(self.model, self.data)
+            self._contacts = contacts
+            self.model.callback.contactfilter = contacts
+            self._passive.bind(self.model, self.data, model)
+            self.model.callback.passive = self._passive
+            self._reduction = Reduction(device, self.data, slice(start, start + size))
+        self._beside = np.r_[:start, start + size : model.nsensordata]
+        self._staged: dict[str, Any] = {}
+        self._graph: Any = None
+        self.seconds: dict[str, float] = {}
+
+    def _expand(self, name: str, values: np.ndarray) -> None:
+        if name.startswith(_HOST_ONLY):
+            return
+        if name.startswith("opt."):
+            raise NotImplementedError(f"{name} is the same in all worlds of Warp")
+        array = getattr(self.model, name, None)
+        if array is None or array.shape[0] != 1:
+            raise NotImplementedError(
+                f"{name} cannot differ between worlds of Warp; "
+                "take simulation_device='cpu'"
+            )
+        made = self._warp.array(
+            self._shaped(values, array), dtype=array.dtype, device=self._device.name
+        )
+        setattr(self.model, name, made)
+
+    @staticmethod
+    def _shaped(values: np.ndarray, array: Any) -> np.ndarray:
+        """Values in Warp's shape and type: vectors and matrices as last axes."""
+        inner = tuple(getattr(array.dtype, "_shape_", ()))
+        shape = (len(values), *array.shape[1:], *inner)
+        kind = np.int32 if array.dtype is int else np.float32
+        return np.ascontiguousarray(values.reshape(shape), kind)
+
+    def write_model(self, own: Mapping[str, np.ndarray], names: Iterable[str]) -> None:
+        """Writes fields of the model that have changed."""
+        for name in names:
+            if not name.startswith(_HOST_ONLY):
+                array = getattr(self.model, name)
+                array.assign(self._shaped(own[name], array))
+
+    def write(self, arrays: Any, whole: bool) -> None:
+        """Writes the state of all worlds, or what the host changes in every step.
+
+        Args:
+            arrays: Of the host, by MuJoCo's names.
+            whole: Whether velocities and accelerations have changed, too.
+        """
+        began = time.perf_counter()
+        if whole:
+            self._passive.write()
+        for name in _WRITTEN if whole else _ALWAYS:
+            array = getattr(self.data, name)
+            staged = self._stage(f"to {name}", array)
+            np.copyto(staged.numpy(), getattr(arrays, name), casting="same_kind")
+            self._warp.copy(array, staged)
+        self.seconds["write"] = time.perf_counter() - began
+
+    def _stage(self, key: str, array: Any) -> Any:
+        """Page-locked memory of the host for a copy of an array."""
+        if key not in self._staged:
+            pinned = self._device.is_cuda
+            self._staged[key] = self._warp.empty(
+                array.shape, dtype=array.dtype, device="cpu", pinned=pinned
+            )
+        return self._staged[key]
+
+    def step(self) -> None:
+        """Does the physics steps of a control step."""
+        self._reduction.begin()
+        self._contacts.begin()
+        with self._warp.ScopedDevice(self._device.name):
+            if not self._device.is_cuda:
+                self._steps()
+                return
+            if self._graph is None:
+                self._graph = self._captured()
+            self._warp.capture_launch(self._graph)
+
+    def _steps(self) -> None:
+        for _ in range(self._substeps):
+            self._mjwarp.step(self.model, self.data)
+            self._reduction.add()
+
+    def _captured(self) -> Any:
+        """The physics steps as a CUDA graph; the state stays as it is."""
+        kept = {name: self._warp.clone(getattr(self.data, name)) for name in _WRITTEN}
+        self._mjwarp.step(self.model, self.data)  # compiles what is not compiled yet
+        self._reduction.add()
+        with self._warp.ScopedCapture() as capture:
+            self._steps()
+        for name, array in kept.items():
+            self._warp.copy(getattr(self.data, name), array)
+        self._reduction.begin()
+        return capture.graph
+
+    def read(self, arrays: Any, names: Iterable[str]) -> Totals:
+        """Reads the state, what an episode reads, and the sums of the control step.
+
+        Args:
+            arrays: Of the host, by MuJoCo's names, (N, ...) float64.
+            names: Those to read; of `sensordata` all but the contacts.
+        """
+        chosen = [name for name in names if name != "sensordata"]
+        began = time.perf_counter()
+        self.wait()
+        stepped = time.perf_counter()
+        for name in chosen:
+            array = getattr(self.data, name)
+            self._warp.copy(self._stage(name, array), array)
+        self.wait()
+        copied = time.perf_counter()
+        for name in chosen:
+            there = getattr(arrays, name)
+            np.copyto(there, self._staged[name].numpy().reshape(there.shape))
+        totals = self._reduction.read()
+        arrays.sensordata[:, self._beside] = totals.beside
+        done = time.perf_counter()
+        self.seconds |= {"step": stepped - began, "copy": copied - stepped}
+        self.seconds["convert"] = done - copied
+        return totals
+
+    def wait(self) -> None:
+        """Waits until the device has done what it was told."""
+        self._warp.synchronize_device(self._device.name)
+
+    def read_sensors(self, out: np.ndarray) -> None:
+        """Reads all sensors (N, nsensordata) of the last physics step."""
+        out[...] = self.data.sensordata.numpy()
+
+    def overflowed(self) -> np.ndarray:
+        """(N,) whether a world had too many contacts or rows in the control step."""
+        found = self._contacts.overflowed() | (self.data.overflow.numpy() != 0)
+        self.data.overflow.zero_()
+        return found

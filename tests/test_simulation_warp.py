@@ -1,0 +1,109 @@
+"""MuJoCo Warp on the CPU against `mujoco.batch`, with the same laws and actions."""
+
+import importlib.util
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+
+from cathsim_dmc import suite
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.simulation.warp import contacts, devices
+from cathsim_dmc.simulation.warp.simulation import WarpSimulation
+
+needs_warp = pytest.mark.skipif(
+    importlib.util.find_spec("mujoco_warp") is None, reason="needs the extra gpu"
+)
+STEPS = 24  # control steps; the device is then in contact with the wall
+
+
+def both(task, count=4, **options):
+    one = BatchSimulation(suite.make_task(task, **options), count, num_threads=1)
+    two = WarpSimulation(suite.make_task(task, **options), count, device="cpu")
+    return one, two
+
+
+@pytest.mark.slow
+@needs_warp
+def test_worlds_follow_the_batch():
+    one, two = both("type1_lcca", randomisation=True)
+    here, there = one.reset(), two.reset()
+    for key, value in here.observation.items():
+        np.testing.assert_array_equal(there.observation[key], value)
+    random = np.random.RandomState(0)
+    forces, equal = [], 0
+    for _ in range(STEPS):
+        action = random.uniform(-1, 1, (4, one.num_actions))
+        action[:, -1] = 1.0
+        here, there = one.step(action), two.step(action)
+        tips = here.readings.head - there.readings.head
+        assert np.linalg.norm(tips, axis=1).max() < 0.5e-3
+        found = one.contacts(), two.contacts()
+        counts = [each.present.sum(axis=1) for each in found]
+        equal += int((counts[0] == counts[1]).sum())
+        forces.append((here.wall_force.sum, there.wall_force.sum))
+    totals = np.array(forces).sum(axis=(0, 2))
+    assert totals[0] > 0.0
+    assert totals[1] == pytest.approx(totals[0], rel=0.05)
+    # Where a contact is between two physics steps, single precision decides.
+    assert equal >= 0.9 * 4 * STEPS
+    assert not two.stepper.lost.any()
+    # Some worlds begin anew, the others stay where they are.
+    before = two.rollout.readings.head.copy()
+    after = two.reset(np.array([1, 3])).readings.head
+    np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
+    assert (after[[1, 3]] != before[[1, 3]]).any()
+    # One instant: the same state has the same contacts.
+    model, data = two.stepper._mine()
+    two.stepper._write(0, data, vars(two.stepper.arrays))
+    mujoco.mj_forward(two.stepper._model_of(0), data)
+    wall = model.geom("wall").id
+    at_wall = [c for c in data.contact if c.geom2 == wall]
+    two.stepper.run()
+    assert len(at_wall) == pytest.approx(two.contacts().present[0].sum(), abs=1)
+
+
+@needs_warp
+@pytest.mark.parametrize(
+    ("task", "options", "named"),
+    [
+        ("type1_lcca_pair", {}, "coaxial devices"),
+        ("type1_lcca", {"vessel": "living"}, "living vessel"),
+    ],
+)
+def test_what_is_not_simulated_is_refused_by_name(task, options, named):
+    with pytest.raises(NotImplementedError, match=named):
+        WarpSimulation(suite.make_task(task, **options), 1, device="cpu")
+
+
+@needs_warp
+def test_a_device_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="cuda:7.*cpu"):
+        WarpSimulation(suite.make_task("type1_lcca"), 1, device="cuda:7")
+
+
+def test_without_the_extra_an_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
+    with pytest.raises(ImportError, match=r"\.\[gpu\]"):
+        devices.warp_modules()
+
+
+def test_parameters_of_contacts_are_mixed_as_in_mujoco():
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco><worldbody>
+      <geom name="a" type="box" size="1 1 1" condim="3" solmix="3" priority="0"/>
+      <geom name="b" type="box" size="1 1 1" condim="1" priority="2"/>
+      <body pos="0 0 1.05">
+        <freejoint/>
+        <geom name="c" type="capsule" size="0.1 0.2" contype="0" conaffinity="1"
+          condim="4"/>
+      </body>
+    </worldbody></mujoco>""")
+    links = contacts._links(model, np.array([0, 1]))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    dims = {int(c.geom.min()): int(c.dim) for c in data.contact}
+    assert dims == {0: links.dims[0, 0], 1: links.dims[0, 1]}
+    assert links.mix[0, 0] == 0.25
+    assert links.priorities.tolist() == [[0, 1]]
