@@ -158,6 +158,9 @@ TRAINING = {
     "activation": word(),
     "cnn_features": whole(1),
     "subtract_background": flag(),
+    "simulation_device": word(),
+    "logger": word(optional=True),
+    "modules": st.sampled_from([1, 1.5, True, {}, [1], (1,)]),
     "convolutions": st.sampled_from(
         [
             *(None, 1, "x", (), [], {}, True, ((1.5, 8, 4),)),

@@ -38,7 +38,7 @@ def test_wrong_domain_name():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"task_name": "type3_bcb"}, ["type3_bcb", "cathsim", *TASKS, "navigate"]),
+        ({"task_name": "type3_bcb"}, ["type3_bcb", "`cathsim list`", *TASKS]),
         ({"observation": "pixels"}, ["pixels", *OBSERVATIONS]),
         ({"frictoin": 0.1}, ["frictoin", *OPTIONS]),
         ({**TYPE1, "goal": "carotid"}, ["carotid", *phantoms.load("simple1").goals]),

@@ -176,7 +176,9 @@ def test_what_is_no_policy_is_refused(tmp_path):
         load_policy(tmp_path / "expret")
     with pytest.raises(TypeError, match="policy is 3; it must be a name"):
         load_policy(3)
-    with pytest.raises(ValueError, match="'push' was not trained.*type1_bca"):
+    with pytest.raises(
+        ValueError, match="'push' was not trained.*type1_lcca.*`cathsim list`"
+    ):
         evaluate("push")
     with pytest.raises(AttributeError, match="'task'"):
         evaluate("push", "reach", 1, make_env=synthetic_env.make_env)

@@ -76,12 +76,12 @@ def test_draws_lie_in_their_ranges(seed):
     for name in (*drawn, "delay"):
         low, high = getattr(DEFAULT_RANGES, name)
         assert low <= getattr(episode, name) <= high
-    deviation, (low, high) = episode.deviation, DEFAULT_RANGES.view
-    for angle in (deviation.primary, deviation.secondary):
+    low, high = DEFAULT_RANGES.view
+    for angle in episode.view:
         assert low <= angle <= high and angle == int(angle)
     for name in ("gain", "kerma"):
         low, high = getattr(DEFAULT_RANGES, name)
-        assert low <= getattr(deviation, name) <= high
+        assert low <= getattr(episode, name) <= high
 
 
 def test_a_composer_variation_is_a_range_too():

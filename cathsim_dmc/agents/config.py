@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import re
 import types
 import typing
 from collections.abc import Mapping
@@ -232,6 +233,9 @@ class TrainingConfig:
         layers, start = self.convolutions, self.training_start
         fit = all(len(layer) == 3 for layer in layers)
         require(fit, "convolutions", layers, "(filters, kernel size, stride) of each")
+        place = re.fullmatch(r"cpu|cuda(:\d+)?", self.simulation_device)
+        named = "'cpu', 'cuda' or 'cuda:1'"
+        require(bool(place), "simulation_device", self.simulation_device, named)
         ordered = start is None or (len(start) == 2 and start[0] <= start[1])
         require(ordered, "training_start", start, "two shares (low, high), low <= high")
         try:

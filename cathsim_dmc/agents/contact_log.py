@@ -46,4 +46,5 @@ class ContactLog:
             return
         title = f"{result.task}, {result.policy}: {len(result.episodes)} episodes"
         surface = task.scene.anatomy.surface
-        heatmap.heatmap(*self.contacts(), surface, path, title)
+        positions, magnitudes = self.contacts()
+        heatmap.heatmap(positions, magnitudes, surface, path, title)

@@ -189,9 +189,9 @@ def views(kind: Any, rows: np.ndarray, sizes: Mapping[str, int]) -> Any:
     found, start = [], 0
     for shape in declared.shapes(kind, sizes).values():
         count = math.prod(shape)
-        found.append(rows[:, start : start + count].reshape(len(rows), *shape))
+        found.append(rows[:, start : start + count].reshape((len(rows), *shape)))
         start += count
-    return kind(*found)
+    return kind._make(found)
 
 
 class Layout:

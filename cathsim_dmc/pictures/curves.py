@@ -56,7 +56,7 @@ def plot(episode: Episode) -> Picture:
     time = episode.time - episode.time[0]
     for axes in panels:
         for name, first, last in phases(episode):
-            axes.axvspan(*time[[first, last]], color=PHASES[name], lw=0, zorder=0)
+            axes.axvspan(time[first], time[last], color=PHASES[name], lw=0, zorder=0)
     _draw_forces(panels[0], episode, time)
     _draw_insertion(panels[1], episode, time)
     _draw_distance(panels[2], episode, time)
@@ -92,7 +92,7 @@ def _draw_forces(axes: Any, episode: Episode, time: np.ndarray) -> None:
     touching = np.isin(np.arange(episode.steps), episode.contact_step)
     edges = np.flatnonzero(np.diff(touching, prepend=False, append=False))
     for first, last in edges.reshape(-1, 2):
-        axes.axvspan(*time[[first, last]], 0.97, 1.0, color=_TOUCH, lw=0)
+        axes.axvspan(time[first], time[last], 0.97, 1.0, color=_TOUCH, lw=0)
     axes.set_ylabel("force, mN")
     axes.margins(y=0.1)
     axes.legend(fontsize=8, loc="upper left", framealpha=0.9)

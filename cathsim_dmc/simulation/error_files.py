@@ -153,11 +153,16 @@ class ErrorFiles:
             rows, snapshot = np.array([index]), before[index]
             drawn = packed(f"rollout.{_RANDOM}", getattr(rollout, _RANDOM), rows)
             snapshot = Snapshot(snapshot.task, {**snapshot.arrays, **drawn}, versions())
-            own = self._options, self._whole, snapshot, action[index].copy()
+            failed = PhysicsError(
+                str(step.errors[index]),
+                self._task,
+                self._options,
+                self._whole,
+                snapshot,
+                action[index].copy(),
+            )
             try:
-                path = self._write(
-                    PhysicsError(str(step.errors[index]), self._task, *own)
-                )
+                path = self._write(failed)
             except OSError as error:  # must not end the other simulations
                 _LOG.error("the file of a physics error is lost: %s", error)
                 return

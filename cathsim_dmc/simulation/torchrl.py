@@ -114,7 +114,9 @@ class BatchedEnv(EnvBase):
         Simulations without snapshots write none.
         """
         if self.simulation.stepper.has_snapshots:
-            self.simulation.error_files = ErrorFiles(folder, *self._made)
+            self.simulation.error_files = ErrorFiles(
+                folder, self._made[0], self._made[1]
+            )
 
     def _reset(
         self,

@@ -55,14 +55,16 @@ class Cover:
 def rings(ways: Ways, before: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Pairs of ways from the inlet whose ends touch, for every ring of vessels."""
     up = _upstream(ways, before)
-    links = ways.links[np.not_equal(*up[ways.links.T])]
+    one, other = up[ways.links.T]
+    links = ways.links[one != other]
     back = up[links]
     gap = np.linalg.norm(np.diff(ways.points[back], axis=1)[:, 0], axis=1)
     wide = ways.depth[back].sum(axis=1)
     apart = gap > APART * wide + APART_MIN
     # Or, if they are nearer, where a wall stands between them.
     near = np.flatnonzero(~apart & (gap > wide + APART_MIN) & ways.main[links[:, 0]])
-    apart[near] = ways.walled(*ways.points[back[near]].swapaxes(0, 1))
+    here, there = ways.points[back[near]].swapaxes(0, 1)
+    apart[near] = ways.walled(here, there)
     links = links[ways.main[links[:, 0]] & apart]
     depth = ways.depth[links].min(axis=1)
     label = groups(len(ways.points), links)[links[:, 0]]

@@ -17,7 +17,6 @@ from cathsim_dmc import bounds, extras
 from cathsim_dmc.compiled import compiled, for_cuda
 
 _THREADS = 128  # of a block
-_NEEDED = ("warp", "mujoco_warp")
 
 Scratch = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 NONE: Scratch = ((1,), (1,), (1,))
@@ -37,8 +36,8 @@ class Chosen(NamedTuple):
 
 def warp_modules() -> tuple[Any, Any]:
     """The modules `warp` and `mujoco_warp`; ImportError says what to install."""
-    extras.require("gpu", *_NEEDED)
-    found = [importlib.import_module(name) for name in _NEEDED]
+    extras.require("gpu", "warp", "mujoco_warp")
+    found = [importlib.import_module(name) for name in ("warp", "mujoco_warp")]
     found[0].config.quiet = True
     return found[0], found[1]
 
@@ -86,40 +85,38 @@ class Device:
         return array.copy_to_host() if self.is_cuda else array.copy()
 
     def launch(
-        self, function: Any, count: int | Chosen, scratch: Scratch, *arguments: Any
+        self, function: Any, count: int | Chosen, scratch: Scratch, given: Any
     ) -> None:
-        """Runs `function(thread, scratch, *arguments)` in many threads.
+        """Runs `function(thread, scratch, given)` in many threads.
 
         Args:
             function: Compiled thread function.
             count: Number of threads, or those of `select`.
             scratch: Shapes of arrays of float64 that each thread has for itself.
-            arguments: Numbers, arrays and named tuples of them.
+            given: Named tuple of arrays, numbers and named tuples.
         """
-        chosen = count if isinstance(count, Chosen) else None
-        if self.is_cuda:
-            kernel = _chosen_kernel if chosen else _kernel
-            total = len(chosen.threads) if chosen else count
-            given = (chosen or count), arguments
-            self._run(kernel(function, scratch), total, *given)
-            return
-        loop = (_chosen_loop if chosen else _loop)(function)
-        loop(chosen or count, tuple(map(np.zeros, scratch)), arguments)
-
-    def select(self, test: Any, chosen: Chosen, *arguments: Any) -> Chosen:
-        """Chooses the threads in which `test(thread, scratch, *arguments)` is true."""
-        if self.is_cuda:
-            self._run(_clear_kernel(), 1, chosen.found)
-            total = len(chosen.threads)
-            self._run(_test_kernel(test), total, chosen, arguments)
+        if not self.is_cuda:
+            loop = _chosen_loop if isinstance(count, Chosen) else _loop
+            loop(function)(count, tuple(map(np.zeros, scratch)), given)
+        elif isinstance(count, Chosen):
+            total = len(count.threads)
+            self._run(_chosen_kernel(function, scratch), total, (count, given))
         else:
-            _test_loop(test)(chosen, tuple(map(np.zeros, NONE)), arguments)
+            self._run(_kernel(function, scratch), count, (count, given))
+
+    def select(self, test: Any, chosen: Chosen, given: Any) -> Chosen:
+        """Chooses the threads in which `test(thread, given)` is true."""
+        if self.is_cuda:
+            self._run(_clear_kernel(), 1, (chosen.found, 0))
+            self._run(_test_kernel(test), len(chosen.threads), (chosen, given))
+        else:
+            _test_loop(test)(chosen, given)
         return chosen
 
-    def _run(self, kernel: Any, count: int, *arguments: Any) -> None:
+    def _run(self, kernel: Any, count: int, arguments: tuple[Any, Any]) -> None:
         stream = _cuda().external_stream(self._warp.get_stream(self.name).cuda_stream)
         blocks = (count + _THREADS - 1) // _THREADS
-        kernel[blocks, _THREADS, stream](*arguments)
+        kernel[blocks, _THREADS, stream](arguments[0], arguments[1])
 
 
 def _cuda() -> Any:
@@ -136,9 +133,9 @@ def _cuda() -> Any:
 def _loop(function: Any) -> Any:
     """A compiled loop over the threads of a thread function."""
 
-    def loop(count, scratch, arguments):
+    def loop(count, scratch, given):
         for thread in range(count):
-            function(thread, scratch, *arguments)
+            function(thread, scratch, given)
 
     return compiled(loop, cache=False)
 
@@ -147,9 +144,9 @@ def _loop(function: Any) -> Any:
 def _chosen_loop(function: Any) -> Any:
     """A compiled loop over the chosen threads of a thread function."""
 
-    def loop(chosen, scratch, arguments):
+    def loop(chosen, scratch, given):
         for n in range(chosen.found[0]):
-            function(chosen.threads[n], scratch, *arguments)
+            function(chosen.threads[n], scratch, given)
 
     return compiled(loop, cache=False)
 
@@ -158,10 +155,10 @@ def _chosen_loop(function: Any) -> Any:
 def _test_loop(test: Any) -> Any:
     """A compiled loop that chooses threads."""
 
-    def loop(chosen, scratch, arguments):
+    def loop(chosen, given):
         found = 0
         for thread in range(len(chosen.threads)):
-            if test(thread, scratch, *arguments):
+            if test(thread, given):
                 chosen.threads[found] = thread
                 found += 1
         chosen.found[0] = found
@@ -176,7 +173,7 @@ def _kernel(function: Any, scratch: Scratch) -> Any:
     one, two, three = scratch
 
     @cuda.jit
-    def kernel(count, arguments):
+    def kernel(count, given):
         thread = cuda.grid(1)
         if thread < count:
             own = (
@@ -184,7 +181,7 @@ def _kernel(function: Any, scratch: Scratch) -> Any:
                 cuda.local.array(two, np.float64),
                 cuda.local.array(three, np.float64),
             )
-            inner(thread, own, *arguments)
+            inner(thread, own, given)
 
     return kernel
 
@@ -196,7 +193,7 @@ def _chosen_kernel(function: Any, scratch: Scratch) -> Any:
     one, two, three = scratch
 
     @cuda.jit
-    def kernel(chosen, arguments):
+    def kernel(chosen, given):
         n = cuda.grid(1)
         if n < chosen.found[0]:
             own = (
@@ -204,7 +201,7 @@ def _chosen_kernel(function: Any, scratch: Scratch) -> Any:
                 cuda.local.array(two, np.float64),
                 cuda.local.array(three, np.float64),
             )
-            inner(chosen.threads[n], own, *arguments)
+            inner(chosen.threads[n], own, given)
 
     return kernel
 
@@ -215,9 +212,9 @@ def _test_kernel(test: Any) -> Any:
     cuda, inner = _cuda(), for_cuda(test)
 
     @cuda.jit
-    def kernel(chosen, arguments):
+    def kernel(chosen, given):
         thread = cuda.grid(1)
-        if thread < len(chosen.threads) and inner(thread, 0, *arguments):
+        if thread < len(chosen.threads) and inner(thread, given):
             chosen.threads[cuda.atomic.add(chosen.found, 0, 1)] = thread
 
     return kernel
@@ -225,11 +222,11 @@ def _test_kernel(test: Any) -> Any:
 
 @functools.cache
 def _clear_kernel() -> Any:
-    """A kernel that writes 0 into the first place of an array."""
+    """A kernel that writes the first place of an array."""
     cuda = _cuda()
 
     @cuda.jit
-    def kernel(array):
-        array[0] = 0
+    def kernel(array, value):
+        array[0] = value
 
     return kernel

@@ -75,16 +75,30 @@ def device_of(world, arrays):
     )
 
 
+class Given(NamedTuple):
+    """What a law gets.
+
+    Attributes:
+        parameters: Its parameters, of arrays (N, ...).
+        arrays: `Arrays`.
+        memory: `laws.springs.Scratch` of arrays (N, ...).
+    """
+
+    parameters: Any
+    arrays: Arrays
+    memory: Any
+
+
 @compiled
-def add_drag(world, scratch, given, arrays):
+def add_drag(world, scratch, all_given):
     """Adds the drag of still blood, see `laws.blood`.
 
     Args:
         world: Its number.
         scratch: Not used.
-        given: `Blood` of arrays (N, ...).
-        arrays: `Arrays`.
+        all_given: `Given`.
     """
+    given = all_given.parameters
     blood = Blood(
         given.density[world],
         given.viscosity[world],
@@ -96,24 +110,23 @@ def add_drag(world, scratch, given, arrays):
         given.friction[world],
         given.space_velocity[world],
     )
-    drag(blood, 0.0, device_of(world, arrays))
+    drag(blood, 0.0, device_of(world, all_given.arrays))
 
 
 @compiled
-def add_springs(world, scratch, given, arrays, memory):
+def add_springs(world, scratch, all_given):
     """Adds what the springs of a shaped device lack, see `laws.springs`.
 
     Args:
         world: Its number.
         scratch: Not used.
-        given: `Springs` of arrays (N, ...).
-        arrays: `Arrays`.
-        memory: `laws.springs.Scratch` of arrays (N, ...).
+        all_given: `Given`.
     """
+    given, memory = all_given.parameters, all_given.memory
     bends = Bends(memory.bends.bends[world], memory.bends.twists[world])
     own = Scratch(memory.angles[world], bends, memory.free[world])
     springs = Springs(given.rest[world], given.compliance[world])
-    shape_torques(springs, device_of(world, arrays), own)
+    shape_torques(springs, device_of(world, all_given.arrays), own)
 
 
 class PassiveForces:
@@ -144,7 +157,7 @@ class PassiveForces:
                     "Warp; take the device 'cpu'"
                 )
             given = effect.world.parameters
-            there = type(given)(*(device.constant(np.array(each)) for each in given))
+            there = type(given)._make(device.constant(np.array(each)) for each in given)
             law = add_drag if effect.adapter == "blood" else add_springs
             self._laws.append((law, given, there))
 
@@ -162,23 +175,24 @@ class PassiveForces:
         )
         memory = Scratch(
             constant(np.zeros((self._count, 2 * joints))),
-            Bends(*map(constant, bends)),
+            Bends._make(map(constant, bends)),
             constant(np.zeros((self._count, joints, 2))),
         )
-        arrays = Arrays(
-            places.first_link,
-            view(data.xipos),
-            rows.reshape(*rows.shape[:2], 9),
-            *(view(getattr(data, name)) for name in names),
-            *(view(getattr(model, name)) for name in fields),
-            constant(host.body_dofadr[links]),
-            constant(host.body_dofnum[links]),
-            constant(places.geoms.astype(np.int64)),
-            constant(places.hinges.astype(np.int64)),
+        arrays = Arrays._make(
+            [
+                places.first_link,
+                view(data.xipos),
+                rows.reshape((*rows.shape[:2], 9)),
+                *(view(getattr(data, name)) for name in names),
+                *(view(getattr(model, name)) for name in fields),
+                constant(host.body_dofadr[links]),
+                constant(host.body_dofnum[links]),
+                constant(places.geoms.astype(np.int64)),
+                constant(places.hinges.astype(np.int64)),
+            ]
         )
         self._calls = [
-            (law, there, arrays, *([memory] if law is add_springs else []))
-            for law, _, there in self._laws
+            (law, Given(there, arrays, memory)) for law, _, there in self._laws
         ]
 
     def write(self) -> None:
@@ -190,5 +204,5 @@ class PassiveForces:
     def __call__(self, model: Any, data: Any) -> None:
         """What mujoco_warp calls at the end of its own passive forces."""
         del model, data
-        for law, *arguments in self._calls:
-            self._device.launch(law, self._count, NONE, *arguments)
+        for law, given in self._calls:
+            self._device.launch(law, self._count, NONE, given)

@@ -37,19 +37,36 @@ def clear(world, scratch, totals):
     totals.diverged[world] = 0
 
 
+class Added(NamedTuple):
+    """What a physics step adds to the totals.
+
+    Attributes:
+        sensors: (N, nsensordata), Warp's.
+        first, last: Places of the wall's contacts in it.
+        qpos: (N, nq), Warp's.
+        qvel: (N, nv), Warp's.
+        totals: See `Totals`.
+    """
+
+    sensors: Any
+    first: Any
+    last: Any
+    qpos: Any
+    qvel: Any
+    totals: Totals
+
+
 @compiled
-def add(world, scratch, sensors, first, last, qpos, qvel, totals):
+def add(world, scratch, given):
     """Adds a physics step of a world; see `physics.forces_loops.summed`.
 
     Args:
         world: Its number.
         scratch: Not used.
-        sensors: (N, nsensordata), Warp's.
-        first, last: Places of the wall's contacts in it.
-        qpos: (N, nq), Warp's.
-        qvel: (N, nv), Warp's.
-        totals: `Totals`.
+        given: `Added`.
     """
+    sensors, first, last = given.sensors, given.first, given.last
+    qpos, qvel, totals = given.qpos, given.qvel, given.totals
     total, largest, deepest = 0.0, 0.0, totals.force[4, world]
     for at in range(first, last, CONTACT_SIZE):
         if sensors[world, at] == 0.0:
@@ -94,9 +111,9 @@ class Reduction:
             device.constant(np.zeros(self._count, np.int32)),
             device.constant(np.zeros((self._count, beside))),
         )
-        bounds = contacts.start, contacts.stop
-        arrays = view(data.sensordata), *bounds, view(data.qpos), view(data.qvel)
-        self._added = *arrays, self._totals
+        state = view(data.qpos), view(data.qvel)
+        sensors, first, last = view(data.sensordata), contacts.start, contacts.stop
+        self._added = Added(sensors, first, last, state[0], state[1], self._totals)
 
     def begin(self) -> None:
         """Begins a control step."""
@@ -104,8 +121,8 @@ class Reduction:
 
     def add(self) -> None:
         """Adds a physics step."""
-        self._device.launch(add, self._count, NONE, *self._added)
+        self._device.launch(add, self._count, NONE, self._added)
 
     def read(self) -> Totals:
         """The totals on the host."""
-        return Totals(*map(self._device.host, self._totals))
+        return Totals._make(map(self._device.host, self._totals))

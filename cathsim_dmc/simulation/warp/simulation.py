@@ -50,5 +50,5 @@ class WarpSimulation(BatchSimulation):
         self.stepper.take(self.rollout)
 
     def _made_stepper(self, num_simulations: int, num_threads: int) -> WarpStepper:
-        own = self.task, self._model, num_simulations
-        return WarpStepper(*own, self._device, num_threads)
+        task, model = self.task, self._model
+        return WarpStepper(task, model, num_simulations, self._device, num_threads)

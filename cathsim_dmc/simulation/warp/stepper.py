@@ -90,8 +90,8 @@ class WarpStepper(Stepper):
             NotImplementedError: if there is a law that is not simulated on Warp.
         """
         places = Places.of(self._model, rollout.index)
-        own = rollout.effects, self.num_simulations
-        self._passive = PassiveForces(self._device, places, *own)
+        count = self.num_simulations
+        self._passive = PassiveForces(self._device, places, rollout.effects, count)
 
     # Fields of the model that differ between worlds.
 
@@ -166,8 +166,9 @@ class WarpStepper(Stepper):
         """Does the physics steps of a control step on the device."""
         if self._worlds is None or not self.contacts.is_bound:
             laws = self.contacts, self._passive
-            given = self._device, self._model, self._own, laws, self.substeps
-            self._worlds = Worlds(*given)
+            self._worlds = Worlds(
+                self._device, self._model, self._own, laws, self.substeps
+            )
             self._dirty.clear()
             self._stale = True
         worlds = self._worlds
@@ -192,7 +193,7 @@ class WarpStepper(Stepper):
             self._stale = True
 
     def _forces(self) -> tuple[forces.WallForce, np.ndarray]:
-        return forces.WallForce(*self._force[:4].copy()), self._force[4].copy()
+        return forces.WallForce._make(self._force[:4].copy()), self._force[4].copy()
 
     @property
     def contact_rows(self) -> np.ndarray:

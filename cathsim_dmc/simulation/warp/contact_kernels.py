@@ -1,0 +1,431 @@
+"""Contacts of links with walls, as functions of one thread of a GPU.
+
+The law is `laws.contact`, as in `collision.loops`. A thread takes one link and one
+carrier of one world, or writes the contacts of one world.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from cathsim_dmc.compiled import compiled
+from cathsim_dmc.laws.capsule import SAMPLES, is_far
+from cathsim_dmc.laws.contact import (
+    CONTACT,
+    contact_law,
+    contacts,
+    end_caps,
+    looks_ahead,
+    sweep_of,
+    world_contact,
+)
+from cathsim_dmc.laws.contact import Scratch as Memory
+from cathsim_dmc.laws.field import FieldArrays
+from cathsim_dmc.laws.places import Capsule
+from cathsim_dmc.laws.planes import MOST, PLANES
+from cathsim_dmc.laws.vectors import into
+from cathsim_dmc.laws.wall import Wall, is_straight_bore
+from cathsim_dmc.simulation.warp.devices import Scratch
+
+SCRATCH: Scratch = ((SAMPLES,), (PLANES, 4), (MOST, CONTACT))
+_LEAST_FRICTION = 1e-5  # MuJoCo's mjMINMU
+_CONSTRAINT = 1  # mujoco_warp's ContactType.CONSTRAINT
+
+
+class Links(NamedTuple):
+    """The links and the carriers of the compiled model.
+
+    Attributes:
+        geoms: (L,) geoms of the links.
+        joints: (L,) bodies whose origin is the joint of a link; -1 for none.
+        carriers: (C,) geoms that carry a wall.
+        last_dof: (L,) last degree of freedom that moves a link; -1 for none.
+        roots: (L,) bodies at the roots of the links' trees.
+        parents: (nv,) degree of freedom before each one; -1 for none.
+        dims: (L, C) dimensions of a contact.
+        priorities: (L, C) 1 where the carrier's parameters hold, -1 where the link's
+            do, 0 where they are mixed.
+        mix: (L, C) weight of the link's `solref` and `solimp`.
+    """
+
+    geoms: Any
+    joints: Any
+    carriers: Any
+    last_dof: Any
+    roots: Any
+    parents: Any
+    dims: Any
+    priorities: Any
+    mix: Any
+
+
+class Walls(NamedTuple):
+    """Walls of all anatomies, one after the other, and that of each world.
+
+    Attributes:
+        head, coarse, bricks, samples: As `laws.field.FieldArrays`, of all lumens.
+        line: As `laws.wall.Wall`, of all bores.
+        starts: (F, 5, 2) first and last place of wall f in each of these arrays.
+        is_bore: (F,) whether a wall is a bore.
+        middle: (F, 3) m, place of the carrier's middle in the frame of the wall.
+        of_world: (N, C) wall of a carrier in each world.
+    """
+
+    head: Any
+    coarse: Any
+    bricks: Any
+    samples: Any
+    line: Any
+    starts: Any
+    is_bore: Any
+    middle: Any
+    of_world: Any
+
+
+class Fields(NamedTuple):
+    """Fields of Warp's model, (1 or N, ...)."""
+
+    size: Any
+    friction: Any
+    solref: Any
+    solimp: Any
+    timestep: Any
+
+
+class Motion(NamedTuple):
+    """Arrays of Warp's data (N, ...) that a contact depends on."""
+
+    geom_xpos: Any
+    geom_xmat: Any
+    xpos: Any
+    cdof: Any
+    qvel: Any
+    subtree_com: Any
+
+
+class Found(NamedTuple):
+    """Contacts of all threads, before they are counted.
+
+    Attributes:
+        count: (T,) contacts of a thread.
+        rows: (T, MOST, 7) of each the distance m, the place (3) m, and the direction
+            (3) from the link into the wall.
+    """
+
+    count: Any
+    rows: Any
+
+
+class Contacts(NamedTuple):
+    """Arrays of mujoco_warp's `Contact`, and their number."""
+
+    dist: Any
+    pos: Any
+    frame: Any
+    includemargin: Any
+    friction: Any
+    solref: Any
+    solreffriction: Any
+    solimp: Any
+    dim: Any
+    geom: Any
+    efc_address: Any
+    worldid: Any
+    type: Any
+    geomcollisionid: Any
+    adhesion: Any
+    nacon: Any
+
+
+@compiled
+def _wall(walls, number):
+    """`laws.wall.Wall` of a number."""
+    # A device function of numba-cuda may return arrays in a tuple alone.
+    first, last = walls.starts[number, :, 0], walls.starts[number, :, 1]
+    field = FieldArrays(
+        walls.head[first[0] : last[0]],
+        walls.coarse[first[1] : last[1]],
+        walls.bricks[first[2] : last[2]],
+        walls.samples[first[3] : last[3]],
+    )
+    line = walls.line[first[4] : last[4]]
+    return Wall(walls.is_bore[number], field, line)
+
+
+@compiled
+def _matrix(turns, world, geom):
+    """The nine numbers of a matrix of Warp, row by row, float64."""
+    m = turns[world, geom]
+    return (
+        float(m[0, 0]), float(m[0, 1]), float(m[0, 2]),
+        float(m[1, 0]), float(m[1, 1]), float(m[1, 2]),
+        float(m[2, 0]), float(m[2, 1]), float(m[2, 2]),
+    )  # fmt: skip
+
+
+@compiled
+def _vector(places, world, number):
+    place = places[world, number]
+    return float(place[0]), float(place[1]), float(place[2])
+
+
+@compiled
+def _swept(links, motion, world, link, step):
+    """Ways of a link's centre (3) m and turn (3) rad in a physics step, in the world.
+
+    See `collision.links`.
+    """
+    a, b, c, x, y, z = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    dof = links.last_dof[link]
+    while dof >= 0:
+        way, velocity = motion.cdof[world, dof], float(motion.qvel[world, dof])
+        a, b = a + way[0] * velocity, b + way[1] * velocity
+        c, x = c + way[2] * velocity, x + way[3] * velocity
+        y, z = y + way[4] * velocity, z + way[5] * velocity
+        dof = links.parents[dof]
+    about = motion.subtree_com[world, links.roots[link]]
+    centre = motion.geom_xpos[world, links.geoms[link]]
+    u, v, w = centre[0] - about[0], centre[1] - about[1], centre[2] - about[2]
+    x, y, z = x + b * w - c * v, y + c * u - a * w, z + a * v - b * u
+    return (step * x, step * y, step * z), (step * a, step * b, step * c)
+
+
+class Pair(NamedTuple):
+    """A link and a wall in one world.
+
+    Attributes:
+        wall: `laws.wall.Wall`.
+        capsule: The link in the frame of the wall.
+        law: `laws.contact.Law`.
+        sweep: `laws.contact.Sweep`.
+        centre: (3) m, of the link, in the world.
+        axis: (3) unit vector of the link, in the world.
+        frame: (9) matrix whose columns are the axes of the wall's frame.
+    """
+
+    wall: Any
+    capsule: Any
+    law: Any
+    sweep: Any
+    centre: Any
+    axis: Any
+    frame: Any
+
+
+@compiled
+def pair_of(thread, links, walls, fields, motion):
+    """`Pair` of a thread.
+
+    Args:
+        thread: (carrier · N + world) · L + link.
+        links: `Links`.
+        walls: `Walls`.
+        fields: `Fields`.
+        motion: `Motion`.
+    """
+    count, worlds = len(links.geoms), len(walls.of_world)
+    link, world = thread % count, (thread // count) % worlds
+    which = thread // (count * worlds)
+    geom, carrier = links.geoms[link], links.carriers[which]
+    number = walls.of_world[world, which]
+    wall, middle = _wall(walls, number), walls.middle[number]
+    frame = _matrix(motion.geom_xmat, world, carrier)
+    turned = _matrix(motion.geom_xmat, world, geom)
+    centre = _vector(motion.geom_xpos, world, geom)
+    origin = _vector(motion.geom_xpos, world, carrier)
+    axis = (turned[2], turned[5], turned[8])
+    apart = (centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2])
+    seen = into(frame, apart)
+    local = (middle[0] + seen[0], middle[1] + seen[1], middle[2] + seen[2])
+    size = fields.size[world % len(fields.size), geom]
+    radius, half_length = float(size[0]), float(size[1])
+    caps = (True, True)
+    if links.joints[link] >= 0:
+        joint = _vector(motion.xpos, world, links.joints[link])
+        caps = end_caps(centre, axis, half_length, joint)
+    capsule = Capsule(local, into(frame, axis), half_length, caps)
+    impedance = float(fields.solimp[world % len(fields.solimp), geom, 0])
+    reference = float(fields.solref[world % len(fields.solref), geom, 0])
+    law = contact_law(wall, radius, 0.0, impedance, reference)
+    travel, turn = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    if looks_ahead(law):
+        step = float(fields.timestep[world % len(fields.timestep)])
+        travel, turn = _swept(links, motion, world, link, step)
+        travel, turn = into(frame, travel), into(frame, turn)
+    sweep = sweep_of(capsule, law, travel, turn)
+    return Pair(wall, capsule, law, sweep, centre, axis, frame)
+
+
+class Scene(NamedTuple):
+    """What contacts are found from, and where they go."""
+
+    links: Links
+    walls: Walls
+    fields: Fields
+    motion: Motion
+    found: Found
+
+
+class Written(NamedTuple):
+    """What contacts are written from, and where they go.
+
+    Attributes:
+        links: See `Links`.
+        fields: See `Fields`.
+        found: See `Found`.
+        out: Warp's contacts; world w has the places from w K on.
+        overflow: (N,) gets 1 where there are more than K contacts.
+    """
+
+    links: Links
+    fields: Fields
+    found: Found
+    out: Contacts
+    overflow: Any
+
+
+@compiled
+def is_near(thread, scene):
+    """Whether `find` is to look at the link and the wall of a thread; clears `found`.
+
+    Most links are far from the wall. The others are gathered, so that all threads of a
+    GPU that run together have as much to do.
+    """
+    scene.found.count[thread] = 0
+    pair = pair_of(thread, scene.links, scene.walls, scene.fields, scene.motion)
+    place = pair.capsule.centre
+    if not math.isfinite(place[0] + place[1] + place[2] + pair.axis[0] + pair.axis[1]):
+        return False
+    if is_straight_bore(pair.wall):
+        return True
+    law = pair.law
+    limit = max(law.radius + law.margin + law.activation, pair.sweep.reach)
+    return not is_far(pair.wall, pair.capsule, limit)
+
+
+@compiled
+def find(thread, scratch, scene):
+    """Finds the contacts of a link with a wall.
+
+    Args:
+        thread: As `pair_of`.
+        scratch: Arrays of the shapes `SCRATCH`.
+        scene: `Scene`.
+    """
+    found = scene.found
+    pair = pair_of(thread, scene.links, scene.walls, scene.fields, scene.motion)
+    samples, planes, out = scratch
+    memory = Memory(samples, planes)
+    count = contacts(pair.wall, pair.capsule, pair.law, pair.sweep, memory, out)
+    for n in range(count):
+        distance, place, towards = world_contact(
+            out[n], pair.law, pair.centre, pair.axis, pair.frame
+        )
+        row = found.rows[thread, n]
+        row[0] = distance
+        for k in range(3):
+            row[1 + k], row[4 + k] = place[k], towards[k]
+    found.count[thread] = count
+
+
+@compiled
+def _tangent(normal):
+    """A unit vector (3) across a unit vector, that of MuJoCo's `mju_makeFrame`."""
+    x, y, z = normal
+    a, b = (0.0, 1.0) if abs(y) < 0.5 else (1.0, 0.0)
+    along = a * z + b * y
+    u, v, w = -along * x, b - along * y, a - along * z
+    norm = math.sqrt(u * u + v * v + w * w)
+    return u / norm, v / norm, w / norm
+
+
+@compiled
+def _mixed(array, row, geoms, k, mix, priority):
+    """Entry k of a parameter of a contact, from those of link and carrier."""
+    link, carrier = float(array[row, geoms[0], k]), float(array[row, geoms[1], k])
+    if priority:
+        return carrier if priority > 0 else link
+    return mix * link + (1.0 - mix) * carrier
+
+
+@compiled
+def _write_law(links, fields, out, at, pair):
+    """Writes what two geoms give a contact, as MuJoCo's `mj_contactParam` does."""
+    world, link, which = pair
+    geoms = links.geoms[link], links.carriers[which]
+    priority, mix = links.priorities[link, which], links.mix[link, which]
+    row = world % len(fields.friction)
+    for k in range(3):  # sliding, spinning and rolling
+        one = float(fields.friction[row, geoms[0], k])
+        other = float(fields.friction[row, geoms[1], k])
+        value = max(one, other)
+        if priority:
+            value = other if priority > 0 else one
+        value = max(value, _LEAST_FRICTION)
+        if k == 1:
+            out.friction[at, 2] = value
+        else:
+            first = 0 if k == 0 else 3
+            out.friction[at, first] = out.friction[at, first + 1] = value
+    row = world % len(fields.solref)
+    first = fields.solref[row, geoms[0], 0], fields.solref[row, geoms[1], 0]
+    direct = first[0] <= 0 or first[1] <= 0
+    for k in range(2):
+        value = _mixed(fields.solref, row, geoms, k, mix, priority)
+        if direct and not priority:
+            one = float(fields.solref[row, geoms[0], k])
+            value = min(one, float(fields.solref[row, geoms[1], k]))
+        out.solref[at, k], out.solreffriction[at, k] = value, 0.0
+    row = world % len(fields.solimp)
+    for k in range(5):
+        out.solimp[at, k] = _mixed(fields.solimp, row, geoms, k, mix, priority)
+    out.dim[at] = links.dims[link, which]
+    out.geom[at, 0], out.geom[at, 1] = geoms
+
+
+@compiled
+def place(world, scratch, given):
+    """Writes the contacts of a world into its own places of Warp's arrays.
+
+    Args:
+        world: Its number.
+        scratch: Not used.
+        given: `Written`.
+    """
+    links, fields, found = given.links, given.fields, given.found
+    out, overflow = given.out, given.overflow
+    count, most = len(links.geoms), len(out.dist) // len(overflow)
+    carriers, at = len(links.carriers), world * most
+    for own in range(count * carriers):
+        link, which = own // carriers, own % carriers
+        thread = (which * len(overflow) + world) * count + link
+        for n in range(found.count[thread]):
+            if at == (world + 1) * most:
+                overflow[world] = 1
+                break
+            row = found.rows[thread, n]
+            out.dist[at], out.includemargin[at] = row[0], 0.0
+            normal = (row[4], row[5], row[6])
+            side = _tangent(normal)
+            other = (
+                normal[1] * side[2] - normal[2] * side[1],
+                normal[2] * side[0] - normal[0] * side[2],
+                normal[0] * side[1] - normal[1] * side[0],
+            )
+            for k in range(3):
+                out.pos[at, k] = row[1 + k]
+                out.frame[at, 0, k] = normal[k]
+                out.frame[at, 1, k] = side[k]
+                out.frame[at, 2, k] = other[k]
+            _write_law(links, fields, out, at, (world, link, which))
+            out.worldid[at], out.type[at] = world, _CONSTRAINT
+            out.geomcollisionid[at], out.adhesion[at] = n, 0.0
+            at += 1
+    for free in range(world * most, (world + 1) * most):
+        for k in range(out.efc_address.shape[1]):
+            out.efc_address[free, k] = -1
+        if free >= at:
+            out.type[free], out.worldid[free] = 0, world
+    if world == 0:
+        out.nacon[0] = len(out.dist)
