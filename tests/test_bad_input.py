@@ -37,7 +37,7 @@ TASK = {
     "endoluminal_size": pixels(),
     "randomisation": options() | NONE,
     "vessel": options() | NONE,
-    "goal_radius": POSITIVE,
+    "goal_radius": number(positive=True, optional=True),  # None: the usual one
     "reward": options() | NONE,
     "start_along_route": span(0, 0.95),
     "devices": st.sampled_from(["x", 1, [], [1], (None,), {}, ["x"], True]),
