@@ -151,12 +151,13 @@ def test_a_policy_that_ships_meets_its_card(name):
     policy = load_policy(f"pretrained:{name}")
     expected = policy.card["evaluation"]["summary"]
     played = agents.evaluate(policy, episodes=10).summary()
-    # Both are samples, and another processor rounds differently: intervals overlap.
-    intervals = [
-        success_interval(round(one["success"] * one["episodes"]), one["episodes"])
-        for one in (expected, played)
-    ]
-    assert max(low for low, _ in intervals) <= min(high for _, high in intervals)
+    low, high = success_interval(
+        round(expected["success"] * expected["episodes"]), expected["episodes"]
+    )
+    assert low <= played["success"]
+    # All of ten may succeed where the card has a little less.
+    least, _ = success_interval(round(10 * played["success"]), 10)
+    assert least <= high
     for quantity, statistic in (("sum", "mean"), ("max", "maximum")):
         said = expected["forces"][quantity][statistic]
         seen = played["forces"][quantity][statistic]["mean"]
