@@ -72,7 +72,8 @@ class _Table:
         from cathsim_dmc.collision import loops, table
 
         # The arrays whose addresses are in the table, for as long as the process.
-        self._kept: dict[int, Any] = {}
+        self._kept: dict[int, list[np.ndarray]] = {}
+        self._lattices: dict[int, list[np.ndarray]] = {}
         self._words, self._message = table.TABLE, ctypes.create_string_buffer(_MESSAGE)
         self._library = _mujoco_library()
         self._functions = (ctypes.c_void_p * (_TYPES * _TYPES)).in_dll(
@@ -113,7 +114,7 @@ class _Table:
 
     def move(self, key: int, lattice: np.ndarray) -> None:
         """Gives the field of an entry a motion, for simulations that have one."""
-        self._kept[key].append(lattice)
+        self._lattices.setdefault(key, []).append(lattice)
         row = self._rows[np.flatnonzero(self._rows[:, 0] == key)[0]]
         row[self._motion] = lattice.ctypes.data
         from cathsim_dmc.collision import moving
