@@ -64,7 +64,7 @@ class Play:
                 if action is not None:
                     self.actions[i].append(np.array(action[i], np.float64))
                     self.success[i] |= step.outcome.success[i]
-                    self.force[i] = max(self.force[i], step.wall_force.peak_sum[i])
+                    self.force[i] = max(self.force[i], step.wall_force.mean_sum[i])
                 self.states[i].append(
                     [np.array(v[i]) for _, v in sorted(step.observation.items())]
                     + [batch.batch.qpos[i].copy(), batch.batch.qvel[i].copy()]
@@ -80,7 +80,7 @@ def outcome_of_batch(step: Any, index: int) -> list[np.ndarray]:
     force = step.wall_force
     return [
         np.array([step.outcome.reward[index], *ended]),
-        np.array([force.sum[index], force.peak_sum[index], force.peak_max[index]]),
+        np.array([each[index] for each in force]),
     ]
 
 
@@ -100,7 +100,7 @@ def first_difference(
         if number:
             force = environment.task.wall_force
             own.append(np.array([seen.reward, seen.discount == 0, seen.last()]))
-            own.append(np.array([force.sum, force.peak_sum, force.peak_max]))
+            own.append(np.array(force))
         if any(not np.array_equal(*both) for both in zip(own, state, strict=True)):
             return number
     return None

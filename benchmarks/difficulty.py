@@ -93,7 +93,7 @@ class Trial:
         """JSON-able figures over the episodes.
 
         Forces in N, see `EpisodeForces`: "mean_force", "max_force" and "peak_force" are
-        averaged over the episodes, "largest_force" is the largest "peak_force" of all.
+        averaged over the episodes, "largest_force" is the largest "max_force" of all.
         """
         count = len(self.ends)
         names = ("mean_force", "max_force", "peak_force")
@@ -107,7 +107,7 @@ class Trial:
             "ends": dict(collections.Counter(self.ends)),
             "steps": float(np.mean(self.steps)),
             **{name: float(np.mean(values)) for name, values in figures.items()},
-            "largest_force": float(np.max(figures["peak_force"])),
+            "largest_force": float(np.max(figures["max_force"])),
         }
 
 

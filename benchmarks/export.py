@@ -129,11 +129,10 @@ def write_list(directory):
         forces, observation = summary["forces"], card["config"]["observation"]
         if not isinstance(observation, str):
             observation = ", ".join(observation)
-        shown = (
-            forces["sum"]["mean"],
-            forces["max"]["mean_in_contact"],
-            forces["max"]["maximum"],
-        )
+        # Cards of before 0.3 tell the forces at the end of a control step.
+        total = forces.get("mean_sum", forces["sum"])
+        largest = forces.get("mean_max", forces["max"])
+        shown = total["mean"], largest["mean_in_contact"], largest["maximum"]
         cells = [
             f"`{pretrained.PREFIX}{name}`",
             card["task"],

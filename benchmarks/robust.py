@@ -121,7 +121,7 @@ def play(policy: str, cell: Cell, player=None, threads: int | None = None) -> di
         num_threads=threads,
     )
     reached = found.values("success") > 0
-    sums = found.values("forces.peak_sum.maximum")
+    sums = found.values("forces.largest_sum")
     drawn = found.conditions or ({},) * cell.episodes
     return {
         "policy": policy,

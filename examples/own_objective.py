@@ -22,7 +22,7 @@ class GentleCannulation(Cannulation):
 
     TERMS = {
         **Cannulation.TERMS,
-        "hard_contact": lambda self, m: (m.wall_force.peak_max - 0.1).clip(min=0.0),
+        "hard_contact": lambda self, m: (m.wall_force.mean_max - 0.1).clip(min=0.0),
     }
 
 

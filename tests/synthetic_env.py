@@ -81,7 +81,7 @@ class ReachEnv(EnvBase):
                 pixels[i, y - 4 : y + 4, x - 4 : x + 4] = 255
             out["image"] = torch.as_tensor(pixels)
         info = {
-            **dict(zip(NAMES, (force, 0.5 * force, force, 0.5 * force), strict=True)),
+            **dict(zip(NAMES, 3 * (force, 0.5 * force), strict=True)),
             "physics_error": np.zeros(n),
             "path_ratio": np.ones(n),
             "success": distance < GOAL_RADIUS,

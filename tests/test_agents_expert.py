@@ -185,7 +185,7 @@ def test_pressing_on_the_wall_slows_the_device_down():
     # In a straight vessel the tip points along the route.
     simulation, options = jiggled(make_task("simple1_lcca"), 2, 1), pursuit.Settings()
     plan = pursuit.Plan.for_case(simulation.rollout.case())
-    pressing = forces.WallForce(*[np.array([0.0, 1.0])] * 4)
+    pressing = forces.WallForce(*[np.array([0.0, 1.0])] * 6)
     action, _ = plan.decide(
         options, plan.fresh((2,)), simulation.rollout.readings, pressing
     )

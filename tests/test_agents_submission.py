@@ -195,7 +195,7 @@ def test_a_replay_finds_what_was_not_played(short, script, tmp_path):
         and not path.with_suffix(".npz").exists()
     )
     for episode in values["episodes"]:
-        episode["forces"]["peak_sum"]["maximum"] = 0.01
+        episode["forces"]["mean_sum"]["maximum"] = 0.01
     forged = entries.read(sealed(path, summed(values)))
     assert forged.result.safe_success(0.5) == 1.0
     with pytest.raises(ValueError, match="4 of its 4 episodes are others .*seed 10000"):

@@ -18,6 +18,7 @@ from cathsim_dmc.analysis.force_statistics import (
     recorded_forces,
 )
 from cathsim_dmc.entities.devices import DEVICES
+from cathsim_dmc.tasks.objectives import Cannulation
 from cathsim_dmc.tasks.step import info_types
 
 
@@ -39,12 +40,27 @@ def test_statistics_of_known_forces():
         "wall_force_peak_sum": [4.0, 1.5, 5.0, 0.0],
         "wall_force_peak_max": [3.5, 1.0, 2.0, 0.0],
     }
-    assert recorded_forces(known_episode(**peaks)) == EpisodeForces(
+    means = {
+        "wall_force_mean_sum": [4.0, 0.5, 1.5, 0.0],
+        "wall_force_mean_max": [3.0, 0.5, 1.0, 0.0],
+    }
+    ends = EpisodeForces(
         sum=Statistics(mean=1.5, mean_in_contact=3.0, maximum=4.0),
         max=Statistics(mean=1.25, mean_in_contact=2.5, maximum=3.0),
         peak_sum=Statistics(mean=2.625, mean_in_contact=3.5, maximum=5.0),
         peak_max=Statistics(mean=1.625, mean_in_contact=6.5 / 3, maximum=3.5),
     )
+    found = recorded_forces(known_episode(**peaks, **means))
+    assert found == dataclasses.replace(
+        ends,
+        mean_sum=Statistics(mean=1.5, mean_in_contact=2.0, maximum=4.0),
+        mean_max=Statistics(mean=1.125, mean_in_contact=1.5, maximum=3.0),
+    )
+    assert found.max_force == 3.0 and found.mean_contact_force == 1.5
+    # A recording without means is read by what it tells.
+    older = recorded_forces(known_episode(**peaks))
+    assert older == ends and older.max_force == 3.0
+    assert older.mean_contact_force == 2.5 and older.largest_sum == 5.0
 
 
 def test_without_contact_forces_are_zero_and_in_contact_unknown():
@@ -93,6 +109,8 @@ def test_every_name_in_the_page_of_forces_exists():
         *QUANTITIES,
         *statistics,
         *FIGURES,
+        *Cannulation.TERMS,
+        "force",
         *suite.TASKS,
         *DEVICES,
     }
@@ -103,8 +121,8 @@ def test_every_name_in_the_page_of_forces_exists():
     assert len(words) > 20
     assert unknown - known == set()
     # The table of named figures says what they are.
-    forces = EpisodeForces(*(Statistics(i, i + 0.1, i + 0.2) for i in range(4)))
-    rows = re.findall(r"^\| `(\w+_force)` \| `(\w+)\.(\w+)` \|", text, re.M)
+    forces = EpisodeForces(*(Statistics(i, i + 0.1, i + 0.2) for i in range(6)))
+    rows = re.findall(r"^\| `(\w+)` \| `(\w+)\.(\w+)` \|", text, re.M)
     assert [name for name, *_ in rows] == list(FIGURES)
     for name, quantity, statistic in rows:
         figure = getattr(forces, name)

@@ -51,7 +51,9 @@ def test_forces_are_those_of_the_task(pushed):
     assert readout.push_force == episode.push_force[-1]
     text = repr(readout)
     assert f"{1e3 * readout.wall_max:.2f} mN" in text
-    assert len(text.splitlines()) == 4 + len(readout)
+    assert f"{1e3 * readout.wall_mean_sum:.2f}" in text
+    assert readout.wall_mean_sum == episode.meta["wall_force_mean_sum"][-1]
+    assert len(text.splitlines()) == 5 + len(readout)
     assert PEAK_NOTE in text
     assert len(readout.position) == len(readout.penetration) == len(readout)
 
@@ -75,7 +77,8 @@ def test_an_episode_is_plotted_over_time(pushed):
     figure = cathsim_dmc.plot(episode)
     top, middle, bottom = figure.axes
     curves = {line.get_label(): line.get_xydata() for line in top.lines}
-    np.testing.assert_allclose(curves["wall, sum"][:, 1], 1e3 * episode.wall_force_sum)
+    means = np.array(episode.meta["wall_force_mean_sum"])
+    np.testing.assert_allclose(curves["wall, sum"][:, 1], 1e3 * means)
     np.testing.assert_allclose(curves["wall, sum"][:, 0], episode.time[1:])
     peak = curves["wall, peak sum of a physics step*"][:, 1]
     assert (peak >= curves["wall, sum"][:, 1]).all()

@@ -46,6 +46,8 @@ def test_contacts_make_up_the_forces_of_the_task(env, episode):
     np.testing.assert_allclose(largest, episode.wall_force_max, atol=1e-9)
     peaks = np.array(episode.meta["wall_force_peak_max"])
     assert (peaks >= episode.wall_force_max - 1e-12).all()
+    means = np.array(episode.meta["wall_force_mean_max"])
+    assert (means <= peaks + 1e-12).all() and 0 < means.max() < peaks.max()
     assert episode.push_force[-1] == env.task.readings.push_force
 
 

@@ -16,7 +16,7 @@ def test_overflow_is_told():
 
 
 @given(arrays.arrays(float, (3, 5, 4), elements=st.floats(1e-9, 5)))
-def test_sum_and_peaks(magnitude):
+def test_sums_peaks_and_means(magnitude):
     rows = np.zeros((*magnitude.shape, forces.CONTACT_SIZE))
     rows[..., 0], rows[..., 1], rows[1, 2, 3, 4] = 4, magnitude, -2e-4
     wall, depth = forces.wall_force(rows.reshape(3, 5, -1))
@@ -25,6 +25,8 @@ def test_sum_and_peaks(magnitude):
     np.testing.assert_array_equal(wall.max, magnitude[:, -1].max(-1))
     np.testing.assert_allclose(wall.peak_sum, magnitude.sum(-1).max(-1))
     np.testing.assert_array_equal(wall.peak_max, magnitude.max((-1, -2)))
+    np.testing.assert_allclose(wall.mean_sum, magnitude.sum(-1).mean(-1))
+    np.testing.assert_allclose(wall.mean_max, magnitude.max(-1).mean(-1))
     assert (wall.peak_sum >= wall.sum).all()
     assert (wall.peak_max >= wall.max).all() and (wall.sum >= wall.max - 1e-12).all()
 
@@ -35,5 +37,6 @@ def test_a_force_that_is_no_number_is_not_lost(step):
     rows.reshape(1, 5, 3, -1)[..., :2] = 3, 1.0
     rows[0, step, 1] = np.nan
     wall, _ = forces.wall_force(rows)
-    assert np.isnan(wall.peak_max) and np.isnan(wall.peak_sum)
+    lasting = wall.peak_max, wall.peak_sum, wall.mean_max, wall.mean_sum
+    assert np.isnan(lasting).all()
     assert np.isnan([wall.max, wall.sum]).all() == (step == 4)

@@ -188,7 +188,8 @@ def test_the_reward_is_the_sum_of_its_terms(anatomy):
     outcome = judge(
         task,
         heads,
-        sum=random.uniform(size=50),
+        mean_sum=random.uniform(size=50),
+        mean_max=random.uniform(size=50),
         peak_max=random.uniform(size=50),
         action=random.uniform(-1, 1, (50, 21)),
     )
@@ -201,18 +202,22 @@ def test_the_reward_is_the_sum_of_its_terms(anatomy):
 
 
 def test_terms_are_what_their_names_say(anatomy):
-    weights = {"force": -2.0, "peak_force": -3.0, "time": -0.5, "smoothness": -1.0}
+    weights = {"force": -2.0, "contact_force": -1.0, "excess_force": -1.0}
+    weights |= {"peak_force": -3.0, "time": -0.5, "smoothness": -1.0}
     task = cannulation(anatomy, reward=weights)
     outcome = judge(
         task,
         np.zeros((1, 3)),
-        sum=np.array([0.3]),
+        mean_sum=np.array([0.3]),
+        mean_max=np.array([0.2]),
+        peak_sum=np.array([0.9]),
         peak_max=np.array([0.7]),
         action=np.full((1, 21), 0.5),
         previous_action=np.full((1, 21), -0.5),
     )
     terms = {name: float(value[0]) for name, value in outcome.terms.items()}
-    expected = {"force": -0.6, "peak_force": -2.1, "time": -0.5, "smoothness": -1.0}
+    expected = {"force": -0.6, "contact_force": -0.2, "excess_force": -0.2}
+    expected |= {"peak_force": -2.1, "time": -0.5, "smoothness": -1.0}
     assert terms == pytest.approx(expected)
 
 
@@ -244,11 +249,11 @@ def test_a_success_rule_of_ones_own_sees_the_forces(anatomy):
     @dataclasses.dataclass(frozen=True)
     class Gentle(Cannulation):
         def success(self, measurement):
-            gentle = measurement.wall_force.peak_max < 0.1
+            gentle = measurement.wall_force.mean_max < 0.1
             return super().success(measurement) & gentle
 
     task = Gentle.to(anatomy, anatomy.goal("bca"))
     heads = np.stack([task.goal, task.goal, towards(task, 0.03)])
-    outcome = judge(task, heads, peak_max=np.array([0.05, 0.2, 0.05]))
+    outcome = judge(task, heads, mean_max=np.array([0.05, 0.2, 0.05]))
     assert outcome.success.tolist() == [True, False, False]
     assert outcome.reward[0] == 10.0 and (outcome.reward[1:] <= 0.0).all()

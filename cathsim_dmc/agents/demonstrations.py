@@ -40,7 +40,7 @@ class Demonstrations:
         successes: Number of those that reached the goal.
         steps: Number of control steps in all.
         mean_force: Mean over the episodes, N, see `EpisodeForces.mean_force`.
-        max_force: Largest single contact at the end of a step of any episode, N.
+        max_force: Largest one of all episodes, N, see `EpisodeForces.max_force`.
     """
 
     path: Path
@@ -115,8 +115,8 @@ def record_demonstrations(
         description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
         f"seeds from {seed}",
     )
-    means = [np.mean(buffer.infos["wall_force_sum"][1:]) for buffer in buffers]
-    largest = [np.max(buffer.infos["wall_force_max"][1:]) for buffer in buffers]
+    means = [np.mean(buffer.infos["wall_force_mean_sum"][1:]) for buffer in buffers]
+    largest = [np.max(buffer.infos["wall_force_mean_max"][1:]) for buffer in buffers]
     return Demonstrations(
         path=out,
         episodes=len(buffers),

@@ -97,13 +97,13 @@ class EvaluationResult:
         """Share of episodes that reach the goal with little force on the wall.
 
         Args:
-            limit: The sum of the magnitudes over all contacts stays at or below it in
-                every physics step, N.
+            limit: The sum of the magnitudes over all contacts, mean over a control step
+                (`EpisodeForces.largest_sum`), stays at or below it in all of them, N.
 
         Returns:
             As a fraction; an episode whose force is not known is not safe.
         """
-        safe = self.values("forces.peak_sum.maximum") <= limit
+        safe = self.values("forces.largest_sum") <= limit
         return float(np.mean((self.values("success") > 0) & safe))
 
     def summary(self) -> dict[str, Any]:
@@ -117,8 +117,14 @@ class EvaluationResult:
         result: dict[str, Any] = {"episodes": count}
         for name in ("reward", "length", "path_ratio"):
             result[name], result[f"{name}_sd"] = self.mean_sd(name)
-        result["forces"] = {quantity: {} for quantity in QUANTITIES}
-        for quantity, name in itertools.product(QUANTITIES, STATISTICS):
+        # Files of before 0.3 do not tell the means over a control step.
+        quantities = [
+            name
+            for name in QUANTITIES
+            if any(getattr(one.forces, name) is not None for one in self.episodes)
+        ]
+        result["forces"] = {quantity: {} for quantity in quantities}
+        for quantity, name in itertools.product(quantities, STATISTICS):
             mean, deviation = self.mean_sd(f"forces.{quantity}.{name}")
             result["forces"][quantity][name] = {"mean": mean, "sd": deviation}
         result["physics_errors"] = sum(e.physics_error for e in self.episodes)

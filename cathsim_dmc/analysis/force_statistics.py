@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cathsim_dmc.physics.forces import NAMES
 from cathsim_dmc.recording.episode import Episode
 
 
@@ -40,27 +41,48 @@ class EpisodeForces:
             on the physics step (`physics.forces.PEAK_NOTE`).
         peak_max: Of the largest single contact in any physics step of a control step;
             likewise.
+        mean_sum: Of the sum over all contacts, mean over a control step: what a load
+            cell that is read at 25 Hz shows.
+        mean_max: Of the largest single contact, mean over a control step.
     """
 
     sum: Statistics | None = None
     max: Statistics | None = None
     peak_sum: Statistics | None = None
     peak_max: Statistics | None = None
+    mean_sum: Statistics | None = None
+    mean_max: Statistics | None = None
+
+    # Files of before 0.3 do not tell the means over a control step: what they tell of
+    # its end stands for them in the first three.
 
     @property
     def mean_force(self) -> float | None:
-        """Sum over all contacts, mean over all control steps, N."""
-        return self.sum and self.sum.mean
+        """`mean_sum`, mean over all control steps, N."""
+        force = self.mean_sum or self.sum
+        return force and force.mean
 
     @property
     def mean_contact_force(self) -> float | None:
-        """Largest single contact, mean over the control steps with contact, N."""
-        return self.max and self.max.mean_in_contact
+        """`mean_max`, mean over the control steps with contact, N."""
+        force = self.mean_max or self.max
+        return force and force.mean_in_contact
 
     @property
     def max_force(self) -> float | None:
-        """Largest single contact at the end of any control step, N."""
-        return self.max and self.max.maximum
+        """`mean_max` of the control step where it is largest, N."""
+        force = self.mean_max or self.max
+        return force and force.maximum
+
+    @property
+    def largest_sum(self) -> float | None:
+        """`mean_sum` of the control step where it is largest, N.
+
+        *Safe success* is decided on it. `peak_sum`, which is never less, stands for it
+        in files of before 0.3.
+        """
+        force = self.mean_sum or self.peak_sum
+        return force and force.maximum
 
     @property
     def peak_force(self) -> float | None:
@@ -71,7 +93,7 @@ class EpisodeForces:
 STATISTICS = tuple(field.name for field in dataclasses.fields(Statistics))
 QUANTITIES = tuple(field.name for field in dataclasses.fields(EpisodeForces))
 # Properties of `EpisodeForces`.
-FIGURES = ("mean_force", "mean_contact_force", "max_force", "peak_force")
+FIGURES = ("mean_force", "mean_contact_force", "max_force", "largest_sum", "peak_force")
 
 
 class ForceTracker:
@@ -106,8 +128,8 @@ def recorded_forces(episode: Episode) -> EpisodeForces:
     """Statistics of a recorded episode; empty without a single step."""
     if not episode.steps:
         return EpisodeForces()
-    peaks = (episode.meta.get(f"wall_force_peak_{name}") for name in ("sum", "max"))
-    columns = episode.wall_force_sum, episode.wall_force_max, *peaks
+    columns = episode.wall_force_sum, episode.wall_force_max
+    columns += (*map(episode.meta.get, NAMES[2:]),)
     found = (None if one is None else _statistics(one) for one in columns)
     return EpisodeForces(*found)
 

@@ -55,12 +55,13 @@ _TASK = (
 PolicysTask = Annotated[str | None, conf.arg(help=_TASK)]
 Options = Annotated[TaskOptions, conf.arg(name="", constructor=task_kind())]
 _CAPTION = (
-    "Mean ± standard deviation over episodes. Mean force: sum over all contacts at the "
-    "end of a control step, mean over all steps. Mean contact force: largest single "
-    "contact at the end of a control step, mean over the steps with contact. Max "
-    "force: largest single contact at the end of any control step. Peak force: the "
-    "same in any physics step. Safe success: the goal reached while the sum over all "
-    f"contacts stays at or below a limit in every physics step. {PEAK_NOTE}"
+    "Mean ± standard deviation over episodes. Forces are means over a control step, as "
+    "a load cell at 25 Hz reads them, but for the peak. Mean force: sum over all "
+    "contacts, mean over all steps. Mean contact force: largest single contact, mean "
+    "over the steps with contact. Max force: largest single contact of any step. "
+    "Largest sum: sum over all contacts of any step. Safe success: the goal reached "
+    "with a largest sum at or below a limit. Peak force: largest single contact in any "
+    f"physics step. {PEAK_NOTE}"
 )
 _NEARLY_ONE = (
     " Success without interval: episodes differ only by 1 mm of the start, or recur; "
@@ -196,7 +197,7 @@ def print_episodes(result: EvaluationResult) -> None:
     table = Table(*rows[0], title=title)
     for row in rows:
         table.add_row(*row.values())
-    table.caption = f"Peak force and largest sum: of any physics step. {PEAK_NOTE}"
+    table.caption = f"Peak force: of any physics step. {PEAK_NOTE}"
     # A pipe has no width that the columns would have to fit.
     Console(width=None if sys.stdout.isatty() else 160).print(table)
 
@@ -206,6 +207,7 @@ def _outcome(
 ) -> dict[str, str]:
     end = "goal reached" if episode.success else "out of time"
     forces = episode.forces
+    largest = forces.largest_sum
     return {
         "seed": str(seed),
         "arch": str(conditions.get("arch", "–")),
@@ -215,7 +217,7 @@ def _outcome(
         "path ratio": f"{episode.path_ratio:.2f}",
         "mean force, mN": millinewtons(forces.mean_force),
         "peak force, mN": millinewtons(forces.peak_force),
-        "largest sum, N": f"{forces.peak_sum.maximum:.2f}" if forces.peak_sum else "–",
+        "largest sum, N": "–" if largest is None else f"{largest:.2f}",
     }
 
 

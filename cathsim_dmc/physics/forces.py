@@ -67,7 +67,11 @@ class Contacts:
 
 
 class WallForce(NamedTuple):
-    """Force on the wall over one control step, N.
+    """Force on the wall over one control step, N, by its magnitudes: never negative.
+
+    The means are what a load cell that is read at 25 Hz shows. They are judged and
+    learnt from (reward terms, `safe success`, the observation `force`, the expert), as
+    they hardly depend on the physics step.
 
     Attributes:
         sum: (...), sum of the magnitudes of all contacts, last substep.
@@ -76,12 +80,17 @@ class WallForce(NamedTuple):
         peak_sum: (...), largest sum of any substep of the control step; it depends
             on the physics step, see `PEAK_NOTE`.
         peak_max: (...), largest single contact of any substep; likewise.
+        mean_sum: (...), mean over the substeps of the sum over all contacts; where
+            nothing has moved yet, `sum`.
+        mean_max: (...), mean over the substeps of the largest single contact.
     """
 
     sum: np.ndarray
     max: np.ndarray
     peak_sum: np.ndarray
     peak_max: np.ndarray
+    mean_sum: np.ndarray
+    mean_max: np.ndarray
 
     def named(self) -> dict[str, np.ndarray]:
         """The forces as logs and records name them, see `NAMES`."""

@@ -17,11 +17,11 @@ def summed(rows, size):
         size: numbers of a contact.
 
     Returns:
-        (5, N).
+        (7, N).
     """
-    found = np.zeros((5, len(rows)))
+    found, steps = np.zeros((7, len(rows))), rows.shape[1]
     for i in range(len(rows)):
-        for step in range(rows.shape[1]):
+        for step in range(steps):
             total, largest = 0.0, 0.0
             for place in range(0, rows.shape[2], size):
                 contact = rows[i, step, place : place + size]
@@ -31,10 +31,12 @@ def summed(rows, size):
                 force = math.sqrt(fused(z, z, fused(y, y, x * x)))
                 total += force
                 largest = higher(force, largest)
-                found[4, i] = max(found[4, i], -contact[4])
+                found[6, i] = max(found[6, i], -contact[4])
             found[0, i], found[1, i] = total, largest
             found[2, i] = higher(total, found[2, i])
             found[3, i] = higher(largest, found[3, i])
+            found[4, i] += total / steps
+            found[5, i] += largest / steps
     return found
 
 

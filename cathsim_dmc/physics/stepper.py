@@ -121,7 +121,7 @@ class Stepper(abc.ABC):
         warned, (force, depth) = self._warned(), self._forces()
         limit = forces.DEEPEST if self.deepest is None else self.deepest
         depth = self._depth_at_end(depth, warned, limit)
-        peaks = None
+        again: list[tuple[np.ndarray, forces.WallForce]] = []
         # A wall that gives is soft enough for half the step, as a rule.
         for parts in (forces.REFINEMENT,) if self.deepest is None else (2, 8):
             coarse = ((force.peak_max > forces.HARDEST) | (depth > limit)) & ~warned
@@ -129,13 +129,11 @@ class Stepper(abc.ABC):
                 break
             indices = np.flatnonzero(coarse)
             finer, _ = forces.wall_force(self._refine(indices, parts))
-            if peaks is None:
-                peaks = np.zeros((2, self.num_simulations))
-            peaks[:, indices] = finer.peak_sum, finer.peak_max
+            again.append((indices, finer))
             warned, (force, depth) = self._warned(), self._forces()
-        if peaks is not None:
-            peak_sum, peak_max = np.maximum(peaks, [force.peak_sum, force.peak_max])
-            force = force._replace(peak_sum=peak_sum, peak_max=peak_max)
+        for indices, finer in again:  # all shorter steps count, not only those kept
+            for whole, each in zip(force, finer, strict=True):
+                whole[indices] = each
         return force, warned
 
     def _forces(self) -> tuple[forces.WallForce, np.ndarray]:
@@ -150,7 +148,10 @@ class Stepper(abc.ABC):
     def still(self, indices: np.ndarray) -> forces.WallForce:
         """Force on the wall where some simulations have not moved yet."""
         self._keep_still(indices)
-        return self._forces()[0]
+        force, _ = self._forces()
+        force.mean_sum[indices] = force.sum[indices]
+        force.mean_max[indices] = force.max[indices]
+        return force
 
     def restore(self, indices: np.ndarray) -> None:
         """Restores options that an interrupted reset or control step leaves changed."""

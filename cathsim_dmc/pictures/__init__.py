@@ -72,7 +72,7 @@ def plot(episode: Episode) -> "Picture":
 
     Returns:
         The figure; a notebook draws it, `.savefig(path)` writes it. Forces are in mN:
-        sum and largest contact at the end of each control step, the peak of the sum
+        sum and largest contact, means over each control step, the peak of the sum
         within it, and the push force at the base. Shades are the phases of the base:
         it advances, rests or withdraws. A bar marks contact with the wall.
 

@@ -132,16 +132,16 @@ def _frames(
 
 
 def _draw_force(axes: Any, episode: Episode) -> Any:
-    """Draws the largest contact of any physics step over time; returns the cursor."""
-    peak = episode.meta.get("wall_force_peak_max") or episode.wall_force_max
+    """Draws the largest contact over time; returns the cursor."""
+    force = episode.meta.get("wall_force_mean_max") or episode.wall_force_max
     time = episode.time[1:] - episode.time[0]
-    force = 1e3 * np.asarray(peak, dtype=np.float64)
+    force = 1e3 * np.asarray(force, dtype=np.float64)
     axes.fill_between(time, force, color=_FORCE_COLOUR, alpha=0.18, lw=0)
     axes.plot(time, force, color=_FORCE_COLOUR, lw=1.1)
     axes.set_xlim(0, time.max(initial=1e-3))
     axes.set_ylim(0, max(1.15 * force.max(initial=0.0), 1.0))
     axes.set_xlabel("s", fontsize=8, labelpad=0)
-    axes.set_ylabel("peak force, mN", fontsize=8)
+    axes.set_ylabel("largest contact, mN", fontsize=8)
     axes.tick_params(labelsize=7)
     axes.spines[["top", "right"]].set_visible(False)
     return axes.axvline(0.0, color="0.2", lw=1.0)

@@ -75,9 +75,11 @@ def plot(episode: Episode) -> Picture:
 
 def _draw_forces(axes: Any, episode: Episode, time: np.ndarray) -> None:
     peak = episode.meta.get("wall_force_peak_sum")
+    total = episode.meta.get("wall_force_mean_sum") or episode.wall_force_sum
+    largest = episode.meta.get("wall_force_mean_max") or episode.wall_force_max
     curves = {
-        "wall, sum": (episode.wall_force_sum, COLOURS[1], "-", 1.4),
-        "wall, largest contact": (episode.wall_force_max, COLOURS[4], "-", 1.2),
+        "wall, sum": (np.asarray(total), COLOURS[1], "-", 1.4),
+        "wall, largest contact": (np.asarray(largest), COLOURS[4], "-", 1.2),
         "push force": (episode.push_force, COLOURS[0], "--", 1.0),
     }
     if peak:

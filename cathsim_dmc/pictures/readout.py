@@ -17,8 +17,9 @@ LEAST_FORCE = 5e-6
 class ForceReadout:
     """Contacts and forces at the end of a control step; newtons, world frame (LPS).
 
-    Contacts, `wall_sum` and `wall_max` are those of the last physics step; the peaks
-    are the largest of any physics step of the control step, and depend on its length.
+    Contacts, `wall_sum` and `wall_max` are those of the last physics step, the means
+    those of all physics steps of the control step; the peaks are the largest of any of
+    them, and depend on their length.
 
     Attributes:
         position: (K, 3) places of contact with the wall, m, where the force reaches
@@ -30,6 +31,8 @@ class ForceReadout:
         wall_max: Largest magnitude.
         wall_peak_sum: Largest sum within the control step.
         wall_peak_max: Largest magnitude within the control step.
+        wall_mean_sum: Sum, mean over the control step.
+        wall_mean_max: Largest magnitude, mean over the control step.
         push_force: Force at the base, positive when it pushes the device forward.
         push_torque: Torque of the base on the device about its axis, N·m.
         load_cell: (3,) force of the phantom on its support.
@@ -43,6 +46,8 @@ class ForceReadout:
     wall_max: float
     wall_peak_sum: float
     wall_peak_max: float
+    wall_mean_sum: float
+    wall_mean_max: float
     push_force: float
     push_torque: float
     load_cell: np.ndarray
@@ -53,12 +58,14 @@ class ForceReadout:
 
     def __repr__(self) -> str:
         """A table of the contacts and a line of the other forces."""
-        shown = self.wall_sum, self.wall_max, self.wall_peak_max, self.push_force
-        total, largest, peak, push = (f"{1e3 * force:.2f} mN" for force in shown)
+        shown = self.wall_sum, self.wall_max, self.wall_mean_sum, self.wall_mean_max
+        shown += self.wall_peak_max, self.push_force
+        total, largest, *means, peak, push = (f"{1e3 * one:.2f} mN" for one in shown)
         cell = ", ".join(f"{1e3 * force:.1f}" for force in self.load_cell)
         lines = [
             f"{len(self)} contact{'s' * (len(self) != 1)} with the wall: sum {total}, "
-            f"largest {largest}, peak within the step {peak}*",
+            f"largest {largest}",
+            f"mean over the step: sum {means[0]}, largest {means[1]}; peak {peak}*",
             f"push {push}, load cell ({cell}) mN",
         ]
         if len(self):

@@ -140,8 +140,8 @@ def lines_of(task: Any) -> list[tuple[str, str]]:
             lines.append(("turned", f"{np.degrees(devices.rotation[k]):5.0f}°"))
     forces = {
         "push force": state.push_force,
-        "wall force, sum": wall.sum,
-        "largest contact": wall.max,
+        "wall force, sum": wall.mean_sum,
+        "largest contact": wall.mean_max,
         f"peak of {1e3 * task.config.physics_timestep:g} ms steps": wall.peak_max,
     }
     # Plus zero: no minus before it.

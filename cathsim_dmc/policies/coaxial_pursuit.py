@@ -126,7 +126,7 @@ class CoaxialPlan(Route):
         Args:
             state: after the last step, arrays (N,).
             readings: of the chain, arrays (N, ...).
-            wall_force: arrays (N,); its `max` slows the devices down.
+            wall_force: arrays (N,); its `mean_max` slows the devices down.
 
         Returns:
             Action (N, 2 K) in [-1, 1] and the new state.
@@ -143,7 +143,7 @@ class CoaxialPlan(Route):
         leader = devices.insertion.argmax(axis=1)[:, None]
         looks = np.where(turns, np.cos(error), 1.0)
         cosine = np.take_along_axis(looks, leader, axis=1)[:, 0]
-        speed = attempts.translation(settings, state, wall_force.max, cosine)
+        speed = attempts.translation(settings, state, wall_force.mean_max, cosine)
         deep = np.maximum(place.arc_length - self.ostium, 0.0)
         action[:, 0::2] = _led(settings, state, devices.insertion, speed, deep)
         return np.clip(action, -1.0, 1.0), state

@@ -117,7 +117,7 @@ class Plan(Route):
         Args:
             state: after the last step, arrays (...).
             readings: of the devices, arrays (...).
-            wall_force: arrays (...); its `max` slows the device down.
+            wall_force: arrays (...); its `mean_max` slows the device down.
             devices: of coaxial devices; not looked at.
 
         Returns:
@@ -131,7 +131,7 @@ class Plan(Route):
         bend = bend + _correction(settings, axes, turn)
         bend = np.clip(bend, -self.steering_angle, self.steering_angle)
         state = attempts.advance(settings, state, place, readings.insertion)
-        speed = attempts.translation(settings, state, wall_force.max, cosine)
+        speed = attempts.translation(settings, state, wall_force.mean_max, cosine)
         action = np.zeros((*speed.shape, self.num_actions))
         motors = self.tip.size
         action[..., :motors] = (bend / self.steering_angle).reshape(*speed.shape, -1)

@@ -60,8 +60,9 @@ class Episode:
         action: (T, A) as given to the environment.
         reward: (T,).
         insertion: (T+1,) position of the insertion joint.
-        wall_force_sum: (T,) sum of contact force magnitudes over the wall.
-        wall_force_max: (T,) largest single contact force magnitude.
+        wall_force_sum: (T,) sum of contact force magnitudes over the wall at the end
+            of the control step; ``meta`` has means and peaks within it.
+        wall_force_max: (T,) largest single contact force magnitude, likewise.
         push_force: (T,) force at the base of the device, signed as the task says.
         contact_step: (K,) int64, index of the step, non-decreasing.
         contact_position: (K, 3).

@@ -13,6 +13,7 @@ import numpy as np
 from dm_control.rl import control
 
 from cathsim_dmc import __version__, bounds
+from cathsim_dmc.physics.forces import NAMES
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.records import (
     DEVICE_SERIES,
@@ -184,7 +185,6 @@ class EpisodeRecorder:
     def _meta(self, rows: _Rows, end: dict[str, Any]) -> dict[str, Any]:
         model, task = self._env.physics.model, self._task
         termination = end["termination"] or "truncated"
-        peaks = ("wall_force_peak_sum", "wall_force_peak_max")
         meta = {
             "success": termination == "success",
             **end,
@@ -200,7 +200,7 @@ class EpisodeRecorder:
             "body_names": [model.id2name(i, "body") for i in range(model.nbody)],
             "catheter_radius": [float(task.scene.catheter.device.outer_radius)]
             * len(task.scene.catheter.links),
-            **{name: rows[name] for name in peaks},
+            **{name: rows[name] for name in NAMES[2:]},
             "reward_terms": {
                 name.removeprefix(_TERM): values
                 for name, values in rows.items()

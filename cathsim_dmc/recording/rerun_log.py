@@ -187,6 +187,10 @@ def _log_series(log: Log) -> None:
         ("insertion_mm", mm * episode.insertion, "insertion, mm", [150, 90, 200]),
     ):
         log.series(entity, values, label, colour)
+    for name, label in ("sum", "sum"), ("max", "largest contact"):
+        if (means := meta.get(f"wall_force_mean_{name}")) is not None:
+            label = f"wall, {label}, mean over the step"
+            log.series(f"force/wall_mean_{name}", mn * np.array(means), label)
     if "distance" in meta:
         away = mm * np.array(meta["distance"])
         log.series("distance_mm", away, "distance to goal, mm", [60, 190, 90])

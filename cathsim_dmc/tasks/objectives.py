@@ -218,13 +218,16 @@ class Cannulation(Shiftable, Routed):
             "distance": lambda self, m: m.distance,
             # Shortest way from head to goal inside the lumen, m.
             "path": lambda self, m: self.lumen_distance(m.readings.head),
-            # Sum of all contacts on the wall at the end of the control step, N.
-            "force": lambda self, m: m.wall_force.sum,
-            # Largest single contact in any physics step of the control step, N.
+            # Sum of all contacts on the wall, mean over the control step, N.
+            "force": lambda self, m: m.wall_force.mean_sum,
+            # Largest single contact, mean over the control step, N.
+            "contact_force": lambda self, m: m.wall_force.mean_max,
+            # Largest single contact in any physics step of the control step, N; it
+            # depends on the physics step, see `forces.PEAK_NOTE`.
             "peak_force": lambda self, m: m.wall_force.peak_max,
-            # By how much the peak of that sum in the control step exceeds `GENTLE`, N.
+            # By how much "force" exceeds `GENTLE`, N.
             "excess_force": lambda self, m: np.maximum(
-                m.wall_force.peak_sum - GENTLE, 0.0
+                m.wall_force.mean_sum - GENTLE, 0.0
             ),
             # 1 for each control step.
             "time": lambda self, m: np.ones_like(m.readings.insertion),

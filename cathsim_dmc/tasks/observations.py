@@ -267,10 +267,9 @@ def goal(frame: Frame) -> Observation:
 @OBSERVATIONS.row(
     Entry(
         "wall_force",
-        4,
+        2,
         "N",
-        "on the wall: sum and largest contact at the end of the step, and their "
-        "peaks within it, which depend on the physics step",
+        "on the wall: sum and largest contact, means over the control step",
         0,
     ),
     Entry(
@@ -285,9 +284,7 @@ def force(frame: Frame) -> Observation:
     """Forces on wall, base and support."""
     wall, state = frame.wall_force, frame.readings
     return {
-        "wall_force": np.stack(
-            [wall.sum, wall.max, wall.peak_sum, wall.peak_max], axis=-1
-        ),
+        "wall_force": np.stack([wall.mean_sum, wall.mean_max], axis=-1),
         "push_force": np.stack([state.push_force, state.push_torque], axis=-1),
         "load_cell": state.load_cell,
     }

@@ -61,7 +61,7 @@ class Step(NamedTuple):
         """Figures beside the observation, arrays (N,): for logs and wrappers.
 
         "distance" and "insertion" in m; "push_force" in N; "wall_force_sum",
-        "wall_force_max" and their peaks within the control step in N (see
+        "wall_force_max" and their means and peaks within the control step in N (see
         `forces.WallForce`); "path_ratio"; of a vessel that lives "heart_phase",
         "breath_phase", "blood_speed" (at the head, m/s), "indentation" (m) and
         "wall_work" (J); "reward_<term>" for each weighted term; and "success" and

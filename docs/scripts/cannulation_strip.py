@@ -43,7 +43,7 @@ def run() -> tuple[object, list[dict]]:
                 "time": env.physics.time(),
                 "line": task.readings.centreline,
                 "insertion": float(task.readings.insertion),
-                "force": float(task.wall_force.peak_max),
+                "force": float(task.wall_force.mean_max),
             }
         )
         if timestep.last():

@@ -29,7 +29,7 @@ def episode(case, seed, actions=None):
     while not step.last() and len(done) < (300 if actions is None else len(actions)):
         done.append(act(step) if actions is None else actions[len(done)])
         step = env.step(done[-1])
-        forces.append(float(env.task.wall_force.sum))
+        forces.append(float(env.task.wall_force.mean_sum))
     return done, env.task.readings.head, np.mean(forces), step.discount == 0.0
 
 

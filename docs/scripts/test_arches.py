@@ -87,8 +87,13 @@ def table(rows):
                 continue
             good = sum(r["end"] == difficulty.SUCCESS for r in own)
             low, high = success_interval(good, len(own))
-            mean = np.mean([r["forces"]["sum"]["mean"] for r in own])
-            peaks = [r["forces"]["peak_max"]["maximum"] for r in own]
+            mean = np.mean(
+                [r["forces"].get("mean_sum", r["forces"]["sum"])["mean"] for r in own]
+            )
+            peaks = [
+                r["forces"].get("mean_max", r["forces"]["peak_max"])["maximum"]
+                for r in own
+            ]
             lines.append(
                 f"| `{task}` | {kind} | {100 * good / len(own):.0f} "
                 f"({100 * low:.0f}–{100 * high:.0f}), {len(own)} "

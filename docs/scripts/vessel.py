@@ -132,7 +132,7 @@ def judged(policy: str, task: str, case: str, episodes: int) -> dict:
         "episodes": episodes,
         "successes": result.successes,
         "safe": round((result.safe_success(SAFE) or 0.0) * episodes),
-        "force": result.mean_sd("forces.peak_sum.maximum")[0],
+        "force": result.mean_sd("forces.largest_sum")[0],
         "steps": result.mean_sd("length")[0],
         "commit": figures.origin("")["commit"],
     }

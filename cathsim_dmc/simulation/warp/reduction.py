@@ -18,8 +18,8 @@ class Totals(NamedTuple):
     """Of the physics steps of a control step, float64.
 
     Attributes:
-        force: (5, N) the forces of `physics.forces.WallForce`, N, and the depth of the
-            deepest contact, m.
+        force: (7, N) the forces of `physics.forces.WallForce`, N, of the means the sums
+            over the physics steps, and the depth of the deepest contact, m.
         diverged: (N,) whether the state is no longer finite.
         beside: (N, B) sensors beside those of contacts.
     """
@@ -32,7 +32,7 @@ class Totals(NamedTuple):
 @compiled
 def clear(world, scratch, totals):
     """Begins a control step of a world."""
-    for k in range(5):
+    for k in range(7):
         totals.force[k, world] = 0.0
     totals.diverged[world] = 0
 
@@ -67,7 +67,7 @@ def add(world, scratch, given):
     """
     sensors, first, last = given.sensors, given.first, given.last
     qpos, qvel, totals = given.qpos, given.qvel, given.totals
-    total, largest, deepest = 0.0, 0.0, totals.force[4, world]
+    total, largest, deepest = 0.0, 0.0, totals.force[6, world]
     for at in range(first, last, CONTACT_SIZE):
         if sensors[world, at] == 0.0:
             break
@@ -79,7 +79,9 @@ def add(world, scratch, given):
     totals.force[0, world], totals.force[1, world] = total, largest
     totals.force[2, world] = max(totals.force[2, world], total)
     totals.force[3, world] = max(totals.force[3, world], largest)
-    totals.force[4, world] = deepest
+    totals.force[4, world] += total
+    totals.force[5, world] += largest
+    totals.force[6, world] = deepest
     for k in range(totals.beside.shape[1]):
         at = k if k < first else k - first + last
         totals.beside[world, k] = sensors[world, at]
@@ -107,7 +109,7 @@ class Reduction:
         self._count, size = data.sensordata.shape
         beside = size - (contacts.stop - contacts.start)
         self._totals = Totals(
-            device.constant(np.zeros((5, self._count))),
+            device.constant(np.zeros((7, self._count))),
             device.constant(np.zeros(self._count, np.int32)),
             device.constant(np.zeros((self._count, beside))),
         )

@@ -61,7 +61,7 @@ class WarpStepper(Stepper):
         self.lost = np.zeros(num_simulations, np.int64)
         self._names = tuple(dict.fromkeys((*_STATE, *task.data_fields)))
         self.arrays = types.SimpleNamespace(**self._empty(model, num_simulations))
-        self._force = np.zeros((5, num_simulations))
+        self._force = np.zeros((7, num_simulations))
         self._own: dict[str, np.ndarray] = {}
         fields = [name for effect in task.effects for name in effect.model_fields]
         self._expand(dict.fromkeys(fields))
@@ -178,6 +178,7 @@ class WarpStepper(Stepper):
         worlds.step()
         totals = worlds.read(self.arrays, self._names)
         self._force[:] = totals.force
+        self._force[4:6] /= self.substeps
         self.arrays.time += self.substeps * self._timestep
         self._stale = False
         self._note(totals.diverged != 0, worlds.overflowed())
@@ -193,7 +194,7 @@ class WarpStepper(Stepper):
             self._stale = True
 
     def _forces(self) -> tuple[forces.WallForce, np.ndarray]:
-        return forces.WallForce._make(self._force[:4].copy()), self._force[4].copy()
+        return forces.WallForce._make(self._force[:6].copy()), self._force[6].copy()
 
     @property
     def contact_rows(self) -> np.ndarray:
