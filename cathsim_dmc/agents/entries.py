@@ -183,7 +183,8 @@ def _episode(index: int, row: Mapping[str, Any]) -> EpisodeOutcome:
     forces = {
         quantity: Statistics(**{name: force(quantity, name) for name in STATISTICS})  # type: ignore[arg-type]
         for quantity in QUANTITIES
-        if quantity in row["forces"] or not quantity.startswith("mean")
+        # Files of before 0.3 do not tell the means.
+        if row["forces"].get(quantity) or not quantity.startswith("mean")
     }
     switches = "terminated", "success", "physics_error"
     found = {name: bounds.switch(name, row[name]) for name in switches}

@@ -33,8 +33,9 @@ class AttemptSettings:
         creep: slowest, as a part of `speed`, when misaligned or pressing.
         aligned, misaligned: cosines of the error of direction between which the speed
             falls from full to creeping.
-        soft_force, hard_force: largest contact, mean over a control step, N, between which
-            it falls likewise; the published forces lie below 0.2 N, with outliers above 0.4 N.
+        soft_force, hard_force: largest contact, N, between which it falls likewise; the
+            mean over a control step. The published forces lie below 0.2 N, with
+            outliers above 0.4 N.
         progress: m; what the head must gain to count as moving.
         patience: control steps without progress until a retry.
         lost_patience: control steps outside the route's tube until a retry.
