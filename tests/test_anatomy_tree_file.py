@@ -102,6 +102,18 @@ def test_smoothing_takes_away_scatter_of_the_measurement():
     assert smooth < 0.8 * rough
 
 
+def test_a_tree_in_ras_is_the_one_in_lps():
+    there = content()
+    for entry in (*there["vessels"].values(), there["goals"]["free"]):
+        for name in {"points_mm", "position_mm"} & set(entry):
+            entry[name] = (np.array(entry[name]) * [-1, -1, 1]).tolist()
+    ras, lps = parse_tree(there | {"frame": "RAS"}), parse_tree(content())
+    for name, curve in lps.curves.items():
+        np.testing.assert_array_equal(ras.curves[name].points, curve.points)
+    places = [tree.goals["free"].position for tree in (ras, lps)]
+    np.testing.assert_array_equal(*places)
+
+
 def test_cut_inlet_drops_what_lies_behind_it():
     whole, cut = (parse_tree(content()).build(access) for access in ("low", "cut"))
     lengths = [a.tree.root.centreline.length for a in (whole, cut)]
@@ -142,7 +154,7 @@ def change(path, value):
     [
         (change(["units"], "m"), "units is 'm'"),
         (change(["version"], 2), "version is 2"),
-        (change(["frame"], "RAS"), "LPS"),
+        (change(["frame"], "LAS"), "one of LPS, RAS"),
         (change(["colour"], "red"), "some of format, version"),
         (change(["vessels"], {}), "first of vessels"),
         (change(["vessels", "trunk"], {"parent": None}), "lacks points_mm, radii_mm"),

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_play_coaxial import Screen, held
 
+from cathsim_dmc.physics.forces import WallForce
 from cathsim_dmc.play import play, window
 from cathsim_dmc.play.controls import BEND_RATE, HELD, ONCE, Controls
 from cathsim_dmc.recording.episode import Episode
@@ -72,6 +73,26 @@ def test_a_person_steers_in_the_fluoroscopy_window(monkeypatch, tmp_path):
     np.testing.assert_array_equal(first.action[:, 0:20:2], 0.0)
     assert first.termination == "truncated"
     assert not second.action[:, :20].any() and second.action[:, 20].min() == -1.0
+
+
+@pytest.mark.parametrize(
+    ("force", "share", "colour"),
+    [(0.0, 0, "green"), (0.3, 0.2, "orange"), (1.0, 2 / 3, "red"), (9.0, 1, "red")],
+)
+def test_a_bar_shows_the_largest_contact(
+    force, share, colour, monkeypatch, shared_environment
+):
+    screen = Screen([])
+    monkeypatch.setitem(sys.modules, "tkinter", screen)
+    env = shared_environment("simple1_bca")
+    env.reset()
+    shown = window.FluoroscopyWindow(env.task, Controls(10))
+    monkeypatch.setattr(
+        type(env.task), "wall_force", property(lambda _: WallForce(*4 * [force]))
+    )
+    shown.show(env.task)
+    length, drawn = screen.bars[-1]
+    assert length == pytest.approx(share * (window._PANEL - 28)) and drawn == colour
 
 
 def test_without_a_display_the_message_says_so(monkeypatch):

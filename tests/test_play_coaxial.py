@@ -53,6 +53,7 @@ class Screen(types.ModuleType):
       pictures: shown so far.
       texts: drawn since the panel was last cleared.
       said: texts of labels.
+      bars: length and colour of the bar of force in each picture.
     """
 
     TclError = RuntimeError
@@ -61,7 +62,7 @@ class Screen(types.ModuleType):
         super().__init__("tkinter")
         self.keys = sorted(keys)
         self.pictures = 0
-        self.texts, self.said = [], []
+        self.texts, self.said, self.bars = [], [], []
         self.bound = {}
         self.Tk = lambda **_: Widget(self)
         self.Canvas = self._canvas
@@ -109,6 +110,9 @@ class Panel(Widget):
 
     def create_text(self, *_, text, **__):
         self.screen.texts.append(text)
+
+    def create_rectangle(self, left, _, right, *__, fill, **___):
+        self.screen.bars.append((right - left, fill))
 
 
 def held(key, first, last):

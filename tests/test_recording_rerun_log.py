@@ -14,6 +14,7 @@ from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.pictures.moment import Moment
 from cathsim_dmc.pictures.recorded import xray_film
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.geometry import force_text
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.recording.records import VesselRecord
 from cathsim_dmc.recording.rerun_log import write_rrd
@@ -37,6 +38,7 @@ def make_recorded():
     episode = make_episode(STEPS, counts=np.array([2, 0, 1, 3, 0, 0]))
     away = np.linalg.norm(episode.head - GOAL, axis=1)
     meta = {"goal_position": GOAL, "goal_radius": 0.008, "distance": away}
+    meta["versions"] = {"a|b": "1.0"}
     place, turn = episode.body_pos.copy(), episode.body_quat.copy()
     place[:, 1], turn[:, 1] = place[0, 1], turn[0, 1]
     values = {"meta": episode.meta | meta, "body_pos": place, "body_quat": turn}
@@ -94,6 +96,8 @@ def test_the_file_holds_one_recording_and_its_layout(written):
     assert recording.recordings[0].application_id == "cathsim"
     assert recording.views["/world"] == "3D"
     assert recording.views["/fluoroscopy"] == "2D"
+    assert recording.views["/events"] == "TextLog"
+    assert recording.views["/info"] == "TextDocument"
     plots = {o for o, kind in recording.views.items() if kind == "TimeSeries"}
     named = ("reward", "distance_mm", "force", "insertion_mm", "action")
     assert plots == {f"/series/{name}" for name in named}
@@ -112,11 +116,12 @@ def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
     of_states = "world/catheter world/catheter/head world/robot/wheel fluoroscopy "
     of_states += "series/distance_mm series/insertion_mm"
     of_steps = "world/catheter/trail world/contacts world/heat series/reward "
-    of_steps += "series/force/wall_sum series/force/wall_max series/force/push"
+    of_steps += "series/force/wall_sum series/force/wall_max series/force/push "
+    of_steps += "world/contacts/largest"
     expected = {"/series/action": states[:-1]}
     expected |= {f"/{entity}": states for entity in of_states.split()}
     expected |= {f"/{entity}": steps for entity in of_steps.split()}
-    assert set(recording.temporal) == set(expected)
+    assert set(recording.temporal) == {*expected, "/events"}
     for entity, rows in expected.items():
         assert recording.values(entity, "step") == rows, entity
         wanted = [round(episode.time[row] * 1e9) for row in rows]
@@ -161,6 +166,39 @@ def test_series_hold_the_values_of_the_episode(written):
     np.testing.assert_array_equal(scalars("force/push")[:, 0], 1e3 * episode.push_force)
     away = 1e3 * np.array(episode.meta["distance"])
     np.testing.assert_allclose(scalars("distance_mm")[:, 0], away)
+
+
+def test_text_says_what_happens_when(written):
+    episode, _, _, recording = written
+    texts = [text[0] for text in recording.values("/events", "TextLog:text")]
+    rows = dict(zip(texts, recording.values("/events", "step"), strict=True))
+    assert rows["start of type1_bca"] == 0 and rows["end: success"] == STEPS
+    row = int(episode.wall_force_max.argmax())
+    assert rows[f"largest force, {force_text(episode.wall_force_max[row])}"] == row + 1
+    nearest = 1e3 * np.min(episode.meta["distance"])
+    row = int(np.argmin(episode.meta["distance"]))
+    assert rows[f"nearest to the goal, {nearest:.1f} mm"] == row
+    assert len([text for text in texts if text.startswith("contact")]) == 1
+    page = recording.fixed("/info", "TextDocument:text")[0].splitlines()
+    assert "| outcome | success |" in page and page[0] == "# type1_bca"
+    assert r'| versions | {"a\|b": "1.0"} |' in page
+    assert not any(line.startswith("| distance |") for line in page)
+
+
+def test_the_largest_force_of_a_step_is_written_at_the_end_of_its_arrow(written):
+    episode, _, _, recording = written
+    entity = "/world/contacts/largest"
+    places = recording.values(entity, "Points3D:positions")
+    labels = recording.values(entity, "Points3D:labels")
+    for step in range(STEPS):
+        rows = np.flatnonzero(episode.contact_step == step)
+        force = np.linalg.norm(episode.contact_force[rows], axis=1)
+        assert labels[step] == [force_text(f) for f in force if f == force.max()]
+        if len(rows):
+            top = rows[force.argmax()]
+            end = episode.contact_position[top]
+            end = end + arrow_scale(episode) * episode.contact_force[top]
+            np.testing.assert_allclose(places[step], [end], atol=1e-6)
 
 
 def test_links_take_the_colour_of_what_they_press(written):

@@ -17,7 +17,7 @@ from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Inlet
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.posture import bends_of, nodes_of
-from cathsim_dmc.physics.effects import Episode
+from cathsim_dmc.physics.effects import Draw
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
@@ -94,7 +94,7 @@ def posture(environment):
 
     def nodes(displacement, roll=None):
         data.qpos[:] = model.qpos0
-        episode = Episode(np.asarray(displacement), roll=roll)
+        episode = Draw(np.asarray(displacement), roll=roll)
         rollout.case().start.write(data.qpos, episode, environment.task.random)
         mujoco.mj_kinematics(model, data)
         return rollout.index.read(data).centreline
@@ -302,7 +302,7 @@ def test_an_ill_conditioned_displacement_is_not_written(shared_environment):
     def written(steps, displacement=(8e-4, 0.0, 0.0)):
         with mock.patch.object(posture, "_steps", steps):
             qpos = data.qpos.copy()
-            start.write(qpos, Episode(np.array(displacement)), np.random.RandomState(0))
+            start.write(qpos, Draw(np.array(displacement)), np.random.RandomState(0))
         return qpos
 
     rest, steps = written(posture._steps, (0.0, 0.0, 0.0)), posture._steps

@@ -15,7 +15,7 @@ from cathsim_dmc.entities.devices import get
 from cathsim_dmc.physics.randomisation import (
     DEFAULT_RANGES,
     ActionDelay,
-    Episode,
+    Draw,
     Randomisation,
     start_displacement,
 )
@@ -64,7 +64,7 @@ def test_nothing_is_drawn_but_the_displacement_by_default():
     episode = Randomisation().draw(drawn)
     displacement = start_displacement(plain)
     np.testing.assert_array_equal(episode.displacement, displacement)
-    assert episode == Episode(episode.displacement)
+    assert episode == Draw(episode.displacement)
     assert drawn.randint(2**31) == plain.randint(2**31)
 
 
@@ -225,7 +225,7 @@ def test_actions_arrive_as_late_as_drawn(delays, actions):
     way.bind(types.SimpleNamespace(chain=chain, num_simulations=count))
 
     def restart(index, delay):
-        way.restart(index, Episode(np.zeros(3), delay=delay), np.random.RandomState())
+        way.restart(index, Draw(np.zeros(3), delay=delay), np.random.RandomState())
 
     for index, delay in enumerate(delays):
         restart(index, delay)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cathsim_dmc import bounds, suite
-from cathsim_dmc.physics.randomisation import Episode, Randomisation
+from cathsim_dmc.physics.randomisation import Draw, Randomisation
 from cathsim_dmc.tasks.anatomies import POOL
 from cathsim_dmc.tasks.start import START_SPACING, STARTS_ALONG_ROUTE
 
@@ -165,7 +165,7 @@ def stratified(
     return tuple(chosen)
 
 
-def _bins(ranges: Randomisation, episode: Episode) -> np.ndarray:
+def _bins(ranges: Randomisation, episode: Draw) -> np.ndarray:
     """Which tenths of their ranges the draws lie in."""
     shares = []
     for name in _STEPS:

@@ -134,14 +134,7 @@ class Anatomy:
         unit = "m" if self.file is None else self.file.unit
         position = given if self.file is None else self.file.to_lps @ given
         name = "(" + ", ".join(f"{x:g}" for x in given) + f") {unit}"
-        depth = float(self.lumen(position))
-        if not depth > 0.0:
-            low, high = self._box_of_file()
-            raise ValueError(
-                f"goal {name} lies {-depth * 1e3:.1f} mm outside the lumen of "
-                f"{self.name!r}, which reaches from {low} to {high} {unit}; give a "
-                f"place inside, or one of the goals {', '.join(self.goals)}"
-            )
+        self.check_inside(f"goal {name}", position)
         depths = self.tree.depths(position)
         own = []
         for key, vessel in self.tree.vessels.items():
@@ -150,6 +143,20 @@ class Anatomy:
                 own.append((float(depths[key]), key, arc))
         _, key, arc = max(own)
         return Goal(name, key, position, arc)
+
+    def check_inside(self, what: str, position: np.ndarray) -> None:
+        """Refuses (ValueError) a place (3,), m, that is outside the lumen."""
+        depth = float(self.lumen(position))
+        if not depth > 0.0:
+            (low, high), unit = (
+                self._box_of_file(),
+                self.file.unit if self.file else "m",
+            )
+            raise ValueError(
+                f"{what} lies {-depth * 1e3:.1f} mm outside the lumen of "
+                f"{self.name!r}, which reaches from {low} to {high} {unit}; give a "
+                f"point inside, or one of the goals {', '.join(self.goals)}"
+            )
 
     def _box_of_file(self) -> list[str]:
         """Two corners of the lumen in the unit and frame of the file, as text."""

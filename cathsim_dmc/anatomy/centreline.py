@@ -41,6 +41,14 @@ def arc_lengths(points: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
+def interpolate(at: float | np.ndarray, arc: np.ndarray, points: np.ndarray) -> Array:
+    """Points (..., k) of a polyline (n, k) at arc lengths `at` (...), m; held outside.
+
+    `arc` (n,) are the arc lengths of its points.
+    """
+    return np.stack([np.interp(at, arc, axis) for axis in points.T], axis=-1)
+
+
 class CentrelinePoint(NamedTuple):
     """A place on a centreline: position (..., 3), radius (...), tangent (..., 3)."""
 

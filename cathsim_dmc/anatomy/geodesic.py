@@ -1,6 +1,7 @@
 """Points of a lattice inside a lumen, and the shortest paths among them to one."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -39,6 +40,23 @@ def nearest_cell(cells: np.ndarray, place: np.ndarray) -> tuple[int, ...]:
     return tuple(cells[np.square(cells - place).sum(axis=1).argmin()].tolist())
 
 
+def search(price: np.ndarray, start: tuple[int, ...]) -> tuple[Any, np.ndarray]:
+    """Cheapest ways from a cell of a lattice to all others (26 neighbours).
+
+    Args:
+        price: (X, Y, Z) of a way by a cell through each; negative where there is none.
+        start: The cell.
+
+    Returns:
+        The graph, whose `traceback(cell)` lists the cells of a way, and the cost of the
+        way to each cell (X, Y, Z), inf where there is none.
+    """
+    from skimage.graph import MCP_Geometric  # slow to import
+
+    graph = MCP_Geometric(price)
+    return graph, graph.find_costs([start])[0]
+
+
 class LumenDistance:
     """Length of the shortest way inside the lumen to a target, as a lattice.
 
@@ -57,9 +75,6 @@ class LumenDistance:
             target: (3,), m, point in the lumen.
             origin: (3,), m, another one; ValueError if no way joins it to the target.
         """
-        # Slow to import, and only a reward along the path needs it.
-        from skimage import graph
-
         (low, high), spacing = np.asarray(bounds, float), SPACING
         while True:
             self._low, self._spacing = low - 1.5 * spacing, spacing
@@ -71,8 +86,7 @@ class LumenDistance:
                 nearest_cell(cells, (point - self._low) / spacing)
                 for point in (target, origin)
             )
-            field = graph.MCP_Geometric(np.where(lumen, 1.0, -1.0))
-            costs, _ = field.find_costs([start])
+            _, costs = search(np.where(lumen, 1.0, -1.0), start)
             if np.isfinite(costs[end]):
                 break
             spacing /= 2.0

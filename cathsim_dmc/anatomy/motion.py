@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import softmax
 
-from cathsim_dmc.anatomy.centreline import Array, VesselTree, as_rows
+from cathsim_dmc.anatomy.centreline import Array, VesselTree, as_rows, interpolate
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.anatomy.parts import End, Surface
 from cathsim_dmc.laws.motion import (
@@ -165,5 +165,5 @@ def _along_aorta(blood: Circulation, tree: VesselTree) -> tuple[Array, Array]:
     medial, posterior, superior = _INSPIRATION
     unit = np.array([(medial * sign, posterior, superior) for sign in _MEDIAL])
     unit *= (_BREATHING / np.linalg.norm(unit, axis=1))[:, None]
-    breath = np.stack([np.interp(place, sites, unit[:, k]) for k in range(3)], -1)
+    breath = interpolate(place, np.array(sites), unit)
     return fading[:, None] * _HEART_WAY, breath

@@ -4,7 +4,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from cathsim_dmc.anatomy.curves import Curve
 FORMAT = "cathsim-vessel-tree"
 FORMAT_VERSION = 1
 _MM = 1e-3
+_FRAMES = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}  # factors to LPS
 _FARTHEST, _RADII = 2000.0, (0.3, 60.0)  # mm: other coordinates have another unit
 _MOST_POINTS = 20_000
 _WAYS = {  # to say where inlets and goals are
@@ -56,9 +57,10 @@ def parse_tree(content: Any) -> TreeFile:
     needed = ("format", "version", "name", "units", "frame", "vessels")
     _entries("the file", content, needed, ("note", "inlets", "goals"))
     fixed = {"format": FORMAT, "version": FORMAT_VERSION}
-    for key, value in {**fixed, "units": "mm", "frame": "LPS"}.items():
+    for key, value in {**fixed, "units": "mm"}.items():
         if content[key] != value:
             bounds.refuse(key, content[key], repr(value))
+    signs = np.array(_FRAMES[bounds.choice("frame", content["frame"], _FRAMES)])
     curves: dict[str, Curve] = {}
     for key, entry in _parts(content, "vessels"):
         curves[key] = _curve(f"vessel {key!r}", entry, list(curves))
@@ -72,6 +74,10 @@ def parse_tree(content: Any) -> TreeFile:
         for kind, ways in _WAYS.items()
     )
     bounds.instance("note", content.get("note", ""), str)
+    curves = {k: replace(one, points=signs * one.points) for k, one in curves.items()}
+    for key, place in goals.items():
+        if place.position is not None:
+            goals[key] = replace(place, position=signs * place.position)
     return TreeFile(
         bounds.text("name", content["name"]),
         curves,

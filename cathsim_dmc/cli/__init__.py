@@ -33,7 +33,7 @@ COMMANDS = {
     ),
     "play": ("agents:play", "Cannulate by keyboard, with the forces on the screen."),
     "doctor": ("checks:doctor", "Check what is installed; say what to do."),
-    "export": ("exporting:export", "Write a task's scene as MJCF for other programs."),
+    "export": ("exporting:export", "Write a scene as MJCF, or a policy as ONNX."),
     "phantom": ("phantoms:phantoms", "Make, import and check anatomies."),
     "validate": ("checks:validate", "Compare the physics with theory."),
     "benchmark": ("checks:benchmark", "Measure the speed on this machine."),

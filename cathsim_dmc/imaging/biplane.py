@@ -10,8 +10,8 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cathsim_dmc.anatomy.centreline import arc_lengths
-from cathsim_dmc.anatomy.geodesic import nearest_cell
+from cathsim_dmc.anatomy.centreline import arc_lengths, interpolate
+from cathsim_dmc.anatomy.geodesic import nearest_cell, search
 from cathsim_dmc.imaging import biplane_loops as loops
 from cathsim_dmc.imaging import materials
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
@@ -130,7 +130,7 @@ class Biplane:
         line = np.vstack([start, found[1:-1], goal])
         way = arc_lengths(line)
         fine = np.arange(0.0, way[-1], ROUTE_SPACING)
-        line = np.stack([np.interp(fine, way, axis) for axis in line.T], axis=1)
+        line = interpolate(fine, way, line)
         # The ends stay where they are: the line continues beyond them, point reflected.
         beyond = min(round(3 * _SMOOTHING / ROUTE_SPACING), len(line) - 1)
         around = ((beyond, beyond), (0, 0))
@@ -140,18 +140,14 @@ class Biplane:
 
     def _path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Points of the grid from the start to the goal, the cheapest way."""
-        from skimage.graph import MCP_Geometric
-
         low, depth = self._hull
         if self._goal is None or not np.array_equal(self._goal[0], goal):
             margin = 0.4 * HULL_SPACING
             cost = (_WIDE / np.clip(depth, margin, _WIDE)) ** 2
             cost = np.where(depth > _OUTSIDE, cost, -1.0)
             end = nearest_cell(np.argwhere(cost > 0.0), (goal - low) / HULL_SPACING)
-            graph = MCP_Geometric(cost)
-            reached = graph.find_costs([end])[0]
+            self._graph, reached = search(cost, end)
             self._goal = goal, np.argwhere(np.isfinite(reached))
-            self._graph = graph
         begin = nearest_cell(self._goal[1], (start - low) / HULL_SPACING)
         path = np.array(self._graph.traceback(begin))[::-1]
         return low + path * HULL_SPACING

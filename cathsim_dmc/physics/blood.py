@@ -7,7 +7,7 @@ from numpy.random import RandomState
 
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.laws.blood import Blood
-from cathsim_dmc.physics.effects import Effect, Episode
+from cathsim_dmc.physics.effects import Draw, Effect
 
 BLOOD_VISCOSITY = 3.5e-3  # Pa·s, of whole blood at high shear rates
 
@@ -18,7 +18,7 @@ class StillBlood(Effect):
     parameters = Blood
     acts_in, adapter = "passive", "blood"
 
-    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
+    def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Fills one simulation with blood at rest."""
         factor = 1.0 if episode.viscosity is None else episode.viscosity
         for each in self.world.parameters:

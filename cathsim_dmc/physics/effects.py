@@ -23,7 +23,7 @@ from cathsim_dmc.physics.readings import ModelIndex, Readings
 
 
 @dataclasses.dataclass(frozen=True)
-class Episode:
+class Draw:
     """What was drawn for an episode; None where the model's own value stands.
 
     Attributes:
@@ -135,7 +135,7 @@ class Effect:
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Takes the anatomy of one simulation, before an episode begins in it."""
 
-    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
+    def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Begins an episode of one simulation, whose device lies at its start.
 
         Args:

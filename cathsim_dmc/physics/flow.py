@@ -19,7 +19,7 @@ from cathsim_dmc.compiled import compiled
 from cathsim_dmc.laws.blood import beat
 from cathsim_dmc.laws.motion import VALUES, WARP, carried, warp
 from cathsim_dmc.physics.blood import StillBlood
-from cathsim_dmc.physics.effects import Episode, World
+from cathsim_dmc.physics.effects import Draw, World
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
 from cathsim_dmc.physics.readings import Readings
@@ -95,7 +95,7 @@ class Flow(StillBlood):
         if self._options is not None and self._options.split == "murray":
             self._circulations[index] = Circulation.of(anatomy.tree, True)
 
-    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
+    def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Draws rate, peak and phase of the heart, and pulse wave velocity."""
         super().restart(index, episode, random_state)
         if self._options is None:

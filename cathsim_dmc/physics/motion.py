@@ -14,7 +14,7 @@ from numpy.random import RandomState
 from cathsim_dmc.anatomy import Anatomy, Surface
 from cathsim_dmc.anatomy.motion import PARAMETERS, Motion
 from cathsim_dmc.laws.motion import MotionParameters, first_past
-from cathsim_dmc.physics.effects import Effect, Episode, World
+from cathsim_dmc.physics.effects import Draw, Effect, World
 from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
 from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
@@ -101,7 +101,7 @@ class Moving(Effect):
         self._motions[index], self._surfaces[index] = anatomy.motion, anatomy.surface
         self._inlets[index] = anatomy.inlet.position, anatomy.inlet.direction
 
-    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
+    def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Draws amplitudes, rates and phases."""
         given = {name: getattr(self._options, name) for name in _LIMITS}
         given |= {name: OF_HEART[name] for name in OF_HEART if given[name] is None}

@@ -1,6 +1,6 @@
 """Domain randomisation: what differs from episode to episode, drawn from one source.
 
-Composer and the batched path draw the same `Episode` in the same order;
+Composer and the batched path draw the same `Draw` in the same order;
 `RandomisedModel` writes it to fields of the compiled model, so nothing is compiled
 again.
 """
@@ -16,7 +16,7 @@ from numpy.random import RandomState
 
 from cathsim_dmc import bounds
 from cathsim_dmc.entities.chain import hinge_time
-from cathsim_dmc.physics.effects import Effect, Episode, World
+from cathsim_dmc.physics.effects import Draw, Effect, World
 from cathsim_dmc.physics.readings import Readings, ids
 
 # Published: radius of the ball of the random displacement of the tip.
@@ -151,12 +151,12 @@ class Randomisation:
         """How much farther in an episode may begin, m."""
         return 0.0 if self.start_insertion is None else self.start_insertion[1]
 
-    def draw_in(self, random_state: RandomState, anatomies: int) -> tuple[int, Episode]:
+    def draw_in(self, random_state: RandomState, anatomies: int) -> tuple[int, Draw]:
         """Draws the number of one of so many anatomies, then an episode in it."""
         number = int(random_state.randint(anatomies)) if anatomies > 1 else 0
         return number, self.draw(random_state)
 
-    def draw(self, random_state: RandomState) -> Episode:
+    def draw(self, random_state: RandomState) -> Draw:
         """Draws an episode; what is None takes nothing from the source."""
 
         def value(name: str) -> float | None:
@@ -182,7 +182,7 @@ class Randomisation:
         given["view"] = round(primary or 0.0), round(secondary or 0.0)
         given["gain"] = 1.0 if gain is None else gain
         given["kerma"] = 1.0 if kerma is None else kerma
-        return Episode(displacement, **given)
+        return Draw(displacement, **given)
 
 
 # Friction and EI over what real devices and lubrication show (the friction that is
@@ -235,7 +235,7 @@ class RandomisedModel(Effect):
         self._ratio = 1.0 if chain.coaxial else chain.device.friction_ratio
         self._stiffness = model.jnt_stiffness[self._hinges].copy()
 
-    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
+    def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Writes what was drawn into the model of one simulation."""
         field, stiffness, loss = self.world.field, episode.stiffness, episode.loss
         if episode.friction is not None:
@@ -277,7 +277,7 @@ class ActionDelay(Effect):
         self._past = np.zeros((world.num_simulations, self._longest + 1, num_actions))
         self._delay = np.zeros(world.num_simulations, dtype=int)
 
-    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
+    def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Begins an episode of one simulation, with drives at rest."""
         self._past[index] = 0.0
         self._delay[index] = episode.delay

@@ -27,7 +27,7 @@ from cathsim_dmc.laws.parameters import Array
 from cathsim_dmc.laws.springs import Springs
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.drives import Drives
-from cathsim_dmc.physics.effects import Effect, Episode, World
+from cathsim_dmc.physics.effects import Draw, Effect, World
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
@@ -76,7 +76,7 @@ class SingleDevice(Effect):
         rest = model.qpos_spring[places[:, 1]]
         self._springs = Springs(rest, 1 / model.jnt_stiffness[hinges_x])
 
-    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
+    def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Holds the base of one simulation where it stands."""
         self._drives.hold(index)
         if self.parameters is Springs:
@@ -169,7 +169,7 @@ class SlidingDevices(SingleDevice):
 
     # The course of an episode.
 
-    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
+    def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Puts the devices of one simulation to the start of the chain."""
         super().restart(index, episode, random_state)
         gaps = self._entity.start_gaps

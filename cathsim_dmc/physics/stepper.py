@@ -267,11 +267,13 @@ class SingleStepper(Stepper):
         # Of each physics step; 0 where there is no contact.
         self._rows = np.zeros((substeps, len(self._sensor)))
         self._substep, self._size = 0, mujoco.mj_stateSize(model, _STATE)
+        self._stopped, self._known_warnings = False, b""  # of the control step
 
     def begin(self, control: np.ndarray) -> None:
         """Begins a control step with the control (1, U) of all its physics steps."""
         super().begin(control)
-        self._substep = 0
+        self._substep, self._stopped = 0, False
+        self._known_warnings = self._warnings_before.tobytes()
 
     def keep(self) -> None:
         """Keeps the contacts of the physics step that has just been done."""
@@ -305,23 +307,22 @@ class SingleStepper(Stepper):
         """Writes the state (1, nstate)."""
         mujoco.mj_setState(self._model, self._data, states[0], _STATE)
 
-    def run(self) -> None:
-        """Does the physics steps of a control step."""
-        self._step(self._rows)
+    def step(self) -> None:
+        """Does a physics step, and keeps its contacts."""
+        self._advance(self._rows[self._substep])
+        self._substep += 1
 
-    def _step(self, rows: np.ndarray) -> None:
-        """Does a physics step for each of the sensor's rows."""
-        before = self._warnings_before.tobytes()
-        for substep, row in enumerate(rows):
+    def _advance(self, row: np.ndarray) -> None:
+        """Does a physics step; none after a warning, where a batch stops, too."""
+        if not self._stopped:
             mujoco.mj_step(self._model, self._data)
-            if self.warnings.tobytes() != before:  # where a batch stops, too
-                rows[substep:] = 0.0
-                return
-            row[:] = self._sensor
+            self._stopped = self.warnings.tobytes() != self._known_warnings
+        row[:] = 0.0 if self._stopped else self._sensor
 
     def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
         rows = np.empty((self.substeps * parts, self._rows.shape[1]))
-        self._step(rows)
+        for row in rows:
+            self._advance(row)
         self._rows[:] = rows[parts - 1 :: parts]
         return rows[None]
 

@@ -13,7 +13,7 @@ from numpy.random import RandomState
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import CONTACT_SOLIMP, CONTACT_SOLREF
 from cathsim_dmc.laws.compliance import Law, Links, Material, write_contacts
-from cathsim_dmc.physics.effects import Effect, Episode, World
+from cathsim_dmc.physics.effects import Draw, Effect, World
 from cathsim_dmc.physics.flow import Flow
 from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
 from cathsim_dmc.physics.readings import Readings
@@ -87,7 +87,7 @@ class Wall(Effect):
         self._radius = np.zeros((count, len(links)))
         self._material = np.ones((count, len(_LIMITS)))
 
-    def restart(self, index: int, episode: Episode, random_state: RandomState) -> None:
+    def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Draws the material of the wall."""
         self._radius[index] = 0.0
         given = [getattr(self._options, name) for name in _LIMITS]

@@ -15,6 +15,9 @@ SIZE = 512  # px
 # X repeats a held key as release and press; a release counts if none follows in, s:
 _REPEAT = 0.06
 _PANEL = 230  # px
+# Colours of the bar of the largest contact, N: mean tip force of trained navigation,
+# budget of safe learning, and proposed threshold of rupture, where the bar ends.
+FORCE_LEVELS = ((0.15, "green"), (0.85, "orange"), (1.5, "red"))
 
 
 class FluoroscopyWindow:
@@ -98,6 +101,11 @@ class FluoroscopyWindow:
             box = x - radius, y - radius, x + radius, y + radius
             self._screen.create_oval(*box, outline="green2")
         self._panel.delete("all")
+        force, (most, colour) = float(task.wall_force.max), FORCE_LEVELS[-1]
+        colour = next((c for level, c in FORCE_LEVELS if force <= level), colour)
+        for share, fill in ((1.0, "grey20"), (min(force / most, 1.0), colour)):
+            box = 14, rows - 30, 14 + share * (_PANEL - 28), rows - 14
+            self._panel.create_rectangle(*box, fill=fill, width=0)
         for row, (name, value) in enumerate([*lines_of(task), (message, "")]):
             y, write = 24 * (row + 1), self._panel.create_text
             write(14, y, text=name, fill="grey70", anchor="w")

@@ -1,21 +1,27 @@
 """Episodes as a Minari dataset, which Gymnasium and TorchRL load."""
 
+import contextlib
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import extras
+from cathsim_dmc import bounds, extras
 from cathsim_dmc.files import (
     atomic_directory,
     naming,
     require_folder,
     require_room,
 )
+from cathsim_dmc.recording.episode import Episode
+
+# Options of what is observed, which the record does not hold.
+_OBSERVED = ("observation", "fluoroscopy", "endoluminal_size", "cameras")
+_SAME_REWARD = 1e-9  # of an episode that is done again: another machine rounds apart
 
 
 def write(
@@ -164,3 +170,111 @@ def check_free(path: Path) -> None:
     if path.exists():
         raise FileExistsError(f"{path} exists: choose another directory, or remove it")
     require_folder(path.parent)
+
+
+def export(
+    episodes: Iterable[Episode],
+    path: str | os.PathLike[str],
+    *,
+    observation: str | Sequence[str] | None = None,
+    task_kwargs: Mapping[str, Any] | None = None,
+) -> Path:
+    """Repeats recorded episodes and writes them as a dataset, see `write`.
+
+    Every step is done again from the episode's seed and compared with the record.
+
+    Args:
+        episodes: Of one task with the same options, seeded and with steps.
+        path: Directory of the dataset, which must not exist.
+        observation: Names of observations; None for those of the record.
+        task_kwargs: Further options of what is observed, such as `fluoroscopy`.
+
+    Returns:
+        The directory.
+
+    Raises:
+        ValueError: the episodes do not belong together, or do not repeat.
+        FileExistsError: the directory exists.
+        ModuleNotFoundError: gymnasium or minari is not installed.
+    """
+    check_free(Path(path))
+    extras.require("gym", "gymnasium", "minari", "h5py")
+    from cathsim_dmc.simulation import gymnasium
+
+    episodes = list(episodes)
+    task, options = _common(episodes)
+    options |= bounds.options("task_kwargs", task_kwargs)
+    if observation is not None:
+        options["observation"] = observation
+    single = all((e.action == e.action.astype(np.float32)).all() for e in episodes)
+    options["dtype"] = "float32" if single else "float64"
+    environment = gymnasium.CathSimEnv(task, **options)
+    with contextlib.closing(environment):
+        return write(
+            path,
+            [_repeated(environment, episode) for episode in episodes],
+            env_spec=gymnasium.env_spec(task, **options),
+            observation_space=environment.observation_space,
+            action_space=environment.action_space,
+            algorithm="recorded episodes",
+            description=f"{len(episodes)} recorded episodes of the task {task} of "
+            "cathsim_dmc",
+        )
+
+
+def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:
+    """Task and options that all episodes share, with what the first one observed."""
+    given = [dict(one.meta.get("task_kwargs", {}), random=None) for one in episodes]
+    kinds = [{k: v for k, v in o.items() if k not in _OBSERVED} for o in given]
+    tasks = sorted({episode.task for episode in episodes})
+    if len(tasks) != 1 or any(kind != kinds[0] for kind in kinds):
+        raise ValueError(
+            f"{len(episodes)} episodes of the tasks {tasks}, or with different "
+            "options, make no dataset; export each kind as one of its own"
+        )
+    for number, one in enumerate(episodes):
+        if one.seed is None or not one.steps:
+            raise ValueError(
+                f"episode {number} has {one.steps} steps and the seed {one.seed}; only "
+                "seeded episodes with steps can be repeated"
+            )
+    return tasks[0], {k: v for k, v in given[0].items() if k != "random"}
+
+
+def _repeated(environment: Any, episode: Episode) -> Any:
+    """Minari's buffer of an episode that is done again; ValueError if it differs."""
+    from minari.data_collector import EpisodeBuffer
+
+    name = f"episode with seed {episode.seed}"
+    actions = episode.action.astype(environment.action_space.dtype)
+    seen, ends = [environment.reset(seed=episode.seed)], []
+    for step, action in enumerate(actions):
+        observation, reward, *end, info = environment.step(action)
+        seen.append((observation, info))
+        ends.append(end)
+        if abs(reward - episode.reward[step]) > _SAME_REWARD:
+            raise ValueError(
+                f"{name} does not repeat: reward {reward} instead of "
+                f"{episode.reward[step]} at step {step}; it was recorded with "
+                f"{episode.meta.get('versions')}"
+            )
+        if any(end) and step + 1 < episode.steps:
+            raise ValueError(
+                f"{name} ends at step {step} instead of {episode.steps - 1}; export it "
+                "with the options it was recorded with"
+            )
+    terminated, truncated = np.array(ends).T
+    truncated[-1] |= not terminated[-1]  # where the operator has stopped
+    observations, infos = (
+        {key: np.array([row[key] for row in rows]) for key in rows[0]}
+        for rows in zip(*seen, strict=True)
+    )
+    return EpisodeBuffer(
+        seed=episode.seed,
+        observations=observations,
+        actions=actions,
+        rewards=episode.reward.tolist(),
+        terminations=terminated.tolist(),
+        truncations=truncated.tolist(),
+        infos=infos,
+    )

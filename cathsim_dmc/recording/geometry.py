@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cathsim_dmc.anatomy.centreline import arc_lengths
+from cathsim_dmc.anatomy.centreline import arc_lengths, interpolate
 
 # Top of the colour scale, newtons. Published in-contact forces lie mostly within
 # 0-0.2 N with outliers above 0.4 N, so ordinary contacts use half the scale.
@@ -23,8 +23,8 @@ def force_colours(
 ) -> np.ndarray:
     """Return RGB colours (..., 3) uint8 of forces (...,), N; up to ``largest``."""
     stops = np.linspace(0.0, largest, len(_FORCE_COLOURS))
-    mixed = [np.interp(magnitude, stops, one) for one in _FORCE_COLOURS.T]
-    return np.round(np.stack(mixed, axis=-1)).astype(np.uint8)
+    mixed = interpolate(magnitude, stops, _FORCE_COLOURS)
+    return np.round(mixed).astype(np.uint8)
 
 
 def force_scale(magnitude: np.ndarray) -> float:
@@ -35,8 +35,7 @@ def force_scale(magnitude: np.ndarray) -> float:
 
 def along(points: np.ndarray, way: np.ndarray) -> np.ndarray:
     """Return places (m, 3) on a line (n, 3) at ways (m,) from its first point."""
-    arc = arc_lengths(points)
-    return np.stack([np.interp(way, arc, axis) for axis in points.T], axis=-1)
+    return interpolate(way, arc_lengths(points), points)
 
 
 def force_text(newtons: float) -> str:

@@ -1,4 +1,4 @@
-"""Episodes as Rerun recordings: scene, fluoroscopy, series, and their layout.
+"""Episodes as Rerun recordings: scene, fluoroscopy, series, text, and their layout.
 
 Whole series are sent as columns, so the cost does not grow with calls per step.
 """
@@ -16,7 +16,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.files import atomic_path
-from cathsim_dmc.recording import rerun_scene
+from cathsim_dmc.recording import rerun_scene, rerun_text
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.records import VESSEL_SERIES
 from cathsim_dmc.recording.rerun_scene import TIMELINES, BodyGeom, Log
@@ -89,6 +89,7 @@ def write_rrd(
             rerun_scene.log_bodies(log, robot_geoms)
             rerun_scene.log_contacts(log)
             _log_series(log)
+            rerun_text.log_text(log)
             data = encoded.read()
             stream.disconnect()
         temporary.write_bytes(data or b"")
@@ -98,7 +99,7 @@ def write_rrd(
 def _layout(
     log: Log, surface: Surface, geoms: Sequence[BodyGeom], planes: int
 ) -> rrb.Blueprint:
-    """The layout: scene on the left, X-ray in the middle, series on the right."""
+    """The layout: scene left, X-ray and text in the middle, series right."""
     episode = log.episode
     low, high = surface.vertices.min(0), surface.vertices.max(0)
     # From the front, as in an antero-posterior projection; y points backwards.
@@ -113,10 +114,13 @@ def _layout(
         contents = ("+ $origin/robot/**", "+ $origin/sheath/**", "+ $origin/catheter")
         middle = episode.body_pos[0, sorted(robots)].mean(0)
         insets.append(_world("Robot", middle, _ROBOT_OFFSET, contents))
-    images = [
+    images: list[rrb.View | rrb.Container] = [
         rrb.Spatial2DView(origin=origin, name=name)
         for origin, name in zip(FLUOROSCOPY[:planes], _PLANE_NAMES, strict=False)
     ]
+    texts = rrb.TextLogView(origin=rerun_text.EVENTS, name="Events")
+    page = rrb.TextDocumentView(origin=rerun_text.PAGE, name="Episode")
+    images.append(rrb.Tabs(texts, page))
     there = {
         "distance_mm": "distance" in episode.meta,
         "rotation_deg": log.coaxial is not None,
@@ -130,7 +134,7 @@ def _layout(
             plots.append(rrb.TimeSeriesView(origin=f"series/{entity}", **look))
     left = rrb.Vertical(scene, rrb.Horizontal(*insets), row_shares=[3, 2])
     columns = [(left, 5), (rrb.Vertical(*images), 3.4), (rrb.Vertical(*plots), 3)]
-    columns, shares = zip(*(columns if planes else columns[::2]), strict=True)
+    columns, shares = zip(*columns, strict=True)
     return rrb.Blueprint(
         rrb.Horizontal(*columns, column_shares=shares),
         rrb.TimePanel(

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.geometry import force_colours, force_scale
+from cathsim_dmc.recording.geometry import force_colours, force_scale, force_text
 from cathsim_dmc.recording.records import MESH_EVERY, CoaxialRecord, VesselRecord
 
 TIMELINES = ("sim_time", "step")
@@ -28,6 +28,8 @@ SHEATH_OPACITY = 0.3  # of what would hide the device inside it
 LONGEST_ARROW = 25e-3  # m, about, in an episode
 ARROW_RADIUS, HEAT_RADIUS, TRAIL_RADIUS = 0.7e-3, 0.9e-3, 0.25e-3
 HEAD_SCALE = 1.8
+# Of the text at the largest force of a step: it can be read on light and dark.
+LABEL_COLOUR = (186, 58, 0)
 # Geoms that bodies collide with are not drawn, as in MuJoCo's own viewers.
 _VISIBLE_GROUPS = 3
 # MuJoCo geom types that a recording can draw, and how many sizes each one uses:
@@ -177,7 +179,7 @@ def arrow_scale(episode: Episode) -> float:
 
 
 def log_contacts(log: Log) -> None:
-    """Log the forces of each step as arrows, and the places pressed so far."""
+    """Log the forces of each step as arrows, the largest also as text, and places."""
     episode = log.episode
     magnitude = np.linalg.norm(episode.contact_force, axis=-1)
     colours = force_colours(magnitude, force_scale(magnitude))
@@ -191,6 +193,15 @@ def log_contacts(log: Log) -> None:
         log.static("world/heat", rr.Points3D.from_fields(radii=[HEAT_RADIUS]))
         heat = rr.Points3D.columns(positions=places, colors=colours)
         log.columns("world/heat", heat.partition(counts), MEASURED)
+        order = np.lexsort((magnitude, episode.contact_step))
+        top = order[np.flatnonzero(np.diff(episode.contact_step[order], append=-1))]
+        look = {"colors": [LABEL_COLOUR], "radii": [0.0], "show_labels": True}
+        log.static("world/contacts/largest", rr.Points3D.from_fields(**look))
+        texts = [force_text(force) for force in magnitude[top]]
+        ends = (places + vectors)[top]
+        labels = rr.Points3D.columns(positions=ends, labels=texts)
+        labels = labels.partition(np.minimum(counts, 1))
+        log.columns("world/contacts/largest", labels, MEASURED)
 
 
 class BodyGeom(NamedTuple):

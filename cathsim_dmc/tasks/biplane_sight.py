@@ -8,6 +8,7 @@ import functools
 
 import numpy as np
 
+from cathsim_dmc.anatomy.centreline import arc_lengths, interpolate
 from cathsim_dmc.imaging import biplane
 from cathsim_dmc.imaging import biplane_loops as loops
 from cathsim_dmc.imaging.biplane import Biplane
@@ -93,8 +94,7 @@ def _route(machine: Biplane, line: np.ndarray, goal: np.ndarray) -> Route:
     first = max(int(out[0]) - 1, 0) if len(out) else len(line) - 1
     points = machine.route(line[first], goal)
     radii = np.maximum(machine.depth(points), _LEAST_RADIUS)
-    ways = np.append(0.0, np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum())
-    return Route(points, radii, ways)
+    return Route(points, radii, arc_lengths(points))
 
 
 def _seen(
@@ -109,8 +109,7 @@ def _seen(
     # Where it has been lost, it is straight.
     beyond = np.maximum(places - ways[-1], 0.0)[:, None]
     back = (line[-1] - line[-2]) / biplane.TRACE_SPACING
-    device = np.stack([np.interp(places, ways, axis) for axis in line.T], axis=1)
-    device = device + beyond * back
+    device = interpolate(places, ways, line) + beyond * back
     ahead = look_ahead([route], np.zeros(1, int), head[None], frame[None])
     return {
         "points": ahead.points.ravel(),

@@ -23,6 +23,7 @@ from cathsim_dmc.physics.randomisation import (
 from cathsim_dmc.physics.sliding import devices_of
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, PHYSICS_TIMESTEP
 from cathsim_dmc.physics.vessel import VesselOptions
+from cathsim_dmc.tasks.cameras import CameraOptions
 
 MAX_STEPS = 2000  # published
 WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
@@ -69,6 +70,8 @@ class NavigationConfig:
             refused.
         fluoroscopy: `imaging.options.FluoroscopyOptions`, or a mapping of its fields.
         endoluminal_size: Pixels along a side of endoluminal views, or (rows, columns).
+        cameras: `cameras.CameraOptions` of `rgb` and `depth`, or a mapping of its
+            fields.
         randomisation: Ranges that each episode draws from: True for
             `randomisation.DEFAULT_RANGES`, False for none, a
             `randomisation.Randomisation` or a mapping of its fields.
@@ -93,6 +96,7 @@ class NavigationConfig:
     # What makes an object is given; the object is here after validation.
     fluoroscopy: Any = FluoroscopyOptions()
     endoluminal_size: Any = (128, 128)
+    cameras: Any = CameraOptions()
     randomisation: Any = Randomisation()
     effects: Sequence[Effect] = ()
     vessel: Any = VesselOptions()
@@ -106,6 +110,7 @@ class NavigationConfig:
                 "fluoroscopy", self.fluoroscopy, FluoroscopyOptions
             ),
             endoluminal_size=bounds.pixels("endoluminal_size", self.endoluminal_size),
+            cameras=bounds.made("cameras", self.cameras, CameraOptions),
             randomisation=Randomisation.make(self.randomisation),
             vessel=VesselOptions.make(self.vessel),
         )

@@ -21,7 +21,7 @@ from cathsim_dmc.tasks import cases, observations
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective, Shiftable
-from cathsim_dmc.tasks.observation_kind import FrameObservable, Sizes
+from cathsim_dmc.tasks.observation_kind import OPENGL, FrameObservable, Sizes
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.snapshot import Snapshot
@@ -97,6 +97,14 @@ class Navigation(composer.Task):
         self._names = observations.resolve(
             config.observation, scene.catheter.coaxial, living
         )
+        if observations.needs(self._names, OPENGL):
+            if config.vessel.motion is not None or others is not None:
+                raise ValueError(
+                    f"the observation is {config.observation!r}: MuJoCo's cameras show "
+                    "one anatomy at rest, and this task has several or moves it; "
+                    "observe image, segmentation or endoluminal, or take a pool of 1 "
+                    "and a vessel that does not move"
+                )
         self.set_timesteps(CONTROL_TIMESTEP, config.physics_timestep)
         self._cases: tuple[cases.Case, ...] = ()
         if others is not None:
@@ -169,6 +177,7 @@ class Navigation(composer.Task):
             devices=len(chain.devices) if self._scene.catheter.coaxial else 0,
             fluoroscopy=config.fluoroscopy,
             endoluminal=config.endoluminal_size,
+            cameras=config.cameras,
         )
         return observations.entry_specs(self._names, sizes)
 

@@ -13,6 +13,7 @@ from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.forces import WallForce
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.physics.vessel import VesselReadings
+from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.route import Ahead
 
@@ -32,7 +33,7 @@ class Frame(NamedTuple):
         images: of the sensors, by name: (..., H, W, P) uint8 of P planes "past_0", the
             last one, "past_1" and "past_2"; (..., H, W, 2 P) uint8 "masks", see
             `imaging.angiograph.masks`; (..., P, K + 1, 2) "pixels" of tracked points
-            and goal, (column, row); endoluminal views.
+            and goal, (column, row); endoluminal views; "rgb" and "depth".
         ahead: route ahead of the tip; None where no observation needs it.
         devices: state of coaxial devices; None for a device alone.
         vessel: state of the vessel; None for a rigid one with blood at rest.
@@ -60,6 +61,7 @@ class Sizes:
         devices: coaxial devices; 0 for a single device.
         fluoroscopy: set-up of the angiography machine.
         endoluminal: (rows, columns) of endoluminal views.
+        cameras: which of MuJoCo's are shown, and the size of their images.
     """
 
     actions: int = 0
@@ -68,6 +70,7 @@ class Sizes:
     devices: int = 0
     fluoroscopy: FluoroscopyOptions = FluoroscopyOptions()
     endoluminal: tuple[int, int] = (128, 128)
+    cameras: CameraOptions = CameraOptions()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +113,7 @@ class Entry:
 
 # What a row of the table may need.
 FLUOROSCOPY, BIPLANE = "fluoroscopy", "fluoroscopy with two planes"
-ROUTE = "a route"
+ROUTE, OPENGL = "a route", "OpenGL"
 COAXIAL, LIVING = "coaxial devices", "a living vessel (option vessel)"
 
 
@@ -121,8 +124,8 @@ class ObservationKind:
     Attributes:
         observe: function from a frame to the arrays of the observation.
         entries: its arrays.
-        needs: `FLUOROSCOPY`, `BIPLANE`, `ROUTE`, `COAXIAL` or `LIVING`; empty for
-            nothing.
+        needs: `FLUOROSCOPY`, `BIPLANE`, `ROUTE`, `OPENGL`, `COAXIAL` or `LIVING`;
+            empty for nothing.
         joined: names of the rows that coaxial devices add to it.
     """
 

@@ -9,12 +9,14 @@ import numpy as np
 
 from cathsim_dmc.imaging.options import FARTHEST_WALL
 from cathsim_dmc.physics.sliding import DEVICE_PLACES
+from cathsim_dmc.tasks.cameras import FARTHEST
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
 from cathsim_dmc.tasks.observation_kind import (
     BIPLANE,
     COAXIAL,
     FLUOROSCOPY,
     LIVING,
+    OPENGL,
     ROUTE,
     Entry,
     Frame,
@@ -324,6 +326,18 @@ for _key, _unit, _seen, _high, _dtype in (
     _seen += ", over a right angle from the head along its axis; right and down: x and "
     _seen += "y of the tip frame"
     _shown(Entry(_key, lambda s: (*s.endoluminal, 1), _unit, _seen, 0, _high, _dtype))
+
+
+for _key, _unit, _seen, _planes, _high, _dtype in (
+    ("rgb", "colour level", "red, green, blue", 3, 255, np.uint8),
+    ("depth", "m", "distance along the optical axis", 1, FARTHEST, np.float32),
+):
+    _seen += " of each of MuJoCo's cameras, which show a vessel at rest"
+
+    def _size(sizes: Sizes, planes: int = _planes) -> tuple[int, ...]:
+        return (*sizes.cameras.size, planes * len(sizes.cameras.names))
+
+    _shown(Entry(_key, _size, _unit, _seen, 0, _high, _dtype), needs=OPENGL)
 
 
 @OBSERVATIONS.row(

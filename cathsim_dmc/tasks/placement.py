@@ -89,13 +89,8 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal | Sequence[float]") -> Goal
                 "farther in, or import with another inlet"
             )
     bounds.instance("goal", goal, Goal)
-    depth = float(anatomy.lumen(goal.position))
-    if not depth > 0:
-        raise ValueError(
-            f"goal {goal.name!r} at {np.round(goal.position, 4).tolist()} m lies "
-            f"{-depth * 1e3:.1f} mm outside the lumen of {anatomy.name!r}; give a "
-            f"point inside, or one of the goals {', '.join(anatomy.goals)}"
-        )
+    place = np.round(goal.position, 4).tolist()
+    anatomy.check_inside(f"goal {goal.name!r} at {place} m", goal.position)
     return goal
 
 

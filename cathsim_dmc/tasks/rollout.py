@@ -23,7 +23,7 @@ from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import ModelIndex, Readings, merged, part
 from cathsim_dmc.physics.sliding import SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, Stepper
-from cathsim_dmc.tasks import observations, physics_errors
+from cathsim_dmc.tasks import cameras, observations, physics_errors
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
@@ -118,6 +118,8 @@ class Rollout(Restorable):
             self._routes = [Route.of(case.objective) for case in cases]
         self._chain = CommonChain(scene.catheter, config.shaft_link)
         self._sensors = ImageSensors(self._names, cases[0], count, self._chain)
+        own = self._names, self.index.geoms, scene.catheter.coaxial
+        self._cameras = cameras.opened(model, config.cameras, *own)
         self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
@@ -330,9 +332,8 @@ class Rollout(Restorable):
             handles = self.index.handles(self._state.cdof)
             own = points, self.shadows, handles, random, self.around
             sensors.capture(rows, begins, *own)
-        if len(rows) and any(n.startswith("endoluminal") for n in self._names):
-            for name, view in self._endoscope(rows).items():
-                sensors.hold(name, view, rows)
+        for name, view in self._views(rows).items() if len(rows) else ():
+            sensors.hold(name, view, rows)
         ahead = None
         if self._routes:
             seen = self._at_rest(state) if self._tracking.deviation else self.resting
@@ -343,18 +344,21 @@ class Rollout(Restorable):
         )
         return observations.observe(self._names, frame)
 
-    def _endoscope(self, indices: np.ndarray) -> dict[str, np.ndarray]:
-        """What the heads of some simulations (K,) see of the wall, by name."""
-        moving, state = self.moving, self.readings
-        rest = endoluminal.AT_REST
+    def _views(self, indices: np.ndarray) -> dict[str, np.ndarray]:
+        """What heads and MuJoCo's cameras of some simulations (K,) see, by name."""
+        moving, state, seen = self.moving, self.readings, {}
+        if self._cameras is not None:
+            seen = self._cameras.see(indices, self._stepper, state)
+        if not any(name.startswith("endoluminal") for name in self._names):
+            return seen
         grey, distance = endoluminal.views(
             [self.case(index).scene.anatomy.lumen for index in indices],
-            [rest if moving is None else moving.warp(index) for index in indices],
+            [moving.warp(i) if moving else endoluminal.AT_REST for i in indices],
             state.head[indices],
             state.head_frame[indices],
             self._config.endoluminal_size,
         )
-        return {"endoluminal": grey, "endoluminal_distance": distance}
+        return {**seen, "endoluminal": grey, "endoluminal_distance": distance}
 
     def _derive(self, indices: np.ndarray) -> Step:
         for index in indices.tolist():

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cathsim_dmc.anatomy.centreline import interpolate
 from cathsim_dmc.tasks.objectives import Objective, Routed
 
 ROUTE_SPACING = 1e-3  # m, resolution of the route
@@ -45,11 +46,11 @@ class Route:
 
     def at(self, arc_length: np.ndarray) -> np.ndarray:
         """Point (..., 3) of the route; beyond its end, straight on."""
-        axes = [np.interp(arc_length, self.arc_length, x) for x in self.points.T]
+        held = interpolate(arc_length, self.arc_length, self.points)
         last = self.points[-1] - self.points[-2]
         last = last / np.linalg.norm(last)
         beyond = np.maximum(arc_length - float(self.arc_length[-1]), 0.0)
-        return np.stack(axes, axis=-1) + beyond[..., None] * last
+        return held + beyond[..., None] * last
 
 
 class Place(NamedTuple):

@@ -13,7 +13,7 @@ from cathsim_dmc.entities.posture import bends_of, joints_along, nodes_of
 from cathsim_dmc.laws.field import FREE
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import hold
-from cathsim_dmc.physics.effects import Episode
+from cathsim_dmc.physics.effects import Draw
 from cathsim_dmc.physics.randomisation import START_JITTER, start_displacement
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
@@ -106,7 +106,7 @@ class StartPosture:
             self._scale = reach / farthest
 
     def write(
-        self, qpos: np.ndarray, episode: Episode, random_state: np.random.RandomState
+        self, qpos: np.ndarray, episode: Draw, random_state: np.random.RandomState
     ) -> None:
         """Writes the start configuration of one simulation.
 

@@ -23,7 +23,7 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.blood import StillBlood
-from cathsim_dmc.physics.effects import Episode, Layout, World, userdata_size
+from cathsim_dmc.physics.effects import Draw, Layout, World, userdata_size
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import theory
@@ -208,7 +208,7 @@ class Rig:
             parameters=self.data.userdata[None],
         )
         Layout([blood], world, places).begin(0)
-        blood.restart(0, Episode(np.zeros(3)), np.random.RandomState(0))
+        blood.restart(0, Draw(np.zeros(3)), np.random.RandomState(0))
 
     def qpos(self, joint: str) -> float:
         """Position of a joint of the catheter, by its name in the entity."""

@@ -16,7 +16,7 @@ import figures
 import numpy as np
 
 from cathsim_dmc import files, policies, suite
-from cathsim_dmc.physics.randomisation import Episode, Randomisation, RandomisedModel
+from cathsim_dmc.physics.randomisation import Draw, Randomisation, RandomisedModel
 from cathsim_dmc.simulation.batch import BatchSimulation
 
 TASK = "type1_bca"
@@ -106,7 +106,7 @@ class Settings(RandomisedModel):
     def restart(self, index, episode, random_state):
         """Writes the model of one simulation."""
         stiffness, friction = self._settings[index]
-        own = Episode(np.zeros(3), friction=friction, stiffness=stiffness)
+        own = Draw(np.zeros(3), friction=friction, stiffness=stiffness)
         super().restart(index, own, random_state)
 
 

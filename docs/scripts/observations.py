@@ -15,6 +15,7 @@ from cathsim_dmc.imaging.carm import VIEWS
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.randomisation import DEFAULT_RANGES, Randomisation
 from cathsim_dmc.tasks import observation_kind, observations
+from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.observation_kind import Entry
 from cathsim_dmc.tasks.placement import COMMON_LENGTH
 
@@ -95,6 +96,21 @@ OpenGL: rays are traced through the lumen, at rest or moving. The option
 the lumen is closed.
 
 ![From the aorta to a branch: grey levels and distances](images/endoluminal.png)
+"""
+
+CAMERAS = """
+## Cameras
+
+`rgb` and `depth` show MuJoCo's cameras and need OpenGL: set `MUJOCO_GL` to `egl` (with
+a GPU), `osmesa` (software) or `glfw` (with a display) before Python starts.
+`task_kwargs={"cameras": {...}}` configures them:
+
+{table}
+
+The channels of a camera follow those of the one before. "tip" looks from the head along
+its axis over a right angle, as endoluminal views do, and the device is not seen. A
+batch draws its simulations one after the other. Tasks with several anatomies or a
+vessel that moves are refused.
 """
 
 RANDOMISATION = """
@@ -198,7 +214,9 @@ def options_table(kind: type, values: object, title: str) -> str:
     for name, meaning in _attributes(kind).items():
         value = getattr(values, name)
         if isinstance(value, tuple):
-            value = ", ".join(f"{each:.4g}" for each in value)
+            value = ", ".join(
+                each if isinstance(each, str) else f"{each:.4g}" for each in value
+            )
         elif isinstance(value, float):
             value = f"{value:.4g}"
         rows.append(_row(f"`{name}`", str(value), meaning))
@@ -212,6 +230,8 @@ def page() -> str:
     table = options_table(FluoroscopyOptions, FluoroscopyOptions(), "default")
     parts.append(FLUOROSCOPY.replace("{table}", table))
     parts.append(ENDOLUMINAL)
+    table = options_table(CameraOptions, CameraOptions(), "default")
+    parts.append(CAMERAS.replace("{table}", table))
     table = options_table(Randomisation, DEFAULT_RANGES, "default range")
     parts.append(RANDOMISATION.replace("{table}", table))
     assert len(_attributes(Randomisation)) == len(dataclasses.fields(Randomisation))

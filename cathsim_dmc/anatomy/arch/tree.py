@@ -16,6 +16,7 @@ from cathsim_dmc.anatomy.centreline import (
     Vessel,
     VesselTree,
     arc_lengths,
+    interpolate,
 )
 from cathsim_dmc.anatomy.curves import check_septa, flare_begin
 
@@ -76,7 +77,7 @@ def _aorta_points(p: ArchParameters) -> Array:
     # Equal steps along the ellipse.
     arc = arc_lengths(ellipse)
     even = np.linspace(0.0, arc[-1], round(arc[-1] / _CURVED_STEP) + 1)
-    ellipse = np.stack([np.interp(even, arc, ellipse[:, i]) for i in (0, 1)], axis=1)
+    ellipse = interpolate(even, arc, ellipse)
     fall = ellipse[-1] + _limb(p.descending_length, p.descending_bend, math.pi)
     return np.concatenate([rise[:-1], ellipse, fall[1:]])
 
@@ -162,8 +163,7 @@ def _ostium(
     index = float(np.interp(level, flat, numbers))
     # The curve in space is a little longer than the one in the plane.
     s = float(np.interp(index, numbers, aorta.centreline.arc_length))
-    way = [np.interp(level, flat, axis) for axis in (outer - points).T]
-    outward = plane.to_world(np.array(way))
+    outward = plane.to_world(interpolate(level, flat, outer - points))
     place = aorta.centreline.at(s)
     outward = outward - (outward @ place.tangent) * place.tangent
     outward /= np.linalg.norm(outward)
@@ -279,4 +279,4 @@ def _path(
         v = v / math.sqrt(v @ v)
     steps = 0.5 * step * (tangents[1:] + tangents[:-1])
     points = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    return np.stack([np.interp(s, fine, points[:, i]) for i in range(3)], axis=1)
+    return interpolate(s, fine, points)

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from cathsim_dmc.anatomy.centreline import arc_lengths
+from cathsim_dmc.anatomy.centreline import arc_lengths, interpolate
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 STEP = 1e-3  # m, spacing of the centrelines that result
@@ -23,7 +23,7 @@ def resample(points: np.ndarray) -> np.ndarray:
     points = points[np.concatenate([[True], apart])]
     s = arc_lengths(points)
     t = np.linspace(0.0, s[-1], max(2, int(round(s[-1] / STEP)) + 1))
-    return np.stack([np.interp(t, s, points[:, k]) for k in range(3)], -1)
+    return interpolate(t, s, points)
 
 
 def centred(

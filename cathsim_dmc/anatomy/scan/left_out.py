@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.centreline import VesselTree
@@ -40,7 +39,7 @@ def left_out(ways: Ways, tree: VesselTree) -> list[LeftOut]:
     links = ways.links[beyond[ways.links].any(axis=1)]
     if not len(links):
         return []
-    gone, before = _from_tree(ways, links, taken)
+    gone, before = ways.out_of(taken, links)
     label = groups(len(beyond), links[beyond[links].all(axis=1)])
     label[~beyond] = -1
     found = []
@@ -53,27 +52,6 @@ def left_out(ways: Ways, tree: VesselTree) -> list[LeftOut]:
             middle = ways.points[way[len(way) // 2]]
             found.append(LeftOut(middle, width, float(gone[far])))
     return sorted(found, key=lambda one: -one.length)
-
-
-def _from_tree(
-    ways: Ways, links: np.ndarray, taken: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lengths (n,) m of the shortest ways out of the nodes that are `taken`."""
-    from scipy.sparse import csr_matrix
-
-    rows = np.unique(links)
-    local = np.searchsorted(rows, links)
-    apart = np.linalg.norm(np.diff(ways.points[links], axis=1)[:, 0], axis=1)
-    graph = csr_matrix((apart, local.T), shape=(len(rows),) * 2)
-    starts = np.flatnonzero(taken[rows])
-    gone, before = np.full(len(taken), np.inf), np.full(len(taken), -1)
-    if len(starts):
-        far, back, _ = dijkstra(
-            graph, False, starts, return_predecessors=True, min_only=True
-        )
-        gone[rows] = far
-        before[rows] = np.where(back >= 0, rows[back.clip(min=0)], -1)
-    return gone, before
 
 
 def said(found: list[LeftOut], device: str, radius: float) -> str | None:

@@ -119,6 +119,27 @@ class Ways:
         before = _before(graph, self.node(curve[0]))
         return self.points[self.trace(before, self.node(curve[-1]))]
 
+    def out_of(
+        self, taken: np.ndarray, links: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Shortest ways out of `taken` (n,) nodes by some of the links (e, 2).
+
+        Returns lengths (n,) m, inf where there is none, and the node before each (n,).
+        """
+        rows = np.unique(links)
+        local = np.searchsorted(rows, links)
+        apart = np.linalg.norm(np.diff(self.points[links], axis=1)[:, 0], axis=1)
+        graph = csr_matrix((apart, local.T), shape=(len(rows),) * 2)
+        starts = np.flatnonzero(taken[rows])
+        gone, before = np.full(len(taken), np.inf), np.full(len(taken), -1)
+        if len(starts):
+            far, back, _ = dijkstra(
+                graph, False, starts, return_predecessors=True, min_only=True
+            )
+            gone[rows] = far
+            before[rows] = np.where(back >= 0, rows[back.clip(min=0)], -1)
+        return gone, before
+
     def trace(self, before: np.ndarray, node: int) -> np.ndarray:
         """Nodes of the way that ends at ``node``, first to last."""
         way = [node]

@@ -1,0 +1,167 @@
+"""Pictures of MuJoCo's cameras, which need OpenGL, unlike fluoroscopy."""
+
+import copy
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc import bounds
+from cathsim_dmc.imaging.options import VIEW_ANGLE
+from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.physics.stepper import Stepper
+
+# Of `scene.Scene`, and of the head of the device, see `Cameras`.
+NAMES = ("top", "side", "tip")
+KINDS = ("rgb", "depth")  # names of observations
+# Planes between which a camera sees, m: a wall that the head touches is a radius of
+# the device away, and the top view stands 0.7 m off.
+NEAREST, FARTHEST = 0.3e-3, 10.0
+_OUT_OF_SIGHT = 1e3  # m; a geom without opacity would still be in the depth
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """What `rgb` and `depth` show.
+
+    Attributes:
+        names: of the cameras: "top" as published, "side", and "tip", an endoscope.
+        size: pixels along a side of the image, or (rows, columns).
+    """
+
+    names: Sequence[str] = ("top",)
+    size: Any = (128, 128)
+
+    def __post_init__(self):
+        named = [self.names] if isinstance(self.names, str) else self.names
+        listed = isinstance(named, Sequence) and len(set(map(str, named))) == len(named)
+        if not listed or not named or any(name not in NAMES for name in named):
+            allowed = f"different ones of {', '.join(NAMES)}"
+            bounds.refuse("names of cameras", self.names, allowed)
+        size = bounds.pixels("size of cameras", self.size)
+        vars(self).update(names=tuple(named), size=size)
+
+
+class Cameras:
+    """The cameras of one compiled model, on a context of their own.
+
+    They look at joint positions, so that composer and batches show the same. The
+    endoscope looks ahead from the head of the device, which it does not show.
+    """
+
+    _renderer: Any = None
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        options: CameraOptions,
+        kinds: Sequence[str],
+        links: np.ndarray,
+        resized: bool,
+    ):
+        """Opens the context.
+
+        Args:
+            kinds: What they take, of `KINDS`.
+            links: Numbers of the geoms of the device.
+            resized: Whether the sizes of these differ between simulations.
+
+        Raises:
+            ValueError: if OpenGL does not start.
+        """
+        rows, columns = options.size
+        self._names, self._resized = options.names, resized
+        self._kinds = tuple(kinds)
+        self._links = set(links.tolist())
+        self._model = model = copy.copy(model)
+        model.vis.global_.offheight, model.vis.global_.offwidth = rows, columns
+        model.stat.extent = 1.0  # the unit of the two planes
+        model.vis.map.znear, model.vis.map.zfar = NEAREST, FARTHEST
+        self._data, self._options = mujoco.MjData(model), mujoco.MjvOption()
+        self._options.sitegroup[:] = 0
+        try:
+            self._renderer = mujoco.Renderer(model, rows, columns)
+        except Exception as error:  # each back end fails in its own way
+            chosen = os.environ.get("MUJOCO_GL", "not set")
+            raise ValueError(
+                f"the observations rgb and depth need OpenGL, which does not start "
+                f"here (MUJOCO_GL is {chosen}: {type(error).__name__}: {error}). Set "
+                "MUJOCO_GL to egl (with a GPU), osmesa (software) or glfw (with a "
+                "display) before Python starts, or observe image or segmentation, "
+                "which need no OpenGL"
+            ) from error
+
+    def __del__(self):
+        # MuJoCo frees what lies in whichever context is current, perhaps another's.
+        context = getattr(self._renderer, "_gl_context", None)
+        if context is not None:
+            context.make_current()
+            self._renderer.close()
+
+    def see(
+        self, indices: np.ndarray, stepper: Stepper, readings: Readings
+    ) -> dict[str, np.ndarray]:
+        """Pictures of some simulations (K,).
+
+        Returns:
+            "rgb": (K, rows, columns, 3 C) uint8 of C cameras; "depth": (K, rows,
+            columns, C) float32, m.
+        """
+        seen = [self._see(index, stepper, readings) for index in indices]
+        return {kind: np.stack([one[kind] for one in seen]) for kind in self._kinds}
+
+    def _see(
+        self, index: int, stepper: Stepper, readings: Readings
+    ) -> dict[str, np.ndarray]:
+        """Pictures of one simulation."""
+        if self._resized:
+            self._model.geom_size[:] = stepper.field(index, "geom_size")
+        self._data.qpos[:] = stepper.arrays.qpos[index]
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        seen: dict[str, list[np.ndarray]] = {kind: [] for kind in self._kinds}
+        for name in self._names:
+            self._aim(name, readings.head[index], readings.head_frame[index])
+            for kind, pictures in seen.items():
+                if kind == "depth":
+                    self._renderer.enable_depth_rendering()
+                pictures.append(np.atleast_3d(self._renderer.render()))
+                self._renderer.disable_depth_rendering()
+        return {kind: np.concatenate(each, axis=-1) for kind, each in seen.items()}
+
+    def _aim(self, name: str, head: np.ndarray, axes: np.ndarray) -> None:
+        """Puts the scene before a camera; x and y of the head are right and down."""
+        model, data, inside = self._model, self._data, name == "tip"
+        camera = model.camera(NAMES[0] if inside else name)
+        if inside:  # another place of the top view, until it is put back
+            kept = data.cam_xpos[camera.id].copy(), data.cam_xmat[camera.id].copy()
+            angle = float(model.cam_fovy[camera.id])
+            data.cam_xpos[camera.id], model.cam_fovy[camera.id] = head, VIEW_ANGLE
+            # A camera looks along its -z.
+            data.cam_xmat[camera.id] = (axes * (1.0, -1.0, -1.0)).ravel()
+        self._renderer.update_scene(data, camera.id, self._options)
+        if inside:
+            data.cam_xpos[camera.id], data.cam_xmat[camera.id] = kept
+            model.cam_fovy[camera.id] = angle
+        scene = self._renderer.scene
+        # From inside, the wall is opaque and seen from behind.
+        scene.flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = not inside
+        for geom in scene.geoms[: scene.ngeom] if inside else ():
+            geom.rgba[3] = 1.0
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid in self._links:
+                geom.pos[:] = _OUT_OF_SIGHT
+
+
+def opened(
+    model: mujoco.MjModel,
+    options: CameraOptions,
+    names: Sequence[str],
+    links: np.ndarray,
+    resized: bool,
+) -> Cameras | None:
+    """The cameras that observations of these names need, see `Cameras`, if any."""
+    kinds = [kind for kind in KINDS if kind in names]
+    return Cameras(model, options, kinds, links, resized) if kinds else None

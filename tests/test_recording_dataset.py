@@ -1,0 +1,67 @@
+"""Recorded episodes as Minari datasets, read back by Minari."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+minari = pytest.importorskip("minari")
+
+from cathsim_dmc.recording.dataset import export  # noqa: E402
+from cathsim_dmc.recording.recorder import EpisodeRecorder  # noqa: E402
+
+TASK, SHORT = "simple1_bca", {"max_steps": 9}
+
+
+@pytest.fixture(scope="module")
+def episodes(shared_environment):
+    env = shared_environment(TASK, **SHORT)
+    recorder = EpisodeRecorder(env, TASK, {"random": 5, **SHORT})
+    draw = np.random.default_rng(0)
+
+    def policy(_):
+        return draw.uniform(-1, 1, 21).astype(np.float32)
+
+    return [recorder.record_episode(policy, seed, 9 - seed) for seed in (3, 4)]
+
+
+def test_a_dataset_holds_what_happened(episodes, tmp_path):
+    folder = tmp_path / "own-v0"
+    size = {"size": 32, "noise": True}
+    names = ["tracking", "image"]
+    export(episodes, folder, observation=names, task_kwargs={"fluoroscopy": size})
+    dataset = minari.MinariDataset(folder / "data")
+    assert dataset.total_steps == 6 + 5
+    for episode, data in zip(episodes, dataset.iterate_episodes(), strict=True):
+        np.testing.assert_array_equal(data.actions, episode.action)
+        np.testing.assert_allclose(data.rewards, episode.reward, atol=1e-9)
+        forces = data.infos["wall_force_max"][1:]
+        np.testing.assert_allclose(forces, episode.wall_force_max, atol=1e-9)
+        heads = data.observations["tracking_points"][:, -3:]
+        np.testing.assert_allclose(heads, episode.head, atol=1e-4)
+        assert data.observations["image"].shape == (episode.steps + 1, 32, 32, 1)
+        assert data.truncations.tolist() == [False] * (episode.steps - 1) + [True]
+        assert not data.terminations.any() and data.actions.dtype == np.float32
+    again = dataset.recover_environment()
+    first = next(dataset.iterate_episodes()).observations["tracking_points"][0]
+    shown = again.reset(seed=3)[0]["tracking_points"]
+    np.testing.assert_array_equal(shown, first)
+
+
+def test_what_cannot_be_repeated_is_refused(episodes, tmp_path):
+    first, second = episodes
+    other = dataclasses.replace(second, task="type1_lcca")
+    moved = dataclasses.replace(first, reward=first.reward + 1e-3)
+    for given, options, message in (
+        ([], {}, "0 episodes"),
+        ([first, other], {}, "of its own"),
+        ([dataclasses.replace(first, seed=None)], {}, "seed None"),
+        ([moved], {}, "does not repeat"),
+        ([first], {"max_steps": 2}, "ends at step 1 instead of 5"),
+        ([first], 3, "task_kwargs is 3"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            export(given, tmp_path / "x", task_kwargs=options)
+    with pytest.raises(FileExistsError):
+        export(episodes, tmp_path)
+    assert not (tmp_path / "x").exists()

@@ -1,0 +1,103 @@
+"""MuJoCo's cameras: seen with software OpenGL, refused in words without any."""
+
+import os
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+from conftest import twin
+
+from cathsim_dmc import suite
+from cathsim_dmc.tasks.cameras import FARTHEST, CameraOptions
+
+PROBE = "import mujoco as m; m.Renderer(m.MjModel.from_xml_string('<mujoco/>'), 8, 8)"
+SEEING = """
+import sys
+import numpy as np
+from cathsim_dmc import suite
+from cathsim_dmc.simulation.batch import BatchSimulation
+
+task, away = sys.argv[1], {}
+options = {
+    "observation": ["rgb", "depth", "endoluminal_distance"],
+    "cameras": {"names": ["top", "tip"], "size": [30, 40]},
+    "endoluminal_size": [30, 40],
+}
+env = suite.load("cathsim", task, {"random": 3, **options})
+batch = BatchSimulation(suite.make_task(task, **options), 2, seeds=2)
+first, seen = env.reset().observation, batch.reset().observation
+action = np.zeros(batch.num_actions)
+action[[0, 2] if task.endswith("_pair") else -1] = 1.0
+for _ in range(5):
+    mine = env.step(action).observation
+    seen = batch.step(np.tile(action, (2, 1))).observation
+for key, value in mine.items():
+    env.observation_spec()[key].validate(value)
+    # Both paths see the same, whoever renders in between.
+    np.testing.assert_array_equal(seen[key][1], value, err_msg=key)
+    assert (seen[key][0] != value).any()
+assert mine["rgb"].shape == (30, 40, 6) and mine["depth"].shape == (30, 40, 2)
+assert (mine["rgb"].std((0, 1)) > 1).all() and (mine["rgb"] != first["rgb"]).any()
+top, tip = np.moveaxis(mine["depth"], -1, 0)
+# The distance of the top camera from what it sees of the arch.
+surface = env.task.scene.anatomy.surface.vertices
+camera = env.physics.data.cam_xpos[env.physics.model.ptr.camera("top").id]
+assert abs(top.min() - np.abs(surface[:, 1] - camera[1]).min()) < 0.01
+# The endoscope sees the wall and not the device: what rays through the lumen meet.
+along = mine["endoluminal_distance"][..., 0]
+row, column = np.mgrid[:30, :40] - np.array([14.5, 19.5])[:, None, None]
+along = along / np.sqrt(1 + (row**2 + column**2) / 15**2)
+assert np.median(np.abs(tip - along)) < 0.3e-3, np.median(np.abs(tip - along))
+snapshot = env.snapshot()
+env.step(action)
+np.testing.assert_array_equal(env.restore(snapshot).observation["rgb"], mine["rgb"])
+print("seen")
+"""
+
+
+def python(*arguments):
+    environment = {**os.environ, "MUJOCO_GL": "osmesa", "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["type1_bca", "type1_bca_pair"])
+def test_cameras_see_what_they_should(task):
+    if python(PROBE).returncode:
+        pytest.skip("no software OpenGL (OSMesa) here")
+    done = python(SEEING, task)
+    assert "seen" in done.stdout, done.stderr
+
+
+def test_without_opengl_the_message_says_what_to_do(shared_environment, monkeypatch):
+    def fail(*_):
+        raise OSError("no display")
+
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    task = twin(shared_environment("simple1_bca").task, observation="rgb")
+    with pytest.raises(ValueError, match="MUJOCO_GL.*no display.*osmesa.*segmentation"):
+        suite.environment(task).reset()
+
+
+def test_what_cameras_cannot_show_is_refused(shared_environment):
+    for options in ({"vessel": "living"}, {"arches": "test", "pool": 2}):
+        name = "arch_lcca" if "pool" in options else "simple1_bca"
+        with pytest.raises(ValueError, match="one anatomy at rest.*endoluminal"):
+            suite.make_task(name, observation="depth", **options)
+
+
+@pytest.mark.parametrize("names", ["back", [], ["top", "top"], [1], 3, None])
+def test_names_of_cameras_are_checked(names):
+    with pytest.raises(ValueError, match="different ones of top, side, tip"):
+        CameraOptions(names)
+
+
+def test_specs_follow_the_options():
+    options = {"names": ["tip", "side"], "size": (20, 30)}
+    task = suite.make_task("simple1_bca", observation=["rgb", "depth"], cameras=options)
+    specs = task.observation_specs
+    assert specs["rgb"].shape == (20, 30, 6) and specs["rgb"].dtype == np.uint8
+    assert specs["depth"].shape == (20, 30, 2) and specs["depth"].maximum == FARTHEST
