@@ -185,9 +185,9 @@ def signatures():
     material = named(compliance.Material, REAL, REAL, REAL)
     rule = named(compliance.Law, one, one, REAL)
     links = named(compliance.Links, indices, one, one)
-    servos = named(drive.Servos, *[indices] * 3, *[one] * 5)
+    servos = named(drive.Servos, *[indices] * 3, *[one] * 6)
     state = named(drive.State, two, two, two)
-    told = named(drive.Told, two, two, two)
+    told = named(drive.Told, two, two)
     shape = named(springs.Springs, one, one)
     memory = named(springs.Scratch, one, bends, two)
     return {
@@ -216,7 +216,8 @@ def signatures():
         compliance.write_contacts: (
             *(one, material, links, types.UniTuple(rule, 2), two, two),
         ),
-        drive.follow: (servos, state, two, told),
+        drive.slip: (servos, state, two),
+        drive.follow: (servos, state, two, two, told, two),
     }
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import MAX_ROTATION_SPEED
-from cathsim_dmc.validation import rod
+from cathsim_dmc.validation import platforms, rod
 from cathsim_dmc.validation.rig import Rig
 
 
@@ -93,3 +93,9 @@ def test_the_drive_holds_and_is_exact_until_its_clamp_slips():
     # What has slipped follows the next command at once.
     driven.move(0.2, 0.0, 0.0)
     assert driven.move(0.4, 0.5, 0.0) == pytest.approx(0.2 * 0.04, rel=0.05)
+
+
+def test_platforms_start_stop_and_reverse_smoothly():
+    """The base ran at 3.5 times its largest speed, and was pulled back by 0.5 mm."""
+    found = list(platforms.checks())
+    assert len(found) == 9 and all(one.passed for one in found), found

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc.entities import contact
-from cathsim_dmc.validation import convergence, friction, pair, wall
+from cathsim_dmc.validation import convergence, friction, pair, s_bend, wall
 from cathsim_dmc.validation.rig import tube as straight_tube
 
 
@@ -41,6 +41,13 @@ def test_sliding_does_not_lift_a_device_off_the_wall():
     acting, ripple = friction.slid(pair.PAIR, 0.02, 0.04)
     assert acting == pytest.approx(contact.FRICTION, rel=0.05)
     assert ripple < 0.05
+
+
+@pytest.mark.slow
+def test_a_device_that_stops_in_an_s_bend_keeps_its_push():
+    """It kept 14 to 60 % of it, with friction of the wrong sign."""
+    found = list(s_bend.checks())
+    assert len(found) == 5 and all(one.passed for one in found), found
 
 
 def test_a_tube_passes_the_checks_of_the_lumen_a_false_field_and_a_narrow_one_fail():

@@ -27,10 +27,11 @@ TORSION_ARMATURE = 1e-7
 CARRIAGE_MASS = 0.2  # kg, platform of the follower that pushes the device
 MAX_PUSH_FORCE = 5.0  # N, slip of the clamps
 MAX_PUSH_SPEED = 0.04  # m/s
-# Stiffness of the servo of the carriage, N/m. The largest force moves the carriage in a
-# time step of 4 ms by less than the servo's linear range, F/k = 0.5 mm, or the force
-# would jump from one limit to the other.
-CARRIAGE_STIFFNESS = 1e4
+# Largest acceleration of the platforms, m/s² and rad/s², at a reversal of the full
+# speed; a start or a stop has half of it. No figure of the robot was found: assumed,
+# half of gravity for the carriage.
+MAX_PUSH_ACCELERATION = 5.0
+MAX_ROTATION_ACCELERATION = 150.0
 
 # Damping ratio of the carriage on the spring at the base. The links are rigid; the
 # spring has the axial compliance of the whole device, L / EA. Without it a jam stops
@@ -44,12 +45,20 @@ STEERING_LAG = 0.2
 ROTOR_INERTIA = 1e-4  # kg·m², rotary unit: a 0.3 kg clamp of 2 cm
 MAX_TORQUE = 0.02  # N·m, slip of the clamps
 MAX_ROTATION_SPEED = 3.14  # rad/s
-ROTATION_STIFFNESS = 0.4  # N·m/rad, of the servo
-SERVO_DAMPING = 1.0  # of the critical damping: the speed does not overshoot
 
 _VISIBLE_SHAFT = 0.45  # m, drawn behind the simulated part at full insertion
 COLOUR = (0.85, 0.32, 0.08, 1.0)
 TIP_COLOUR = (0.95, 0.75, 0.1, 1.0)
+
+
+def servo_stiffness(inertia: float, speed: float, acceleration: float) -> float:
+    """Stiffness of a critically damped servo by its platform's limits, N/m or N·m/rad.
+
+    Such a platform is accelerated by 2 v √(K/m) / e at most where its command turns
+    from one speed v to the other. The servo must be so soft that its largest force F
+    moves the platform within a physics step by less than F/K.
+    """
+    return inertia * (np.e * acceleration / (2 * speed)) ** 2
 
 
 def hinge_time(material: Any, timestep: float) -> Any:
@@ -253,14 +262,15 @@ class Chain(composer.ModelWrapperEntity):
                 lag = {"dyntype": "filterexact", "dynprm": [STEERING_LAG]}
                 tip.append(drives.add("general", **motor, **lag, gainprm=[torque]))
         servos = []
-        for joint, stiffness, speed, effort in (
-            (self.insertion, CARRIAGE_STIFFNESS, MAX_PUSH_SPEED, MAX_PUSH_FORCE),
-            (self.rotation, ROTATION_STIFFNESS, MAX_ROTATION_SPEED, MAX_TORQUE),
-        ):
+        push = MAX_PUSH_SPEED, MAX_PUSH_ACCELERATION, MAX_PUSH_FORCE
+        turn = MAX_ROTATION_SPEED, MAX_ROTATION_ACCELERATION, MAX_TORQUE
+        for joint, limits in ((self.insertion, push), (self.rotation, turn)):
             if joint is None:
                 continue
-            # On the integral of a speed, see `physics.drives`.
-            damping = 2 * SERVO_DAMPING * (stiffness * joint.armature) ** 0.5
+            speed, acceleration, effort = limits
+            # On the integral of a speed, see `laws.drive`.
+            stiffness = servo_stiffness(joint.armature, speed, acceleration)
+            damping = 2 * (stiffness * joint.armature) ** 0.5
             servos.append(
                 drives.add(
                     "general",

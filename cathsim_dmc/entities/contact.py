@@ -18,7 +18,7 @@ CONTACT_SOLREF = (-1 / _CONTACT_TIME**2, -18 / _CONTACT_TIME)
 CONTACT_SOLIMP = (0.02, 0.95, 0.0002, 0.01, 2)
 # Friction below its limit is a stiff damper in MuJoCo: what sticks creeps by its
 # compliance, which is that of the normal force over this ratio.
-FRICTION_STIFFNESS = 20.0
+FRICTION_STIFFNESS = 200.0
 # Attributes of a geom that is there to be seen only.
 DRAWN = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
 

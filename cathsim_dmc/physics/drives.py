@@ -3,6 +3,7 @@
 `laws.drive` has the law.
 """
 
+import math
 import types
 from typing import Any
 
@@ -18,28 +19,33 @@ class Drives:
 
     Attributes:
         slipped: (N, D), way by which each clamp has slipped in the episode, m and rad.
-        told: (N, D), place to which each base has been told to go, m and rad.
+        told: (N, D), place at which each base comes to rest without a further command,
+            m and rad; it is that far behind in motion.
     """
 
     def __init__(self, model: mujoco.MjModel, arrays: Any):
-        """Finds the servos; the arrays are views, `qpos`, `qvel` and `act` (N, ...)."""
+        """Finds the servos; the arrays are views (N, ...) of MuJoCo's."""
         found = np.flatnonzero(
             model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR.value
         )
         joints = model.actuator_trnid[found, 0]
-        self._arrays = arrays
+        self._arrays, dofs = arrays, model.jnt_dofadr[joints]
         gain, spring = model.actuator_gainprm[found, 0], model.actuator_biasprm[found]
-        stiffness = -spring[:, 1]
+        stiffness, speed = -spring[:, 1], gain / -spring[:, 1]
+        # A step of the spring by s moves a critically damped mass with s √(K/m) / e.
+        rise = np.sqrt(stiffness * model.dof_armature[dofs]) * speed * math.e
         self._servos = drive.Servos(
             qpos=model.jnt_qposadr[joints],
-            dof=model.jnt_dofadr[joints],
+            dof=dofs,
             act=model.actuator_actadr[found],
             gain=gain.copy(),
             stiffness=stiffness,
-            damping=-spring[:, 2],
+            damping=model.opt.timestep * stiffness - spring[:, 2],
             limit=model.actuator_forcerange[found, 1],
-            reach=gain / stiffness * CONTROL_TIMESTEP,
+            reach=speed * CONTROL_TIMESTEP,
+            rise=rise,
         )
+        self._sensed = np.array([_load_sensor(model, joint) for joint in joints])
         self.slipped, self.told = np.zeros((2, len(arrays.qpos), len(found)))
 
     def hold(self, index: int) -> None:
@@ -50,25 +56,49 @@ class Drives:
         self.told[index] = place
         self.slipped[index] = 0.0
 
-    def follow(self, command: np.ndarray) -> np.ndarray:
-        """Corrects the servos for their loads, before a control step.
+    def resting(self) -> np.ndarray:
+        """Places (N, D) at which the bases come to rest, where clamps have slipped."""
+        slip = np.empty_like(self.told)
+        drive.slip(self._servos, self._state(), slip)
+        return self.told - slip
+
+    def follow(self, command: np.ndarray, load: np.ndarray | None = None) -> np.ndarray:
+        """Lets clamps slip and makes up for loads, before a control step.
 
         Args:
             command: (N, D) in [-1, 1], of the control step to come.
+            load: (N, D), force of each platform on its device, N and N·m; that of the
+                sensors if None.
 
         Returns:
             Way (N, D) by which the clamps have slipped in the last one, m and rad.
         """
-        arrays, slip = self._arrays, np.zeros_like(self.told)
-        state = drive.State(arrays.qpos, arrays.qvel, arrays.act)
-        told = drive.Told(self.told, self.slipped, slip)
-        drive.follow(self._servos, state, np.ascontiguousarray(command), told)
+        slip, told = np.empty_like(self.told), drive.Told(self.told, self.slipped)
+        if load is None:
+            load = self._arrays.sensordata[:, self._sensed]
+        command, load = map(np.ascontiguousarray, (command, load))
+        drive.follow(self._servos, self._state(), command, load, told, slip)
         return slip
+
+    def _state(self) -> drive.State:
+        arrays = self._arrays
+        return drive.State(arrays.qpos, arrays.qvel, arrays.act)
 
 
 def hold(model: mujoco.MjModel, data: mujoco.MjData) -> Drives:
     """The drives of one simulation, whose commands are set to where the bases stand."""
-    arrays = {name: getattr(data, name)[None] for name in ("qpos", "qvel", "act")}
+    names = ("qpos", "qvel", "act", "sensordata")
+    arrays = {name: getattr(data, name)[None] for name in names}
     drives = Drives(model, types.SimpleNamespace(**arrays))
     drives.hold(0)
     return drives
+
+
+def _load_sensor(model: mujoco.MjModel, joint: int) -> int:
+    """Place among `sensordata` of the force or torque of a platform on its device."""
+    slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE.value
+    kind = mujoco.mjtSensor.mjSENS_FORCE if slides else mujoco.mjtSensor.mjSENS_TORQUE
+    bodies = model.site_bodyid[model.sensor_objid * (model.sensor_type == kind.value)]
+    measures = (model.sensor_type == kind.value) & (bodies == model.jnt_bodyid[joint])
+    # Its site has the axes of the device, whose z is that of the joint.
+    return int(model.sensor_adr[np.flatnonzero(measures)[0]]) + 2

@@ -86,7 +86,9 @@ class SingleDevice(Effect):
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Lets clamps slip; turns motors against the twist of the links."""
         motors = len(self.world.chain.tip_motors)
-        self._drives.follow(action[:, motors:])
+        load = np.stack([state.push_force, state.push_torque], axis=1)
+        command = action[:, motors:]
+        self._drives.follow(command, load[:, : command.shape[1]])
         if not motors:
             return action
         angles = self.world.arrays.qpos[:, self._bends_qpos]
@@ -204,7 +206,7 @@ class SlidingDevices(SingleDevice):
         Returns:
             Control (N, 1) of the chain's motor.
         """
-        reached = self._qpos[:, self._index.insertion_qpos].copy()
+        reached = self._drives.resting()[:, 0]
         before, step = self._pushed(), MAX_PUSH_SPEED * CONTROL_TIMESTEP
         leaders = np.argmax(self._insertion, axis=1)
         told = step * action[:, 0::2]
@@ -220,7 +222,8 @@ class SlidingDevices(SingleDevice):
         self._insertion[:] = target
         self._settle(action[:, 1::2], lead, state)
         command = ((lead - reached) / step)[:, None]
-        slip = np.abs(self._drives.follow(command)[:, 0])
+        load = state.push_force[:, None] - self._others[:, None]
+        slip = np.abs(self._drives.follow(command, load)[:, 0])
         self.slipped[np.arange(len(before)), 2 * leaders] += slip
         return command
 
@@ -291,11 +294,14 @@ class SlidingDevices(SingleDevice):
     # What others may read.
 
     def _pushed(self) -> np.ndarray:
-        """Insertion (N, K): leading devices as measured, the others as commanded, m."""
-        reached = self._qpos[:, self._index.insertion_qpos].copy()
+        """Insertion (N, K) at which the devices come to rest, m."""
+        return self._with_leaders_at(self._drives.resting()[:, 0])
+
+    def _with_leaders_at(self, place: np.ndarray) -> np.ndarray:
+        """Insertion (N, K): of leading devices (N,), the others as commanded, m."""
         told = np.ascontiguousarray(self._insertion)
         where = np.empty_like(told)
-        sliding.held(told, reached, where)
+        sliding.held(told, np.ascontiguousarray(place), where)
         return where
 
     def follower_posture(self) -> np.ndarray:
@@ -304,14 +310,16 @@ class SlidingDevices(SingleDevice):
         Of more than two devices it holds the outermost and the innermost; of one, both
         units work on the same.
         """
-        pushed, turned = self._pushed(), self._angles[..., 0]
+        reached = self._qpos[:, self._index.insertion_qpos]
+        pushed, turned = self._with_leaders_at(reached), self._angles[..., 0]
         ends = (pushed[:, -1], turned[:, -1], pushed[:, 0], turned[:, 0])
         return postures(np.array(ends))
 
     def read(self, readings: Readings) -> CoaxialReadings:
         """State of the devices at readings of the same control step."""
-        insertion, nodes = self._pushed(), self._stack.nodes
-        gaps, push = _gaps(insertion), self._axial.copy()
+        insertion, nodes = self._with_leaders_at(readings.insertion), self._stack.nodes
+        # In motion the chain is behind its command, with all devices in it.
+        gaps, push = _gaps(self._pushed()), self._axial.copy()
         push[np.arange(len(gaps)), gaps.argmin(axis=1)] += readings.push_force
         line, load = readings.centreline, readings.push_force.copy()
         if gaps.shape[1] > 1:

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from cathsim_dmc.entities import chain, devices
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
-from cathsim_dmc.validation import damping, theory
+from cathsim_dmc.validation import damping, platforms, theory
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import RESTING_TIME, Rig
 
@@ -315,6 +315,7 @@ def _checks(data: dict[str, Any]) -> Iterator[Check]:
     yield Check.deviation(name, moved, chain.MAX_PUSH_SPEED, SPEED_BOUND, "m/s")
     name = "drive, force at which the clamp slips"
     yield Check.deviation(name, slip_force(), chain.MAX_PUSH_FORCE, SLIP_BOUND, "N")
+    yield from platforms.checks()
     yield from damping.checks()
 
 

@@ -13,7 +13,7 @@ from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 from cathsim_dmc.entities import devices
 from cathsim_dmc.laws.field import FREE
-from cathsim_dmc.validation import convergence, friction, pressed
+from cathsim_dmc.validation import convergence, friction, pressed, s_bend
 from cathsim_dmc.validation.checks import Check, Report
 
 # Bounds (mm) on the difference between the field and the distance that it stands for,
@@ -101,6 +101,7 @@ def validate_wall() -> Report:
     checks = itertools.chain(
         *map(lumen_checks, anatomies),
         friction.checks(pulled),
+        s_bend.checks(),
         pressed.push_checks(),
         convergence.checks(studies),
     )

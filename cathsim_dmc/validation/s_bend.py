@@ -1,0 +1,177 @@
+"""Push force of a device that has stopped in an S-bend, and how it creeps away.
+
+The reference is an elastica of its own in the same tube, whose every contact slides.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import root
+
+from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
+from cathsim_dmc.physics.drives import hold
+from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
+from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.rig import Rig
+
+SPEEDS, FRICTIONS = (0.01, 0.04), (0.037, 0.1)  # m/s; Coulomb
+STOPPED_BOUND = 5.0  # % of the push force
+CREEP_BOUND = 5.0  # % of the push force, in `_HELD`
+BEND, ANGLE, TUBE = 0.04, np.pi / 3, 3e-3  # m, rad, m
+# Longer links push wrongly in a bend without friction (docs/limits.md).
+LINK = 5e-3  # m
+# Ways of the head before the bend, and of the base, after which the head is in the
+# second arc; of the rod behind the bend, m.
+_BEFORE, _PUSH, _BEHIND = 0.01, 0.056, 0.03
+_RESTING, _HELD = 1.0, 1.0  # s
+_PIECE = 1e-3  # m, of the reference
+# Stiffness of the wall of the reference, N/m for each piece, which it takes in steps.
+_WALLS = (0.5, 5.0, 50.0, 500.0)
+
+
+class _Line:
+    """The axis of an S-bend in the plane of x and z, between straight ends."""
+
+    def __init__(self, start: float):
+        """Begins the bend at z = start, m."""
+        c, s = 1 - np.cos(ANGLE), np.sin(ANGLE)
+        corners = BEND * np.array([[0, 0], [c, s], [2 * c, 2 * s]]) + (0.0, start)
+        self._start, self._middle, self._end = corners
+        self._centres = self._start + (BEND, 0.0), self._end - (BEND, 0.0)
+
+    def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Offsets (...) to the right of points (..., 2), m, and tangents (..., 2)."""
+        across = points - self._middle
+        second = across[..., 0] * np.sin(ANGLE) + across[..., 1] * np.cos(ANGLE) > 0
+        straight = np.where(second, self._end[0], 0.0)
+        offset, tangent = points[..., 0] - straight, np.zeros_like(points)
+        tangent[..., 1] = 1.0
+        first = ~second & (points[..., 1] > self._start[1])
+        second &= points[..., 1] < self._end[1]
+        for centre, side, chosen in zip(
+            self._centres, (1, -1), (first, second), strict=True
+        ):
+            way = points[chosen] - centre
+            radius = np.linalg.norm(way, axis=-1)
+            offset[chosen] = side * (BEND - radius)
+            tangent[chosen] = side * way[..., ::-1] * (1, -1) / radius[..., None]
+        return offset, tangent
+
+
+class Stopped(NamedTuple):
+    """Push forces of a device in an S-bend, N."""
+
+    moving: float  # in the last control step of the push
+    stopped: float  # at rest
+    held: float  # some time later
+    expected: float  # of the rod whose contacts slide
+
+
+def stopped(speed: float, friction: float, later: float = 0.0) -> Stopped:
+    """Pushes a device into an S-bend, stops it, and waits.
+
+    Args:
+        speed: Of the base, m/s.
+        friction: Coulomb coefficient.
+        later: Time from rest to the last reading, s.
+    """
+    uniform = dataclasses.replace(
+        devices.STEERABLE_5F,
+        tip=devices.STEERABLE_5F.shaft,
+        tip_links=round(devices.STEERABLE_5F.tip_length / LINK),
+        steering_angle=0.0,
+    )
+    length = _BEHIND + _PUSH + uniform.tip_length
+    fine = devices.Discretisation(length, LINK)
+    rig = Rig(uniform, fine, stroke=_PUSH + 0.01, friction=friction)
+    line = _Line(_BEFORE)
+
+    def depth(blocks: np.ndarray, points: np.ndarray) -> np.ndarray:
+        places = blocks[:, None, :] + points
+        offset, _ = line.nearest(places[..., ::2])
+        return TUBE - np.hypot(offset, places[..., 1])
+
+    low, high = (-TUBE, -TUBE, -length), (0.05, TUBE, 0.1)
+    rig.add_wall(depth, low, high, friction)
+    rig.compile()
+    drives = hold(rig.model, rig.data)
+    motor = rig.data.actuator(f"{rig.name}/insertion")
+
+    def push(command: float, duration: float) -> float:
+        """Push force in the last of some control steps, N."""
+        found = 0.0
+        for _ in range(round(duration / CONTROL_TIMESTEP)):
+            drives.follow(np.array([[command]]))
+            motor.ctrl[0] = command
+            rig.run(CONTROL_TIMESTEP)
+            found = float(rig.sensor(f"{rig.name}/push_force")[2])
+        return found
+
+    moving = push(speed / MAX_PUSH_SPEED, _PUSH / speed)
+    rest, held = push(0.0, _RESTING), push(0.0, later)
+    return Stopped(moving, rest, held, _reference(rig, line, friction))
+
+
+def _reference(rig: Rig, line: _Line, friction: float) -> float:
+    """Axial force on a uniform rod that slides on where the device is, N.
+
+    Pieces of a length h have the angles θ and end at p. With forces f on the ends, the
+    work of EI θ'' h and that of f vanish for each angle, h (cos θ, -sin θ)·Σf.
+    """
+    lengths, stiffness, _ = rig.sections
+    base = rig.lengths[0] / 2 - rig.lengths.sum() + rig.qpos("insertion")
+    count = round(float(lengths.sum()) / _PIECE)
+    piece, gap = lengths.sum() / count, TUBE - rig.device.outer_radius
+    spring = np.full(count, 2.0)
+    spring[-1] = 1.0
+    bends = np.diag(spring) - np.diag(np.ones(count - 1), 1)
+    bends = stiffness[0] / piece * (bends - np.diag(np.ones(count - 1), -1))
+    later = np.maximum.outer(np.arange(count), np.arange(count))
+
+    def balance(angles: np.ndarray, wall: float):
+        """Moments (n,), their rates (n, n) on a wall that is flat, and Σf (2,)."""
+        steps = piece * np.stack([np.sin(angles), np.cos(angles)], axis=-1)
+        across = steps[:, ::-1] * (1, -1)
+        offset, tangent = line.nearest(np.cumsum(steps, axis=0) + (0.0, base))
+        outwards = np.sign(offset)[:, None] * tangent[:, ::-1] * (1, -1)
+        acting = -outwards - friction * tangent
+        deep = np.maximum(np.abs(offset) - gap, 0.0)[:, None]
+        force = np.cumsum((wall * deep * acting)[::-1], axis=0)[::-1]
+        slope = wall * (deep > 0)[..., None] * acting[..., None] * outwards[:, None]
+        slope = np.cumsum(slope[::-1], axis=0)[::-1]
+        moments = bends @ angles - (across * force).sum(axis=1)
+        rates = bends - np.einsum("ia,ikab,kb->ik", across, slope[later], across)
+        rates += np.diag((steps * force).sum(axis=1))
+        return 1e6 * moments, 1e6 * rates, force[0]
+
+    angles = np.zeros(count)
+    for wall in _WALLS:
+        found = root(
+            lambda x, wall=wall: balance(x, wall)[:2], angles, method="lm", jac=True
+        )
+        if not np.abs(found.fun).max() < 1e-4:
+            raise RuntimeError(f"the rod of the reference: {found.message}")
+        angles = found.x
+    return -float(balance(angles, _WALLS[-1])[2][1])
+
+
+def checks() -> Iterator[Check]:
+    """Push forces after a stop, and what is left of the last one."""
+    for friction in FRICTIONS:
+        for speed in SPEEDS:
+            creeps = friction == FRICTIONS[-1] and speed == SPEEDS[-1]
+            one = stopped(speed, friction, _HELD if creeps else 0.0)
+            note = f"{1e3 * one.stopped:.2f} mN, {1e3 * one.moving:.2f} mN moving, "
+            note += f"expected {1e3 * one.expected:.2f} mN"
+            name = f"S-bend, friction {friction:g}: push after a stop "
+            name += f"from {1e3 * speed:g} mm/s"
+            forces = one.stopped, one.expected
+            yield Check.deviation(name, *forces, STOPPED_BOUND, "N", note)
+            if creeps:
+                name = f"S-bend: change of the push by creep in {_HELD:g} s"
+                note = f"{1e3 * one.stopped:.2f} mN, then {1e3 * one.held:.2f} mN"
+                forces = one.held, one.stopped
+                yield Check.deviation(name, *forces, CREEP_BOUND, "N", note)
