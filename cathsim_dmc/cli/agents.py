@@ -204,7 +204,8 @@ def print_episodes(result: EvaluationResult) -> None:
 def _outcome(
     seed: int, conditions: Mapping[str, Any], episode: EpisodeOutcome
 ) -> dict[str, str]:
-    end = "goal reached" if episode.success else "out of time"
+    missed = "given up" if episode.given_up else "out of time"
+    end = "goal reached" if episode.success else missed
     forces = episode.forces
     return {
         "seed": str(seed),
