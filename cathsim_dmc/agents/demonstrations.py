@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from cathsim_dmc import bounds, extras, suite
 from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.agents.replayed import recordings_in, replayed
 from cathsim_dmc.policies import View
 from cathsim_dmc.policies.expert import ExpertPolicy
 from cathsim_dmc.recording import dataset
@@ -192,6 +193,8 @@ def load_transitions(
     """Transitions of a dataset's successful episodes, as a collector gives them.
 
     Args:
+        path: Directory of a dataset, or of episodes as `cathsim play --out` writes
+            them, which are played again (`replayed.replayed`).
         observation: Name or names of the observations that the networks read; the
             dataset may hold others beside them.
         **options: As for `read_episodes`.
@@ -207,7 +210,11 @@ def load_transitions(
         ModuleNotFoundError: minari is not installed.
     """
     names = observations.resolve(observation)
-    episodes = [_tensors(path, e, names) for e in read_episodes(path, **options)]
+    by_hand = bool(recordings_in(path))
+    read = (
+        replayed(path, names, **options) if by_hand else read_episodes(path, **options)
+    )
+    episodes = [_tensors(path, e, names) for e in read]
     succeeded = [one for one in episodes if one is not None]
     if not succeeded:
         raise DatasetError(f"none of the {len(episodes)} episodes in {path} succeeds")

@@ -378,11 +378,12 @@ def play(
     episodes: int | None = None,
     speed: float = 1.0,
     policy: str | None = None,
+    hands: Literal["keyboard", "gamepad", "spacemouse"] = "keyboard",
     modules: Modules = (),
     *,
     options: Options,
 ) -> int:
-    """Cannulate by keyboard, with the forces on the screen.
+    """Cannulate by hand, with the forces on the screen.
 
     Args:
         out: Directory for the episodes as demonstrations (.npz).
@@ -391,10 +392,13 @@ def play(
         speed: Speed of the simulation, in multiples of real time.
         policy: Policy to watch instead of playing yourself: directory of a run or of
             a checkpoint, or name of a policy, such as "pretrained:type1_bca".
+        hands: What you hold (extra `hands`): a gamepad vibrates with the largest
+            contact; the keys act beside it.
         options: Options of the task.
     """
     player = agents.load_policy(policy, seed) if policy else None
     how: Any = {"seed": seed, "episodes": episodes, "speed": speed, "policy": player}
+    how["hands"] = hands
     for path in by_hand.play(task, out, task_kwargs=options.given, **how):
         print(path)
     return 0
