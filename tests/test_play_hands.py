@@ -308,18 +308,17 @@ def test_episodes_of_a_hand_are_demonstrations(by_hand, tmp_path, cathsim):
 def test_an_episode_that_leads_elsewhere_is_refused(by_hand, tmp_path):
     import dataclasses
 
-    from cathsim_dmc.agents.replayed import replayed
-    from cathsim_dmc.recording.dataset import DatasetError
+    from cathsim_dmc.recording.dataset import DatasetError, repeat_episodes
 
     episode = Episode.load(by_hand / "simple1_bca_000.npz")
     for changed, said in (
-        ({"action": 0.9 * episode.action}, "lead elsewhere"),
-        ({"seed": None}, "no seed"),
+        ({"action": 0.9 * episode.action}, "does not repeat"),
+        ({"seed": None}, "the seed None"),
         ({"task": "simple1_bc"}, "no demonstration"),
     ):
         dataclasses.replace(episode, **changed).save(tmp_path / "a.npz")
         with pytest.raises(DatasetError, match=said):
-            list(replayed(tmp_path, "tracking"))
+            list(repeat_episodes(tmp_path, "tracking"))
     (tmp_path / "a.npz").write_bytes(b"nothing")
     with pytest.raises(DatasetError, match="no demonstration"):
-        list(replayed(tmp_path, "tracking"))
+        list(repeat_episodes(tmp_path, "tracking"))

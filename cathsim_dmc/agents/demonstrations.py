@@ -14,11 +14,14 @@ from tensordict import TensorDict, TensorDictBase
 
 from cathsim_dmc import bounds, extras, suite
 from cathsim_dmc.agents.networks import NetworkShapes
-from cathsim_dmc.agents.replayed import recordings_in, replayed
 from cathsim_dmc.policies import View
 from cathsim_dmc.policies.expert import ExpertPolicy
 from cathsim_dmc.recording import dataset
-from cathsim_dmc.recording.dataset import DatasetError, read_episodes
+from cathsim_dmc.recording.dataset import (
+    DatasetError,
+    read_episodes,
+    recordings_in,
+)
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.simulation.episodes import play
@@ -194,7 +197,7 @@ def load_transitions(
 
     Args:
         path: Directory of a dataset, or of episodes as `cathsim play --out` writes
-            them, which are played again (`replayed.replayed`).
+            them, which are repeated.
         observation: Name or names of the observations that the networks read; the
             dataset may hold others beside them.
         **options: As for `read_episodes`.
@@ -210,10 +213,10 @@ def load_transitions(
         ModuleNotFoundError: minari is not installed.
     """
     names = observations.resolve(observation)
-    by_hand = bool(recordings_in(path))
-    read = (
-        replayed(path, names, **options) if by_hand else read_episodes(path, **options)
-    )
+    if recordings_in(path):
+        read = repeat_episodes(path, names, **options)
+    else:
+        read = read_episodes(path, **options)
     episodes = [_tensors(path, e, names) for e in read]
     succeeded = [one for one in episodes if one is not None]
     if not succeeded:
@@ -248,7 +251,8 @@ def _tensors(path: str | Path, episode: Any, names: Sequence[str]) -> TensorDict
     arrays = {key: torch.as_tensor(episode.observations[key]) for key in keys}
     seen = environments.standard(arrays, 1)
     steps = len(episode.actions)
-    done = episode.terminations.astype(bool) | episode.truncations.astype(bool)
+    ends, outs = np.asarray(episode.terminations), np.asarray(episode.truncations)
+    done = ends.astype(bool) | outs.astype(bool)
     chosen = episode.infos.get(EXPERT_ACTION, episode.actions)[:steps]
     return TensorDict(
         {
@@ -257,9 +261,9 @@ def _tensors(path: str | Path, episode: Any, names: Sequence[str]) -> TensorDict
             EXPERT_ACTION: torch.as_tensor(chosen).float(),
             "next": {
                 **{key: value[1:] for key, value in seen.items()},
-                "reward": torch.as_tensor(episode.rewards).float()[:, None],
+                "reward": torch.as_tensor(np.asarray(episode.rewards)).float()[:, None],
                 "done": torch.as_tensor(done)[:, None],
-                "terminated": torch.as_tensor(episode.terminations).bool()[:, None],
+                "terminated": torch.as_tensor(ends).bool()[:, None],
             },
         },
         batch_size=[steps],
