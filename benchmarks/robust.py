@@ -130,6 +130,7 @@ def play(policy: str, cell: Cell, player=None, threads: int | None = None) -> di
         "episodes": cell.episodes,
         "success": found.successes,
         "safe": [int((reached & (sums <= limit)).sum()) for limit in SAFE_FORCES],
+        "given_up": sum(one.given_up for one in found.episodes),
         "steps": round(float(found.values("length").mean()), 1),
         "mean_force": round(float(found.values("forces.mean_force").mean()), 6),
         "largest_sum": round(float(sums.max()), 4),

@@ -8,11 +8,10 @@ from hypothesis import strategies as st
 
 from cathsim_dmc import agents, policies, suite
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.readings import part
 from cathsim_dmc.policies import attempts, pursuit
-from cathsim_dmc.policies.attempts import State
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.retry import Memory
 from cathsim_dmc.tasks.route import Place, locate
 
 TASKS = (
@@ -135,15 +134,20 @@ def test_beside_the_ostium_the_head_is_still_in_the_parent(task, plan):
 def test_many_act_as_each_alone(task, plan):
     simulation = jiggled(task, 3, 20)
     readings, wall_force = simulation.rollout.readings, simulation.rollout.wall_force
+    memory = simulation.rollout.memory
+    memory = memory._replace(retracting=np.array([False, True, False]))
     together, alone = plan.fresh((3,)), [plan.fresh(()) for _ in range(3)]
     for _ in range(3):
-        action, together = plan.decide(plan.settings, together, readings, wall_force)
+        action, together = plan.decide(
+            plan.settings, together, memory, readings, wall_force
+        )
         assert action.shape == (3, plan.num_actions)
         assert np.abs(action).max() <= 1.0
         for index in range(3):
             own, alone[index] = plan.decide(
                 plan.settings,
                 alone[index],
+                part(memory, index),
                 part(readings, index),
                 part(wall_force, index),
             )
@@ -162,35 +166,42 @@ def test_bends_follow_the_leader(plan):
     np.testing.assert_allclose(half[:, :-1], (bend[:, :-1] + bend[:, 1:]) / 2)
 
 
-def test_a_head_that_stands_still_is_withdrawn_and_tried_again():
-    options = pursuit.Settings(patience=5)
-    state = State.fresh((2,), 10)
-    insertion, retracted = np.full(2, 0.08), []
-    for step in range(24):
-        # The first gains a millimetre a step, the second nothing.
-        arc = np.array([0.1 + 1e-3 * step, 0.1])
-        place = Place(arc, np.full(2, -0.5))
-        state = attempts.advance(options, state, place, insertion)
-        retracted.append(state.retracting.copy())
-        insertion = insertion - 1e-3 * state.retracting
-    retracted = np.array(retracted)
-    assert not retracted[:, 0].any()
-    assert state.attempts.tolist() == [0, 1]
-    begun, ended = np.flatnonzero(np.diff(retracted[:, 1].astype(int)))
-    assert begun == options.patience
-    assert (ended - begun) * 1e-3 == pytest.approx(options.backoff, abs=1.1e-3)
+def driven(settings, **values):
+    """Translation with a memory of two heads that stand on the route."""
+    place = Place(np.full(2, 0.1), np.full(2, -0.5))
+    memory = Memory.at(place, np.full(2, 0.08))
+    memory = memory._replace(**{k: np.array(v) for k, v in values.items()})
+    force = np.array([0.0, 1.0])
+    return attempts.translation(settings, memory, force, force, np.array([1.0, 1.0]))
 
 
-def test_pressing_on_the_wall_slows_the_device_down():
-    # In a straight vessel the tip points along the route.
-    simulation, options = jiggled(make_task("simple1_lcca"), 2, 1), pursuit.Settings()
-    plan = pursuit.Plan.for_case(simulation.rollout.case())
-    pressing = forces.WallForce(*[np.array([0.0, 1.0])] * 6)
-    action, _ = plan.decide(
-        options, plan.fresh((2,)), simulation.rollout.readings, pressing
-    )
-    assert action[0, 20] > 0.5 * options.speed
-    assert action[1, 20] == pytest.approx(options.speed * options.creep)
+def test_a_device_is_pressed_on_withdrawn_or_left_where_it_is():
+    settings = pursuit.Settings()
+    forward = driven(settings)
+    np.testing.assert_allclose(forward, [0.6, 0.6 * settings.creep])
+    # Stuck and misaligned it presses on, as long as wall and base feel little.
+    place = Place(np.full(2, 0.1), np.full(2, -0.5))
+    memory = Memory.at(place, np.zeros(2))._replace(stale=np.array([30, 30]))
+    pushes, none = np.array([0.0, 0.2]), np.zeros(2)
+    pressed = attempts.translation(settings, memory, none, pushes, none)
+    creep = settings.speed * settings.creep
+    np.testing.assert_allclose(pressed, [settings.speed * settings.press, creep])
+    # The tip is straightened before it is withdrawn.
+    back = driven(settings, retracting=[True] * 2, stale=[0, settings.straightening])
+    np.testing.assert_allclose(back, [0.0, -settings.withdrawal])
+    assert settings.withdrawal <= 0.25
+    assert not driven(settings, given_up=[True] * 2).any()
+
+
+def test_a_tip_is_straightened_before_it_is_withdrawn(task, plan):
+    simulation = jiggled(task, 1, 20)
+    rollout, state = simulation.rollout, plan.fresh((1,))
+    state = state._replace(bend=np.full((1, len(plan.tip), 2), 0.1))
+    memory = rollout.memory._replace(retracting=np.ones(1, bool))
+    seen = rollout.readings, rollout.wall_force
+    for _ in range(plan.settings.straightening):
+        action, state = plan.decide(plan.settings, state, memory, *seen)
+    assert np.abs(state.bend).max() < 0.1 * 0.1 and action[0, 20] == 0.0
 
 
 def test_reset_forgets_only_those_named(task):
@@ -249,7 +260,7 @@ def test_it_recovers_from_a_wrong_branch(task, to_bca):
         if step.terminated[0]:
             break
     assert step.outcome.success[0]
-    assert pilot.state.attempts[0] >= 1
+    assert simulation.rollout.memory.attempts[0] >= 1
 
 
 @pytest.mark.slow

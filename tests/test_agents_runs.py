@@ -5,17 +5,19 @@ import signal
 import subprocess
 import sys
 import types
+from dataclasses import replace
 
 import pytest
 import synthetic_env
 import torch
 from tensordict import TensorDict
 from test_agents_training import run, small_ppo, small_sac
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc.agents import Checkpoint, ConfigError, evaluate
 from cathsim_dmc.agents.learners import make_config
 from cathsim_dmc.agents.networks import NetworkShapes, make_policy
-from cathsim_dmc.agents.policies import load_policy
+from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 from cathsim_dmc.agents.replay import ReplayError
 from cathsim_dmc.agents.training import take_over
 from cathsim_dmc.agents.training_log import read_metrics
@@ -111,6 +113,28 @@ def test_a_policy_that_ships_starts_a_training():
         take_over(policy, config, NetworkShapes(3, None, 21))
     with pytest.raises(ConfigError, match="'expert' has no network"):
         take_over(policy, config.replace(initial_policy="expert"), source.shapes)
+
+
+def test_a_policy_that_observes_less_starts_a_training():
+    """At first the new one acts as it does, whatever the new entries are."""
+    source = load_policy("pretrained:navigator")
+    assert isinstance(source, TrainedPolicy)
+    wider = {"observation": ("route", "route_retry")}
+    name = {"initial_policy": "pretrained:navigator"}
+    config = source.config.replace(**wider, **name)
+    shapes = replace(source.shapes, vector=source.shapes.vector + 11)
+    policy = make_policy(shapes, config)
+    take_over(policy, config, shapes)
+    seen, more = torch.randn(5, source.shapes.vector), torch.rand(5, 11)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        expected = source.network(TensorDict({environments.VECTOR: seen}, [5]))
+        both = {environments.VECTOR: torch.cat([seen, more], -1)}
+        found = policy(TensorDict(both, [5]))
+    torch.testing.assert_close(found["action"], expected["action"])
+    # Those that come first, or take others away, are refused.
+    for other in (("force", "route"), ("tracking", "route_retry")):
+        with pytest.raises(ConfigError, match="does not fit .*observation: it has"):
+            take_over(policy, config.replace(observation=other), shapes)
 
 
 def test_a_start_that_fails_leaves_no_folder(tmp_path):

@@ -60,9 +60,10 @@ ALLOWED = {
     # The faces to the outside: everything but each other.
     "gym": _FACE,
     "play": _FACE | {"recording", "policies"},
+    "bridge": _FACE,
     "cli": _FACE
     | {"recording", "analysis", "validation", "policies", "agents"}
-    | {"play", "pictures"},
+    | {"play", "pictures", "bridge"},
 }
 _TORCHRL_FACE = ("simulation/torchrl.py", "simulation/environments.py")
 # Package -> files that may import it, wherever in the file the import stands.

@@ -46,6 +46,57 @@ def test_keys_do_what_those_of_the_window_do():
     assert f"const BEND_RATE = {BEND_RATE:g};" in text
 
 
+@needs_node
+def test_a_gamepad_holds_what_that_of_the_window_holds(tmp_path):
+    """The page's mapping, dead zone and vibration are those of `play.hands`."""
+    from cathsim_dmc.play import hands
+    from cathsim_dmc.play.controls import Controls
+
+    shutil.copy(PAGES / "gamepad.js", tmp_path / "gamepad.mjs")
+    shutil.copy(PAGES / "controls.js", tmp_path / "controls.mjs")
+    code = """
+import { Gamepads, leaning, strength, withoutRest } from "./gamepad.mjs";
+import { Controls } from "./controls.mjs";
+const buttons = [..."0123456789"].map(() => ({ value: 0, pressed: false }));
+const pad = { connected: true, mapping: "standard", axes: [0.3, -0.5, 0.9, -0.2],
+              buttons };
+Object.defineProperty(globalThis, "navigator", { value: { getGamepads: () => [pad] } });
+const controls = new Controls(2), gamepads = new Gamepads(), pressed = [];
+gamepads.poll(controls, (command) => pressed.push(command));
+const action = [...controls.action(0.04)];
+buttons[0].pressed = buttons[9].pressed = true;
+gamepads.poll(controls, (command) => pressed.push(command));
+gamepads.poll(controls, (command) => pressed.push(command));
+pad.connected = false;
+gamepads.poll(controls, (command) => pressed.push(command));
+controls.restart();
+const shares = [-1, -0.5, -0.1, 0, 0.15, 0.6, 1].map(withoutRest);
+console.log(JSON.stringify({ action, pressed, shares, still: [...controls.action(0.04)],
+  strengths: [-1, 0, 0.015, 0.5, 1.5, 9].map(strength) }));
+"""
+    (tmp_path / "run.mjs").write_text(code)
+    done = subprocess.run(
+        ["node", tmp_path / "run.mjs"], capture_output=True, text=True, check=True
+    )
+    page = json.loads(done.stdout)
+
+    class Pad:
+        help = ""
+
+        def read(self):
+            ours = {"w": 0.5, "Up": 0.2, "Right": 0.9}
+            return {key: hands.without_rest(one) for key, one in ours.items()}, set()
+
+    controls = Controls(2, hand=Pad())
+    controls.poll()
+    np.testing.assert_allclose(page["action"], controls.action(0.04), rtol=1e-6)
+    assert page["pressed"] == ["straight", "restart"] and not any(page["still"])
+    given = [-1, -0.5, -0.1, 0, 0.15, 0.6, 1]
+    np.testing.assert_allclose(page["shares"], [*map(hands.without_rest, given)])
+    given = [-1, 0, 0.015, 0.5, 1.5, 9]
+    np.testing.assert_allclose(page["strengths"], [*map(hands.strength, given)])
+
+
 @pytest.fixture(scope="module")
 def builder():
     """The script that makes what the pages need."""
@@ -125,7 +176,7 @@ def test_a_visitor_steers(builder, scene, tmp_path):
         address = f"http://127.0.0.1:{port}/steer.html"
         visit = ["node", PAGES / "visit.mjs", modules, address, picture]
         done = subprocess.run(
-            [*visit, "KeyW:2", "KeyW+ArrowRight:1"],
+            [*visit, "KeyW:2", "KeyW+ArrowRight:1", "Pad:1"],
             capture_output=True,
             text=True,
             check=False,
@@ -136,7 +187,7 @@ def test_a_visitor_steers(builder, scene, tmp_path):
     assert done.returncode == 0, done.stderr[-3000:]
     seen = json.loads(done.stdout)
     assert not seen["errors"]
-    assert seen["seconds"] > 0.5
+    assert seen["seconds"] > 0.5 and seen["felt"] > 0
     # It was pushed at 40 mm/s for about as long as it was simulated.
     assert (
         0.3 * 0.04 * seen["seconds"] < seen["inserted"] < 0.04 * seen["seconds"] + 0.01

@@ -6,12 +6,11 @@ from test_policies import assert_same_in_composer
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.agents import evaluate
-from cathsim_dmc.policies import attempts, coaxial_pursuit
-from cathsim_dmc.policies.attempts import State
-from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
+from cathsim_dmc.policies import coaxial_pursuit
+from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan
 from cathsim_dmc.policies.expert import Teacher
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks.route import Place, locate
+from cathsim_dmc.tasks.route import locate
 
 TASK = "simple1_bca_pair"
 
@@ -66,48 +65,6 @@ def test_turning_by_the_error_turns_the_side_to_the_route(environment):
     assert np.cos(after[0, 0]) > 0.9
 
 
-def fresh(arc_length, insertion, **values):
-    changes = {"arc_length": arc_length, "best": arc_length, "held": insertion}
-    changes = {name: np.array([value]) for name, value in (changes | values).items()}
-    return State.fresh((1,))._replace(**changes)
-
-
-def attempt(state, arc_length, insertion, excess=-0.5):
-    place = Place(np.array([arc_length]), np.array([excess]))
-    return attempts.advance(CoaxialSettings(), state, place, np.array([insertion]))
-
-
-def test_a_shaft_that_buckles_is_taken_back_until_the_head_comes_with_it():
-    settings = CoaxialSettings()
-    state = fresh(0.1, 0.05)
-    state = attempt(state, 0.1, 0.05 + settings.slack + 1e-4)
-    assert state.retracting[0] and state.taking_up[0] and state.attempts[0] == 1
-    # The head springs forward: on; it comes back: the slack is gone.
-    state = attempt(state, 0.104, 0.055)
-    assert state.retracting[0]
-    state = attempt(state, 0.104 - 2 * settings.give, 0.052)
-    assert not state.retracting[0]
-    assert state.best[0] == pytest.approx(0.104 - 2 * settings.give)
-
-
-def test_a_head_that_has_strayed_is_withdrawn_all_the_way():
-    settings = CoaxialSettings()
-    state = fresh(0.1, 0.05, lost=settings.lost_patience)
-    state = attempt(state, 0.1, 0.05, excess=1.0)
-    assert state.retracting[0] and not state.taking_up[0]
-    state = attempt(state, 0.1 - 2 * settings.give, 0.045)
-    assert state.retracting[0]  # not yet back by `backoff`
-    state = attempt(state, 0.08, 0.05 - settings.backoff)
-    assert not state.retracting[0]
-
-
-def test_a_head_that_goes_on_is_left_alone():
-    state = fresh(0.0, 0.0)
-    for number in range(1, 200):
-        state = attempt(state, 1e-3 * number, 1e-3 * number)
-    assert state.attempts[0] == 0 and not state.retracting[0]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["simple1_bca_pair", "simple1_bca_wire"])
 def test_the_expert_reaches_the_goal(name):
@@ -131,11 +88,11 @@ def test_a_new_episode_forgets_the_last():
     expert, view = policies.make_policy("expert"), policies.View(simulation)
     expert.reset(view, np.ones(2, bool))
     first = expert.act(None)
-    expert.state.attempts[:] = 4  # which has another direction
+    simulation.rollout.memory.attempts[:] = 4  # which has another direction
+    simulation.reset(np.array([0]))
     expert.reset(view, np.array([True, False]))
-    np.testing.assert_array_equal(expert.state.attempts, [0, 4])
+    np.testing.assert_array_equal(simulation.rollout.memory.attempts, [0, 4])
     again = expert.act(None)
-    np.testing.assert_array_equal(again[0], first[0])
     assert not np.array_equal(again[1], first[1])
 
 

@@ -186,7 +186,9 @@ def test_the_route_goes_straight_on_behind_the_goal():
     line = objective.route
     head, frame = line.points[-1:] - 1e-4, np.eye(3)[None]
     routes = [route.Route.of(objective)]
-    ahead = route.look_ahead(routes, np.zeros(1, int), head, frame)
+    chosen = np.zeros(1, int)
+    place = route.locate_each(routes, chosen, head)
+    ahead = route.look_ahead(routes, chosen, place, head, frame)
     points = ahead.points[0] + line.points[-1] - 1e-4
     way = np.diff(points[2:], axis=0)
     np.testing.assert_allclose(np.linalg.norm(way, axis=-1), 5e-3, atol=1e-9)
@@ -203,7 +205,9 @@ def test_a_head_beside_the_route_sees_how_far_it_is_out_of_the_lumen():
     heads = line.points[middle] + np.outer([0.0, 1.0, 3.0], aside)
     frames = np.broadcast_to(np.eye(3), (3, 3, 3))
     routes = [route.Route.of(objective)]
-    ahead = route.look_ahead(routes, np.zeros(3, int), heads, frames)
+    chosen = np.zeros(3, int)
+    place = route.locate_each(routes, chosen, heads)
+    ahead = route.look_ahead(routes, chosen, place, heads, frames)
     np.testing.assert_allclose(ahead.excess, [-1, 0, 2], atol=0.1)
 
 

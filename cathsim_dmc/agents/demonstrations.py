@@ -17,7 +17,11 @@ from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import View
 from cathsim_dmc.policies.expert import ExpertPolicy
 from cathsim_dmc.recording import dataset
-from cathsim_dmc.recording.dataset import DatasetError, read_episodes
+from cathsim_dmc.recording.dataset import (
+    DatasetError,
+    read_episodes,
+    recordings_in,
+)
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.simulation.episodes import play
@@ -192,6 +196,8 @@ def load_transitions(
     """Transitions of a dataset's successful episodes, as a collector gives them.
 
     Args:
+        path: Directory of a dataset, or of episodes as `cathsim play --out` writes
+            them, which are repeated.
         observation: Name or names of the observations that the networks read; the
             dataset may hold others beside them.
         **options: As for `read_episodes`.
@@ -207,7 +213,11 @@ def load_transitions(
         ModuleNotFoundError: minari is not installed.
     """
     names = observations.resolve(observation)
-    episodes = [_tensors(path, e, names) for e in read_episodes(path, **options)]
+    if recordings_in(path):
+        read = repeat_episodes(path, names, **options)
+    else:
+        read = read_episodes(path, **options)
+    episodes = [_tensors(path, e, names) for e in read]
     succeeded = [one for one in episodes if one is not None]
     if not succeeded:
         raise DatasetError(f"none of the {len(episodes)} episodes in {path} succeeds")
@@ -241,7 +251,8 @@ def _tensors(path: str | Path, episode: Any, names: Sequence[str]) -> TensorDict
     arrays = {key: torch.as_tensor(episode.observations[key]) for key in keys}
     seen = environments.standard(arrays, 1)
     steps = len(episode.actions)
-    done = episode.terminations.astype(bool) | episode.truncations.astype(bool)
+    ends, outs = np.asarray(episode.terminations), np.asarray(episode.truncations)
+    done = ends.astype(bool) | outs.astype(bool)
     chosen = episode.infos.get(EXPERT_ACTION, episode.actions)[:steps]
     return TensorDict(
         {
@@ -250,9 +261,9 @@ def _tensors(path: str | Path, episode: Any, names: Sequence[str]) -> TensorDict
             EXPERT_ACTION: torch.as_tensor(chosen).float(),
             "next": {
                 **{key: value[1:] for key, value in seen.items()},
-                "reward": torch.as_tensor(episode.rewards).float()[:, None],
+                "reward": torch.as_tensor(np.asarray(episode.rewards)).float()[:, None],
                 "done": torch.as_tensor(done)[:, None],
-                "terminated": torch.as_tensor(episode.terminations).bool()[:, None],
+                "terminated": torch.as_tensor(ends).bool()[:, None],
             },
         },
         batch_size=[steps],

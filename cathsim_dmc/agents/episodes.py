@@ -35,6 +35,11 @@ class EpisodeOutcome:
     physics_error: bool
     path_ratio: float
 
+    @property
+    def given_up(self) -> bool:
+        """Whether it ended because the task gave up, see its option `give_up`."""
+        return self.terminated and not (self.success or self.physics_error)
+
 
 class EpisodeTracker:
     """Sums over the running episode of each of `num_envs` environments."""

@@ -99,7 +99,8 @@ class BCConfig(TrainingConfig):
 
     Attributes:
         demonstrations: Directory of the dataset, as `cathsim demos` writes it, with
-            the observation of the run among its observations.
+            the observation of the run among its observations; or of episodes of a hand,
+            as `cathsim play --out` writes them.
         gradient_steps: Number of gradient steps in all, spread over total_frames.
         batch_size: Number of states per gradient step.
         steps_per_env: Number of control steps of each environment between two

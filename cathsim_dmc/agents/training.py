@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,7 @@ CONFIG_FILE = "config.json"
 # What must agree for the weights of another policy to mean the same.
 _ALIKE = ("hidden", "activation", "subtract_background",
           "convolutions", "cnn_features", "observation_clip")  # fmt: skip
+_COIN = 0.5  # deviation of an entry that is 0 or 1 equally often
 
 
 @dataclass(frozen=True)
@@ -235,6 +236,9 @@ def take_over(
 ) -> None:
     """Give a policy the weights and observation statistics of `initial_policy`.
 
+    It may observe more, if the entries that are new come last in alphabetical order, as
+    `route_retry` does after `route`: at first it does not react to them.
+
     A deviation that depends on the state (SAC) starts as one that does not (PPO,
     cloning), and the other way round as its value in the middle of all states.
 
@@ -250,10 +254,14 @@ def take_over(
             'or "pretrained:NAME".'
         )
     pairs = {n: (getattr(source.config, n), getattr(config, n)) for n in _ALIKE}
-    pairs["sizes"] = source.shapes, shapes
-    pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
     seen = source.config.observation, config.observation
-    if _entries(seen[0]) != _entries(seen[1]):
+    known, wanted = map(_entries, seen)
+    same = known == wanted
+    pairs["sizes"] = source.shapes, shapes
+    if not same:  # the rest must agree
+        pairs["sizes"] = replace(source.shapes, vector=0), replace(shapes, vector=0)
+    pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+    if wanted[: len(known)] != known:
         pairs["observation"] = seen
     if pairs:
         raise ConfigError(
@@ -261,6 +269,8 @@ def take_over(
             "another policy."
         )
     given, state = source.network.state_dict(), network.state_dict()
+    if not same:
+        given = {key: _widened(key, given, state[key]) for key in given}
     (middle,) = (v for n, v in given.items() if n.endswith(("log_std", "log_std.bias")))
     if config.initial_std is not None:
         middle = torch.full_like(middle, config.initial_std).log()
@@ -275,10 +285,34 @@ def take_over(
     network.load_state_dict(state)
 
 
+def _widened(
+    key: str, given: Mapping[str, torch.Tensor], own: torch.Tensor
+) -> torch.Tensor:
+    """A tensor with places for the entries of `own` that its policy has not seen.
+
+    Weights of these are 0; their statistics are those of a coin, which is 0 or 1.
+    """
+    old = given[key]
+    if old.shape == own.shape:
+        return old
+    wide, known = torch.zeros_like(own), old.shape[-1]
+    wide[..., :known] = old
+    module, _, name = key.rpartition(".")
+    count = given.get(f"{module}.count")
+    if count is not None:
+        start = {"squares": _COIN**2 * float(count), "scale": 1.0 / _COIN}
+        wide[..., known:] = start.get(name, 0.0)
+    return wide
+
+
 def _entries(names: str | tuple[str, ...]) -> list[str]:
-    """Entries without their first word, which differs between "route" and "biplane"."""
+    """Entries in the order in which networks read them, without their first word.
+
+    It differs between "route" and "biplane".
+    """
     rows = observations.entries(observations.resolve(names))
-    return sorted(entry.key.partition("_")[2] or entry.key for entry in rows)
+    keys = sorted(entry.key for entry in rows)
+    return [key.partition("_")[2] or key for key in keys]
 
 
 def _loop(

@@ -205,7 +205,8 @@ def print_episodes(result: EvaluationResult) -> None:
 def _outcome(
     seed: int, conditions: Mapping[str, Any], episode: EpisodeOutcome
 ) -> dict[str, str]:
-    end = "goal reached" if episode.success else "out of time"
+    missed = "given up" if episode.given_up else "out of time"
+    end = "goal reached" if episode.success else missed
     forces = episode.forces
     largest = forces.largest_sum
     return {
@@ -379,11 +380,12 @@ def play(
     episodes: int | None = None,
     speed: float = 1.0,
     policy: str | None = None,
+    hands: Literal["keyboard", "gamepad", "spacemouse"] = "keyboard",
     modules: Modules = (),
     *,
     options: Options,
 ) -> int:
-    """Cannulate by keyboard, with the forces on the screen.
+    """Cannulate by hand, with the forces on the screen.
 
     Args:
         out: Directory for the episodes as demonstrations (.npz).
@@ -392,10 +394,13 @@ def play(
         speed: Speed of the simulation, in multiples of real time.
         policy: Policy to watch instead of playing yourself: directory of a run or of
             a checkpoint, or name of a policy, such as "pretrained:type1_bca".
+        hands: What you hold (extra `hands`): a gamepad vibrates with the largest
+            contact; the keys act beside it.
         options: Options of the task.
     """
     player = agents.load_policy(policy, seed) if policy else None
     how: Any = {"seed": seed, "episodes": episodes, "speed": speed, "policy": player}
+    how["hands"] = hands
     for path in by_hand.play(task, out, task_kwargs=options.given, **how):
         print(path)
     return 0

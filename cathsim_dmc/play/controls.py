@@ -1,7 +1,8 @@
-"""Actions of a task from keys that are held."""
+"""Actions of a task from keys that are held, and from a hand that leans."""
 
 import numpy as np
 
+from cathsim_dmc.play.hands import Hand
 from cathsim_dmc.tasks.scene import Scene
 
 # Key of Tk that acts while it is held: the axis that it moves, and its sign, for a
@@ -47,6 +48,7 @@ class Controls:
         devices: int = 0,
         *,
         watching: bool = False,
+        hand: Hand | None = None,
     ):
         """Starts with nothing held and a straight tip.
 
@@ -55,20 +57,25 @@ class Controls:
             rotation: Whether the action has a rotation.
             devices: Number K of coaxial devices; 0 for a steerable device.
             watching: Whether somebody else gives the actions.
+            hand: A gamepad or SpaceMouse beside the keys.
         """
         self._tip_joints, self._rotation, self._devices = tip_joints, rotation, devices
-        self.help = "   ".join([*([] if watching else self._keys()), *_ALWAYS])
+        mine = [] if watching else [*([hand.help] if hand else []), *self._keys()]
+        self.help = "   ".join([*mine, *_ALWAYS])
+        self._hand, self._down = hand, set[str]()
         self._held: set[str] = set()
         self.restart()
 
     @classmethod
-    def of(cls, scene: Scene, *, watching: bool = False) -> "Controls":
+    def of(
+        cls, scene: Scene, *, watching: bool = False, hand: Hand | None = None
+    ) -> "Controls":
         """The controls of the devices in a scene."""
-        chain = scene.catheter
+        chain, how = scene.catheter, {"watching": watching, "hand": hand}
         if scene.catheter.coaxial:
-            return cls(devices=len(chain.devices), watching=watching)
+            return cls(devices=len(chain.devices), **how)
         turns = chain.rotation is not None
-        return cls(len(chain.tip_motors) // 2, turns, watching=watching)
+        return cls(len(chain.tip_motors) // 2, turns, **how)
 
     def _keys(self) -> list[str]:
         """What the keys of the task's own actions do."""
@@ -94,9 +101,23 @@ class Controls:
         """Lets a key go."""
         self._held.discard(key)
 
+    def poll(self) -> None:
+        """Reads the hand; a button that is down acts once."""
+        if self._hand is not None:
+            self._leaning, down = self._hand.read()
+            for key in down - self._down:
+                self.press(key)
+            self._down = down
+
+    def feel(self, force: float) -> None:
+        """Lets the hand feel the largest contact force, N."""
+        if self._hand is not None:
+            self._hand.feel(force)
+
     def restart(self) -> None:
         """Lets all keys go and straightens the tip."""
         self._held.clear()
+        self._leaning: dict[str, float] = {}
         self.requested: str | None = None
         self.bend = np.zeros(2)
 
@@ -109,13 +130,15 @@ class Controls:
             devices.
         """
         held = np.zeros(4)
-        for axis, *signs in map(HELD.__getitem__, self._held):
-            held[axis] += signs[self._devices > 0]
+        for key, share in [*((key, 1.0) for key in self._held), *self._leaning.items()]:
+            axis, *signs = HELD[key]
+            held[axis] += share * signs[self._devices > 0]
+        held = np.clip(held, -1.0, 1.0)
         if self._devices:
             action = np.zeros(2 * self._devices)
             action[:2] = held[:2]
             action[-2:] += held[2:]
-            return np.clip(action, -1.0, 1.0)
+            return np.clip(action, -1.0, 1.0).astype(np.float32).astype(np.float64)
         self.bend = np.clip(self.bend + BEND_RATE * duration * held[:2], -1.0, 1.0)
         moved = held[2 : 3 + self._rotation]
         action = np.array([*np.tile(self.bend, self._tip_joints), *moved])

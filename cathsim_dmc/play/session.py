@@ -1,8 +1,9 @@
 """Cannulation by hand, episode after episode, recorded."""
 
+import contextlib
 import itertools
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from cathsim_dmc import bounds, files, suite
 from cathsim_dmc.play.controls import Controls
+from cathsim_dmc.play.hands import HANDS, Hand, hand
 from cathsim_dmc.play.window import FluoroscopyWindow
 from cathsim_dmc.policies import Policy, in_environment
 from cathsim_dmc.recording.episode import SUFFIX, Episode
@@ -29,8 +31,9 @@ def play(
     speed: float = 1.0,
     task_kwargs: Mapping[str, Any] | None = None,
     policy: Policy | None = None,
+    hands: str = "keyboard",
 ) -> list[Path]:
-    """Plays a task by keyboard, at the pace of the clock, and records demonstrations.
+    """Plays a task by hand, at the pace of the clock, and records demonstrations.
 
     Args:
         out: Directory for the episodes (npz), made if it is not there; None for none.
@@ -38,24 +41,45 @@ def play(
         episodes: Number of episodes, None until the operator quits.
         speed: Speed of the simulation, in multiples of real time.
         policy: Policy that plays while the operator watches; None for the operator.
+        hands: What the operator holds, of `hands.HANDS`; the keys act beside it, and a
+            gamepad vibrates with the largest contact.
 
     Returns:
         The files written, one for each episode of at least one step.
 
     Raises:
-        ValueError: if an argument is wrong or no window can be opened.
+        ValueError: if an argument is wrong, no window can be opened, or no such device
+            is connected.
+        ModuleNotFoundError: the extra `hands` is not installed.
     """
     bounds.number("speed", speed, high=_FASTEST, positive=True)
     bounds.seed("seed", seed)
     if episodes is not None:
         bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
+    bounds.choice("hands", hands, HANDS)
     if out is not None:
         files.require_folder(out, make=True)
-    options = dict(task_kwargs or {})
+    held = hand(hands)
+    with contextlib.closing(held) if held else contextlib.nullcontext():
+        seeds = (
+            itertools.count(seed) if episodes is None else range(seed, seed + episodes)
+        )
+        return _play(task, out, seeds, speed, dict(task_kwargs or {}), policy, held)
+
+
+def _play(
+    task: str,
+    out: str | Path | None,
+    seeds: Iterable[int],
+    speed: float,
+    options: dict[str, Any],
+    policy: Policy | None,
+    held: Hand | None,
+) -> list[Path]:
     # The screen is the operator's observation; the task's own would only cost.
     observation = (policy and policy.observation) or "tracking"
     env = suite.load(suite.DOMAIN, task, {"observation": observation, **options})
-    controls = Controls.of(env.task.scene, watching=policy is not None)
+    controls = Controls.of(env.task.scene, watching=policy is not None, hand=held)
     window = FluoroscopyWindow(env.task, controls)
     chosen = policy and in_environment(policy, env)
     due = time.monotonic()
@@ -66,6 +90,7 @@ def play(
     def act(timestep: Any) -> np.ndarray:
         nonlocal due
         due += CONTROL_TIMESTEP / speed
+        controls.feel(float(env.task.wall_force.max))
         window.show(env.task, until=due)
         # A machine that cannot keep pace runs slower and does not catch up later.
         due = max(due, time.monotonic() - CONTROL_TIMESTEP)
@@ -75,10 +100,10 @@ def play(
 
     recorder, written = EpisodeRecorder(env, task, options), []
     try:
-        for number in itertools.count() if episodes is None else range(episodes):
+        for seed in seeds:
             controls.restart()
             due = time.monotonic()
-            episode = recorder.record_episode(act, seed + number)
+            episode = recorder.record_episode(act, seed)
             if out is not None and episode.steps:
                 written.append(_save(episode, Path(out)))
             until = time.monotonic() + _PAUSE / speed

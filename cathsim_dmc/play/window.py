@@ -77,8 +77,9 @@ class FluoroscopyWindow:
         self._released[_name(event.keysym)] = time.monotonic()
 
     def poll(self) -> None:
-        """Reads the keys pressed since the last call."""
+        """Reads the keys pressed since the last call, and the hand."""
         self._root.update()
+        self._controls.poll()
         for key, when in list(self._released.items()):
             if time.monotonic() - when > _REPEAT:
                 self._controls.release(key)

@@ -17,7 +17,7 @@ leads badly: its shaft, the stiffer one, comes to lie in the bend. With a negati
 the wire stays behind in the catheter, whose soft end takes its shape, hooks the branch
 and goes up; the wire holds the shaft in the aorta straight.
 
-**Retries** (`attempts`) have another lead, look-ahead and direction, and every other
+**Retries** (`tasks.retry`) have another lead, look-ahead and direction, and every other
 time no jumps of the head's place on the route.
 """
 
@@ -34,8 +34,10 @@ from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.policies import attempts
 from cathsim_dmc.policies.attempts import AttemptSettings, State
 from cathsim_dmc.policies.pursuit import turned
+from cathsim_dmc.tasks import retry
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.retry import Memory, RetrySettings
 from cathsim_dmc.tasks.route import Place, Route
 
 # What a full action moves (m) and turns (rad) a device by in a control step.
@@ -48,32 +50,24 @@ class CoaxialSettings(AttemptSettings):
     """Settings of the expert of coaxial devices.
 
     Attributes:
-        leads: by how much each device is ahead of the one around it in successive
-            attempts, over and over, m; negative where it stays behind in it.
         lead_gain: share of the error of the lead corrected in a control step.
         aside: by how much the route must bend away for a device to be turned, rad.
         turning: share of the error of direction that a base is turned by in a control
             step.
-        offsets: added to that direction in successive attempts, over and over, rad.
     """
+
+    retry: RetrySettings = retry.COAXIAL
 
     lookahead: float = 20e-3
     least_lookahead: float = 12e-3
-    lookahead_factors: tuple[float, ...] = (1.0, 0.75, 1.4)
     creep: float = 0.1
     aligned: float = 0.7
     misaligned: float = 0.0
-    progress: float = 0.5e-3
-    patience: int = 60
-    lost_patience: int = 15
-    leads: tuple[float, ...] = (0.012, -0.03, -0.045, -0.02)
+    press: float = 0.0
+    straightening: int = 0
     lead_gain: float = 0.2
     aside: float = 0.2
     turning: float = 0.2
-    offsets: tuple[float, ...] = (0.0, 0.0, 0.0, 0.7, -0.7, 0.0, 1.4, -1.4)
-    slack: float = 12e-3
-    give: float = 2e-3
-    thorough: int = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,6 +111,7 @@ class CoaxialPlan(Route):
         self,
         settings: CoaxialSettings,
         state: State,
+        memory: Memory,
         readings: Readings,
         wall_force: forces.WallForce,
         devices: CoaxialReadings,
@@ -125,17 +120,16 @@ class CoaxialPlan(Route):
 
         Args:
             state: after the last step, arrays (N,).
+            memory: of the attempts, arrays (N,).
             readings: of the chain, arrays (N, ...).
             wall_force: arrays (N,); its `mean_max` slows the devices down.
 
         Returns:
             Action (N, 2 K) in [-1, 1] and the new state.
         """
-        place, ahead = attempts.aim(self, settings, state, readings.head)
+        place, ahead = attempts.aim(self, settings, state, memory, readings.head)
         error, away = _directions(self, readings, devices, place, ahead)
-        offsets = np.asarray(settings.offsets)
-        error = error + offsets[state.attempts % len(offsets)][:, None]
-        state = attempts.advance(settings, state, place, readings.insertion)
+        error = error + retry.offset(settings.retry, memory)[:, None]
         turns = away > settings.aside
         action = np.zeros((len(error), 2 * error.shape[1]))
         rate = settings.turning * np.angle(np.exp(1j * error)) / _TURN
@@ -143,27 +137,29 @@ class CoaxialPlan(Route):
         leader = devices.insertion.argmax(axis=1)[:, None]
         looks = np.where(turns, np.cos(error), 1.0)
         cosine = np.take_along_axis(looks, leader, axis=1)[:, 0]
-        speed = attempts.translation(settings, state, wall_force.mean_max, cosine)
+        pressing = wall_force.mean_max, readings.push_force
+        speed = attempts.translation(settings, memory, *pressing, cosine)
         deep = np.maximum(place.arc_length - self.ostium, 0.0)
-        action[:, 0::2] = _led(settings, state, devices.insertion, speed, deep)
+        action[:, 0::2] = _led(settings, memory, devices.insertion, speed, deep)
+        insertion, arc_length = np.array(readings.insertion), np.array(place.arc_length)
+        state = state._replace(arc_length=arc_length, insertion=insertion)
         return np.clip(action, -1.0, 1.0), state
 
 
 def _led(
     settings: CoaxialSettings,
-    state: State,
+    memory: Memory,
     insertion: np.ndarray,
     speed: np.ndarray,
     deep: np.ndarray,
 ) -> np.ndarray:
     """Translations (N, K) at the leads; a leading wire deep in a branch goes alone."""
-    leads = np.asarray(settings.leads)
-    lead = leads[state.attempts % len(leads)]
+    lead = retry.lead(settings.retry, memory)
     lead = np.where(lead > 0.0, np.maximum(lead, deep), lead)[:, None]
     wanted = insertion[:, :1] - lead * np.arange(insertion.shape[1])
     follow = speed[:, None] + settings.lead_gain * (wanted - insertion) / _MOVE
     # While the wire goes on, the catheter waits for it rather than coming back.
-    follow = np.where(state.retracting[:, None], follow, np.maximum(follow, 0.0))
+    follow = np.where(memory.retracting[:, None], follow, np.maximum(follow, 0.0))
     return np.concatenate([speed[:, None], follow[:, 1:]], axis=1)
 
 

@@ -4,17 +4,20 @@ Its success shows that a task can be solved, and is compared with that of traine
 agents. `pursuit` has its decisions, `coaxial_pursuit` those for coaxial devices.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.physics.readings import merged, part
-from cathsim_dmc.policies.attempts import State
+from cathsim_dmc.physics.readings import Readings, merged, part
+from cathsim_dmc.policies.attempts import AttemptSettings, State
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
 from cathsim_dmc.policies.policy import Policy, View
 from cathsim_dmc.policies.pursuit import Plan
+from cathsim_dmc.tasks import retry
 from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.retry import Memory
 from cathsim_dmc.tasks.route import locate
 
 
@@ -36,6 +39,11 @@ class _Plans:
                 self._plans[case] = kind.for_case(case)
             rows = np.array([i for i, one in enumerate(cases) if one is case])
             yield self._plans[case], rows, tuple(part(one, rows) for one in state)
+
+    @property
+    def memory(self) -> Memory:
+        """Memory of the attempts, which the task keeps."""
+        return self.view.rollout.memory
 
 
 class ExpertPolicy(Policy):
@@ -61,7 +69,7 @@ class ExpertPolicy(Policy):
             self._plans = _Plans(view)
         for plan, _, _ in self._plans.chosen():
             self._plan, fresh = plan, plan.fresh((view.num_simulations,))
-        old = fresh if begins else self.state
+        old, _ = fresh if begins else self.state, self._plans.memory
         self.state = merged(old, part(fresh, which), which)
 
     def act(self, observation: Any) -> np.ndarray:
@@ -71,8 +79,8 @@ class ExpertPolicy(Policy):
         view = self._plans.view
         action = np.empty((view.num_simulations, view.num_actions))
         for plan, rows, seen in self._plans.chosen():
-            state = part(self.state, rows)
-            action[rows], state = plan.decide(plan.settings, state, *seen)
+            own = part(self.state, rows), part(self._plans.memory, rows)
+            action[rows], state = plan.decide(plan.settings, *own, *seen)
             self.state = merged(self.state, state, rows)
         return action
 
@@ -85,31 +93,33 @@ class Teacher:
     """The expert as a teacher: its action in states that another policy reaches.
 
     The expert remembers its commands to a steerable tip, to which every correction
-    adds, and its retries. Neither fits the state that another policy has reached, and a
-    learner does not observe retries. The teacher therefore takes the action that was
-    carried out for its own and judges every state by itself: it withdraws outside the
-    tube of the route and advances inside it. Coaxial devices keep one lead and one
-    look-ahead. All follows from the observation if that has the last action.
+    adds; the teacher takes the action that was carried out for its own. Where the
+    learner observes the memory of the attempts, the teacher decides by it. Otherwise it
+    judges every state by itself: it withdraws outside the tube of the route and
+    advances inside it, and coaxial devices keep one lead and one look-ahead. All
+    follows from the observation if that has the last action.
     """
 
     def __init__(self, view: View, lead: float = 0.02):
         """Looks at simulations; `reset` comes before the first question.
 
         Args:
-            lead: of a guidewire ahead of the catheter around it, m. With 0.02 it
-                reaches the left common carotid of Type I without retries; the
-                brachiocephalic artery of Type II takes -0.02, the catheter first.
+            lead: of a guidewire ahead of the catheter around it where the learner does
+                not observe the memory, m. With 0.02 it reaches the left common carotid
+                of Type I without retries; the brachiocephalic artery of Type II takes
+                -0.02, the catheter first.
         """
         self._plans = _Plans(view)
-        self._insertion = np.full(view.num_simulations, np.nan)
+        self._last = np.full((2, view.num_simulations), np.nan)
         # A longer look-ahead than the expert's needs no retry.
-        self._coaxial = CoaxialSettings(
-            leads=(lead,), offsets=(0.0,), lookahead_factors=(1.4,)
+        one = dataclasses.replace(
+            retry.COAXIAL, leads=(lead,), offsets=(0.0,), lookahead_factors=(1.4,)
         )
+        self._one_lead = CoaxialSettings(retry=one)
 
     def reset(self, which: np.ndarray) -> None:
         """Forgets the simulations, (N,) bool, that begin a new episode."""
-        self._insertion[which] = np.nan
+        self._last[:, which] = np.nan
 
     def act(self, last_action: np.ndarray) -> np.ndarray:
         """The expert's action in every state; to be asked once in a control step.
@@ -125,16 +135,29 @@ class Teacher:
             ValueError: the task's device can neither be steered nor turned.
         """
         action = np.empty(last_action.shape)
-        for plan, rows, (readings, force, devices) in self._plans.chosen():
-            coaxial = isinstance(plan, CoaxialPlan)
-            settings = self._coaxial if coaxial else plan.settings
-            state = plan.fresh((len(rows),))._replace(
-                retracting=locate(plan, readings.head).excess > settings.tolerance,
-                turn=np.full(len(rows), np.inf),
-                held=readings.insertion,
-                insertion=self._insertion[rows],
-            )
+        remembers = self._plans.view.rollout.progress.shown
+        for plan, rows, seen in self._plans.chosen():
+            settings, state = plan.settings, plan.fresh((len(rows),))
+            arc_length, insertion = self._last[:, rows]
+            state = state._replace(arc_length=arc_length, insertion=insertion)
             state = plan.told(state, last_action[rows])
-            decided = plan.decide(settings, state, readings, force, devices)
-            action[rows], self._insertion[rows] = decided[0], readings.insertion
+            if remembers:
+                memory = part(self._plans.memory, rows)
+            else:
+                settings = self._one_lead if isinstance(plan, CoaxialPlan) else settings
+                memory = _of_the_moment(plan, settings, seen[0])
+            action[rows], state = plan.decide(settings, state, memory, *seen)
+            self._last[:, rows] = state.arc_length, state.insertion
         return action
+
+
+def _of_the_moment(
+    plan: Plan | CoaxialPlan, settings: AttemptSettings, readings: Readings
+) -> Memory:
+    """A memory that follows from the present state alone."""
+    place = locate(plan, readings.head)
+    memory = Memory.at(place, readings.insertion)
+    outside = place.excess > settings.retry.tolerance
+    return memory._replace(
+        retracting=outside, stale=np.where(outside, settings.straightening, 0)
+    )

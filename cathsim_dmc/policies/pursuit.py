@@ -12,8 +12,9 @@ the motors, most to the distal joints. As the device advances, the command of a 
 moves to its proximal neighbour, and back as the device is withdrawn (follow the
 leader): the tip keeps the shape of its path.
 
-**Retries** (`attempts`) have another look-ahead each time, and every other time no
-jumps of the head's place on the route.
+**Retries** (`tasks.retry`) have another look-ahead each time, and every other time no
+jumps of the head's place on the route. Before a withdrawal the tip is straightened: a
+bent one is caught at an ostium and snaps out of it.
 """
 
 import dataclasses
@@ -27,6 +28,7 @@ from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.policies import attempts
 from cathsim_dmc.policies.attempts import AttemptSettings, State
 from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.retry import Memory
 from cathsim_dmc.tasks.route import Route
 
 
@@ -108,6 +110,7 @@ class Plan(Route):
         self,
         settings: Settings,
         state: State,
+        memory: Memory,
         readings: Readings,
         wall_force: forces.WallForce,
         devices: CoaxialReadings | None = None,
@@ -116,6 +119,7 @@ class Plan(Route):
 
         Args:
             state: after the last step, arrays (...).
+            memory: of the attempts, arrays (...).
             readings: of the devices, arrays (...).
             wall_force: arrays (...); its `mean_max` slows the device down.
             devices: of coaxial devices; not looked at.
@@ -123,21 +127,24 @@ class Plan(Route):
         Returns:
             Action (..., A) in [-1, 1] and the new state.
         """
-        place, way = attempts.aim(self, settings, state, readings.head)
+        place, way = attempts.aim(self, settings, state, memory, readings.head)
         axes, direction = tip_frames(self, readings)
         target = self.at(place.arc_length + way)
         turn, cosine = _rotation_to(direction, target - readings.head)
         bend = _follow_the_leader(self, state, readings.insertion)
-        bend = bend + _correction(settings, axes, turn)
+        still = memory.retracting | memory.given_up
+        correction = _correction(settings, axes, turn)
+        left = attempts.relaxed(settings, memory, wall_force.mean_max)[..., None, None]
+        bend = left * (bend + np.where(still[..., None, None], 0.0, correction))
         bend = np.clip(bend, -self.steering_angle, self.steering_angle)
-        state = attempts.advance(settings, state, place, readings.insertion)
-        speed = attempts.translation(settings, state, wall_force.mean_max, cosine)
+        pressing = wall_force.mean_max, readings.push_force
+        speed = attempts.translation(settings, memory, *pressing, cosine)
         action = np.zeros((*speed.shape, self.num_actions))
         motors = self.tip.size
         action[..., :motors] = (bend / self.steering_angle).reshape(*speed.shape, -1)
         action[..., motors] = speed
-        insertion = np.array(readings.insertion)
-        return action, state._replace(bend=bend, insertion=insertion)
+        insertion, arc_length = np.array(readings.insertion), np.array(place.arc_length)
+        return action, State(arc_length, insertion, bend)
 
 
 def tip_frames(plan: Plan, readings: Readings) -> tuple[np.ndarray, np.ndarray]:

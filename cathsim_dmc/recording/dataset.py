@@ -17,7 +17,7 @@ from cathsim_dmc.files import (
     require_folder,
     require_room,
 )
-from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.episode import SUFFIX, Episode
 
 # Options of what is observed, which the record does not hold.
 _OBSERVED = ("observation", "fluoroscopy", "endoluminal_size", "cameras")
@@ -220,6 +220,47 @@ def export(
             description=f"{len(episodes)} recorded episodes of the task {task} of "
             "cathsim_dmc",
         )
+
+
+def recordings_in(path: str | os.PathLike[str]) -> list[Path]:
+    """Files of episodes in a directory, as `cathsim play --out` writes them."""
+    return sorted(Path(path).glob(f"*{SUFFIX}"))
+
+
+def repeat_episodes(
+    path: str | os.PathLike[str], observation: str | Sequence[str], **options: Any
+) -> Iterator[Any]:
+    """Repeats the episodes of a directory, as `read_episodes` reads those of a dataset.
+
+    Args:
+        path: Directory of .npz files.
+        observation: Name or names of the observations that a learner is to see.
+        **options: Task and options that they must have been recorded with.
+
+    Raises:
+        DatasetError: a file is damaged, was recorded with other options, or does not
+            repeat.
+        ModuleNotFoundError: gymnasium or minari is not installed.
+    """
+    extras.require("gym", "gymnasium", "minari")
+    from cathsim_dmc.simulation import gymnasium
+
+    environment, made = None, None
+    for file in recordings_in(path):
+        try:
+            episode = Episode.load(file)
+            task, own = _common([episode])
+            for name, value in options.items():
+                if (found := {"task": task, **own}.get(name)) != value:
+                    raise ValueError(f"its {name} is {found!r}, not {value!r}")
+            wanted = task, {**own, "observation": observation}
+            if environment is None or made != wanted:
+                environment = gymnasium.CathSimEnv(task, **wanted[1])
+                made = wanted
+            yield _repeated(environment, episode)
+        except (ValueError, TypeError, LookupError, AttributeError) as error:
+            line = " ".join(str(error).split())
+            raise DatasetError(f"{file} is no demonstration: {line}") from error
 
 
 def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:

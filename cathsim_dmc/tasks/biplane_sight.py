@@ -13,7 +13,7 @@ from cathsim_dmc.imaging import biplane
 from cathsim_dmc.imaging import biplane_loops as loops
 from cathsim_dmc.imaging.biplane import Biplane
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
-from cathsim_dmc.tasks.route import Route, into_frame, look_ahead
+from cathsim_dmc.tasks.route import Route, into_frame, locate, look_ahead
 
 # A device with fewer points counts as lost.
 _FEWEST = 7
@@ -47,8 +47,11 @@ class BiplaneSight:
         handles: np.ndarray,
         numbers: np.ndarray,
         fresh: bool,
+        last: np.ndarray,
     ) -> dict[str, np.ndarray]:
-        """Entries of the observation, for some simulations.
+        """Entries of the observation, and "place", for some simulations.
+
+        "place" (K, 1) is the arc length of the heads' places on their routes, m.
 
         Args:
             planes: The two planes before each of the K simulations.
@@ -57,6 +60,7 @@ class BiplaneSight:
             handles: (K, 3, 3), orientation of the handle, its axes in columns.
             numbers: (K,) of the simulations.
             fresh: Whether they begin an episode.
+            last: (K,), places of the heads to stay near, see `route.locate`.
         """
         rows = []
         for k, number in enumerate(numbers.tolist()):
@@ -73,7 +77,8 @@ class BiplaneSight:
             goal = machine.point(pixels[k])
             if fresh or self._routes[number] is None:
                 self._routes[number] = _route(machine, line, goal)
-            rows.append(_seen(line, handles[k], self._routes[number], goal))
+            route = self._routes[number]
+            rows.append(_seen(line, handles[k], route, goal, last[k : k + 1]))
         return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
@@ -98,7 +103,11 @@ def _route(machine: Biplane, line: np.ndarray, goal: np.ndarray) -> Route:
 
 
 def _seen(
-    line: np.ndarray, handle: np.ndarray, route: Route, goal: np.ndarray
+    line: np.ndarray,
+    handle: np.ndarray,
+    route: Route,
+    goal: np.ndarray,
+    last: np.ndarray,
 ) -> dict[str, np.ndarray]:
     ways = biplane.TRACE_SPACING * np.arange(len(line))
     direction = line[0] - line[_CHORD]
@@ -110,11 +119,13 @@ def _seen(
     beyond = np.maximum(places - ways[-1], 0.0)[:, None]
     back = (line[-1] - line[-2]) / biplane.TRACE_SPACING
     device = interpolate(places, ways, line) + beyond * back
-    ahead = look_ahead([route], np.zeros(1, int), head[None], frame[None])
+    place = locate(route, head[None], last)
+    ahead = look_ahead([route], np.zeros(1, int), place, head[None], frame[None])
     return {
         "points": ahead.points.ravel(),
         "radii": ahead.radii[0],
         "goal": into_frame((goal - head)[None], frame)[0],
         "device": into_frame(device - head, frame).ravel(),
         "deviation": ahead.excess,
+        "place": place.arc_length,
     }

@@ -60,6 +60,8 @@ class NavigationConfig:
         start_along_route: Range (low, high) of the fraction of the way from the usual
             start to the goal at which an episode starts, for curricula.
         max_steps: Number of control steps until the episode is truncated.
+        give_up: Whether an episode ends without success where the memory of attempts
+            gives up, see `tasks.retry`: at a lumen too narrow for the device.
         friction: Coulomb coefficient between device and wall.
         shaft_link: Length of the longest link of the shaft, m.
         working_length: Simulated length of the device, m; None for what the goal needs.
@@ -88,6 +90,7 @@ class NavigationConfig:
     rotation: bool = False
     start_along_route: Sequence[float] | None = None
     max_steps: int = MAX_STEPS
+    give_up: bool = False
     friction: float = FRICTION
     shaft_link: float = 0.0175
     working_length: float | None = None
@@ -164,6 +167,7 @@ class NavigationConfig:
             if value is not None or getattr(type(self), name) is not None:
                 bounds.number(name, value, *limits)
         bounds.switch("rotation", self.rotation)
+        bounds.switch("give_up", self.give_up)
         bounds.whole("max_steps", self.max_steps, 1, bounds.MOST_STEPS)
         if (shares := self.start_along_route) is not None:
             bounds.interval("start_along_route", shares, 0.0, bounds.MOST_START_SHARE)

@@ -53,6 +53,7 @@ class ImageSensors:
         handles: np.ndarray,
         random_states: Sequence[np.random.RandomState] | None,
         around: Callable[[angiographs.Planes, int], angiographs.Planes],
+        last: np.ndarray,
     ) -> None:
         """Captures the next images; there are `planes`.
 
@@ -65,12 +66,14 @@ class ImageSensors:
             handles: (N, 3, 3), orientation of the handles, axes in columns.
             random_states: N sources of quantum noise, None for images without.
             around: Moves the vessel before the machine of a simulation.
+            last: (N,), places of the heads on their routes to stay near, see
+                `BiplaneSight.see`.
         """
         planes = [self.planes[index] for index in rows]
         own = [shadow.of(rows) for shadow in shadows]
         if self._wants("image", "sequential", "segmentation"):
             planes = list(map(around, planes, rows.tolist()))
-        if self._wants("image", "sequential", "biplane"):
+        if self._wants("image", "sequential", "biplane", "biplane_retry"):
             noise = None
             if random_states is not None and self._noise:
                 noise = [random_states[index] for index in rows]
@@ -80,13 +83,14 @@ class ImageSensors:
                     self.hold(f"past_{age}", image, rows)
                 else:
                     self.images[f"past_{age}"] = self.images[f"past_{age - 1}"].copy()
-            if self._wants("biplane"):
+            if self._wants("biplane", "biplane_retry"):
                 # The roadmaps show the vessel at rest.
                 resting = [self.planes[index] for index in rows]
                 marked = angiographs.pixels(resting, points[-1][rows, None])[:, :, 0]
-                given = resting, image, marked, handles[rows], rows, begins
+                given = resting, image, marked, handles[rows], rows, begins, last[rows]
                 for key, value in self.sight.see(*given).items():
-                    self.hold(f"biplane_{key}", value, rows)
+                    if key != "place" or self._wants("biplane_retry"):
+                        self.hold(f"biplane_{key}", value, rows)
         if self._wants("segmentation"):
             self.hold("masks", angiographs.masks(planes, own), rows)
         if self._wants("tracking_2d"):

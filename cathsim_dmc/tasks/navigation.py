@@ -321,14 +321,14 @@ class Navigation(composer.Task):
 
     @property
     def termination(self) -> str | None:
-        """Why the episode ended: "success", "truncated", "physics_error", or None."""
+        """Why the episode ended: one of `recording.episode.TERMINATIONS`, or None."""
         step = self._step
         if step is None:
             return None
         if step.errors[0] is not None:
             return "physics_error"
         if step.terminated[0]:
-            return "success"
+            return "success" if step.outcome.success[0] else "given_up"
         return "truncated" if step.truncated[0] else None
 
     @property

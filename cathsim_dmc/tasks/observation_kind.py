@@ -37,6 +37,8 @@ class Frame(NamedTuple):
         ahead: route ahead of the tip; None where no observation needs it.
         devices: state of coaxial devices; None for a device alone.
         vessel: state of the vessel; None for a rigid one with blood at rest.
+        retry: (..., K), memory of the attempts, see `retry.shown`; None where no
+            observation needs it.
     """
 
     readings: Readings
@@ -48,6 +50,7 @@ class Frame(NamedTuple):
     ahead: Ahead | None
     devices: CoaxialReadings | None
     vessel: VesselReadings | None
+    retry: np.ndarray | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,6 +26,7 @@ from cathsim_dmc.tasks.observation_kind import (
     Sizes,
     flat,
 )
+from cathsim_dmc.tasks.retry import COAXIAL_RETRY_ENTRIES, RETRY_ENTRIES
 from cathsim_dmc.tasks.route import AHEAD, into_frame
 
 TRACKED_POINTS = len(TRACKED_PLACES)
@@ -251,6 +252,32 @@ def biplane(frame: Frame) -> Observation:
     parts = "points", "radii", "goal", "device", "deviation"
     seen = {f"biplane_{part}": frame.images[f"biplane_{part}"] for part in parts}
     return {**seen, "biplane_action": frame.action}
+
+
+def _retry(key: str) -> Entry:
+    """What is remembered of the attempts."""
+    seen = "withdrawing, way left to withdraw / 20 mm, control steps without progress "
+    seen += "and outside the route over those until a retry, retries so far / 4, three "
+    seen += "numbers of which the look-ahead of the attempt is 1, whether the place of "
+    seen += "the head stays near the last one, force of the base in N, given up; of "
+    seen += "coaxial devices then whether slack is taken up, the lead of the attempt / "
+    seen += "20 mm, cosine and sine of its offset in direction"
+    length = (RETRY_ENTRIES, COAXIAL_RETRY_ENTRIES)
+    return Entry(key, lambda sizes: length[sizes.devices > 0], "1, N", seen)
+
+
+@OBSERVATIONS.row(_retry("route_retry"), needs=ROUTE)
+def route_retry(frame: Frame) -> Observation:
+    """Memory of the attempts along the route; every other one has a steady place."""
+    assert frame.retry is not None
+    return {"route_retry": frame.retry}
+
+
+@OBSERVATIONS.row(_retry("biplane_retry"), needs=BIPLANE)
+def biplane_retry(frame: Frame) -> Observation:
+    """The memory of `route_retry`, of the route through both roadmaps."""
+    assert frame.retry is not None
+    return {"biplane_retry": frame.retry}
 
 
 @OBSERVATIONS.row(

@@ -17,6 +17,7 @@ from cathsim_dmc.physics.effects import Effect, Layout
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.image_sensors import ImageSensors
+from cathsim_dmc.tasks.progress import Progress
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.snapshot import Snapshot, packed, restored
 from cathsim_dmc.tasks.step import Step
@@ -52,6 +53,7 @@ class Restorable:
 
     deviations: list[Deviation]
     effects: list[Effect]
+    progress: Progress
     _case_of: np.ndarray
     _cases: Sequence[Case]
     _description: Mapping[str, Any]
@@ -71,6 +73,7 @@ class Restorable:
             "tracking": tracking,
             "images": sensors,
             "sight": sensors.sight,
+            "progress": self.progress,
             **{f"effect_{number}": effect for number, effect in numbered},
         }
 

@@ -35,9 +35,10 @@ from cathsim_dmc.tasks.objectives import (
     judge,
     straight,
 )
-from cathsim_dmc.tasks.observation_kind import ROUTE, Frame, Observation
+from cathsim_dmc.tasks.observation_kind import Frame, Observation
+from cathsim_dmc.tasks.progress import Progress
 from cathsim_dmc.tasks.restorable import Restorable, describe
-from cathsim_dmc.tasks.route import Route, look_ahead
+from cathsim_dmc.tasks.retry import Memory
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.tasks.tracking_noise import TrackingNoise
 
@@ -56,6 +57,7 @@ class Rollout(Restorable):
         steps: Control steps (N,) since each episode began.
         deviations: Of the angiography machine of each episode from the options.
         moving: What moves the vessels; None where they rest.
+        progress: Places of the heads on their routes, and the memory of the attempts.
         readings: State of the devices after the last step or reset.
         resting: The same, with places where they are in the vessel at rest: judged
             there.
@@ -113,9 +115,7 @@ class Rollout(Restorable):
         self._description = describe(scene, cases, self.effects, model)
         for index in range(count):
             self._enter(index)
-        self._routes: list[Route] = []
-        if observations.needs(self._names, ROUTE):
-            self._routes = [Route.of(case.objective) for case in cases]
+        self.progress = Progress(self._names, cases, count, config.give_up)
         self._chain = CommonChain(scene.catheter, config.shaft_link)
         self._sensors = ImageSensors(self._names, cases[0], count, self._chain)
         own = self._names, self.index.geoms, scene.catheter.coaxial
@@ -156,9 +156,8 @@ class Rollout(Restorable):
         self._choose_objectives()
         self.steps[indices] = 0
         # New arrays: those handed out before stay what they were.
-        self._action = self._action.copy()
+        self._action = self._previous_action = self._action.copy()
         self._action[indices] = 0.0
-        self._previous_action = self._action
 
     def _choose_objectives(self) -> None:
         """Takes the objective of each simulation's anatomy, with its goal."""
@@ -187,9 +186,8 @@ class Rollout(Restorable):
         self._layout.begin(index)
         for effect in self.effects:
             effect.restart(index, episode, random_state)
-        primary, secondary = episode.view
-        deviation = Deviation(primary, secondary, episode.gain, episode.kerma)
-        self.deviations[index] = deviation
+        gain, kerma = episode.gain, episode.kerma
+        self.deviations[index] = Deviation(*episode.view, gain=gain, kerma=kerma)
         self._place_machine(index)
         self._goal_shift[index] = episode.goal_shift or 0.0
 
@@ -307,9 +305,11 @@ class Rollout(Restorable):
             Measurement(self.resting, self.wall_force, *actions, distance),
             failed if failed.any() else None,
         )
-        ended = (outcome.success | failed) & (not begins) & (self.steps > 0)
+        observation = self._observe(rows, begins)
+        ended = outcome.success | failed | self.progress.given_up
+        ended = ended & (not begins) & (self.steps > 0)
         return Step(
-            observation=self._observe(rows, begins),
+            observation=observation,
             outcome=outcome,
             terminated=ended,
             truncated=~ended & (self.steps >= self._config.max_steps),
@@ -325,22 +325,20 @@ class Rollout(Restorable):
         random, sensors, goal = self._random_states, self._sensors, self.goal
         state, devices = self._tracking.seen(self.readings, self.devices, random, rows)
         if sensors.planes and len(rows):
-            ends = np.zeros((len(goal), 0, 3))
-            if devices is not None:
-                ends = devices.points.reshape(len(goal), -1, 3)
+            ends = np.zeros((0, 3)) if devices is None else devices.points
+            ends = ends.reshape(len(goal), -1, 3)
             points = state.centreline, ends, goal
             handles = self.index.handles(self._state.cdof)
             own = points, self.shadows, handles, random, self.around
-            sensors.capture(rows, begins, *own)
+            sensors.capture(rows, begins, *own, self.progress.steady(rows, begins))
         for name, view in self._views(rows).items() if len(rows) else ():
             sensors.hold(name, view, rows)
-        ahead = None
-        if self._routes:
-            seen = self._at_rest(state) if self._tracking.deviation else self.resting
-            ahead = look_ahead(self._routes, self._case_of, seen.head, state.head_frame)
+        seen = self._at_rest(state) if self._tracking.deviation else self.resting
+        self.progress.see(rows, begins, self._case_of, seen, sensors.images)
+        ahead = self.progress.ahead(self._case_of, seen.head, state.head_frame)
         frame = Frame(
-            *(state, self.wall_force, self._action, goal, self._chain),
-            *(sensors.images, ahead, devices, self.vessel),
+            *(state, self.wall_force, self._action, goal, self._chain, sensors.images),
+            *(ahead, devices, self.vessel, self.progress.seen(state)),
         )
         return observations.observe(self._names, frame)
 
@@ -366,9 +364,15 @@ class Rollout(Restorable):
         self._sensors.sight.changed(indices)
         self._choose_objectives()
         self.resting = self._at_rest(self.readings)
+        self.progress.restart(indices, self._case_of, self.resting)
         return self._step(indices[:0])
 
     # What others may read.
+
+    @property
+    def memory(self) -> Memory:
+        """Memory of the attempts (N,); it begins now at latest, see `Progress`."""
+        return self.progress.remember(self._case_of, vars(self).get("resting"))
 
     @property
     def begun(self) -> bool:

@@ -114,28 +114,53 @@ class Ahead(NamedTuple):
     excess: np.ndarray
 
 
+def locate_each(
+    routes: Sequence[Route],
+    chosen: np.ndarray,
+    head: np.ndarray,
+    last: np.ndarray | None = None,
+) -> Place:
+    """Places (N,) of heads on their routes.
+
+    Args:
+        routes: Of the anatomies.
+        chosen: (N,) int, number of the anatomy of each simulation.
+        head: (N, 3), m, world frame.
+        last: (N,), see `locate`.
+    """
+    place = Place(np.empty(len(head)), np.empty(len(head)))
+    for number in np.unique(chosen).tolist():
+        rows = np.flatnonzero(chosen == number)
+        near = None if last is None else last[rows]
+        found = locate(routes[number], head[rows], near)
+        place.arc_length[rows], place.excess[rows] = found
+    return place
+
+
 def look_ahead(
-    routes: Sequence[Route], chosen: np.ndarray, head: np.ndarray, frame: np.ndarray
+    routes: Sequence[Route],
+    chosen: np.ndarray,
+    place: Place,
+    head: np.ndarray,
+    frame: np.ndarray,
 ) -> Ahead:
     """Routes and lumens ahead of N tips, which may lie in different anatomies.
 
     Args:
         routes: Of the anatomies.
         chosen: (N,) int, number of the anatomy of each simulation.
+        place: Of the heads, see `locate_each`.
         head: (N, 3), m, world frame.
         frame: (N, 3, 3), orientation of each tip, its axes in columns.
     """
     points = np.empty((len(head), len(AHEAD), 3))
     radii = np.empty((len(head), len(AHEAD)))
-    excess = np.empty(len(head))
     for number in np.unique(chosen).tolist():
         route, rows = routes[number], np.flatnonzero(chosen == number)
-        place = locate(route, head[rows])
-        ways = place.arc_length[:, None] + AHEAD
+        ways = place.arc_length[rows, None] + AHEAD
         points[rows] = route.at(ways)
         radii[rows] = np.interp(ways, route.arc_length, route.radii)
-        excess[rows] = place.excess
-    return Ahead(into_frame(points - head[:, None], frame), radii, excess)
+    return Ahead(into_frame(points - head[:, None], frame), radii, place.excess)
 
 
 def into_frame(vectors: np.ndarray, frame: np.ndarray) -> np.ndarray:

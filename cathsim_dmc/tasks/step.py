@@ -31,7 +31,7 @@ class Step(NamedTuple):
         observation: arrays (N, ...), which may share memory with the readings.
         outcome: reward, success and reward terms, arrays (N,); the reward is 0 and
             there is no success where the physics failed.
-        terminated: (N,) bool, success or a physics error.
+        terminated: (N,) bool, success, a physics error, or given up (option `give_up`).
         truncated: (N,) bool, out of time.
         errors: N reasons, None where the physics went well.
         readings: state of the devices.

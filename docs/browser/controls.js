@@ -30,6 +30,7 @@ export class Controls {
 
   restart() {
     this.held = new Set();
+    this.leaning = {}; // shares by axis, of a gamepad
     this.bend = [0, 0];
   }
 
@@ -48,6 +49,9 @@ export class Controls {
     for (const command of this.held) {
       const [axis, sign] = HELD[command];
       axes[axis] += sign;
+    }
+    for (const axis of Object.keys(axes)) {
+      axes[axis] = Math.min(Math.max(axes[axis] + (this.leaning[axis] ?? 0), -1), 1);
     }
     this.bend = [axes.bendX, axes.bendY].map((rate, i) =>
       Math.min(Math.max(this.bend[i] + BEND_RATE * duration * rate, -1), 1),

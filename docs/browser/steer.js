@@ -4,6 +4,7 @@ import loadMujoco from "./vendor/mujoco.js";
 import { Controls, KEYS } from "./controls.js";
 import { GlassView, Trace } from "./drawing.js";
 import { Fluoroscope } from "./fluoroscopy.js";
+import { Gamepads } from "./gamepad.js";
 import { Simulation } from "./simulation.js";
 
 const element = (id) => document.getElementById(id);
@@ -14,6 +15,7 @@ class Page {
   constructor(mujoco, scene, task, views) {
     this.simulation = new Simulation(mujoco, scene, task);
     this.controls = new Controls(task.tip_joints);
+    this.gamepads = new Gamepads();
     this.views = views;
     this.trace = new Trace(element("trace"), 318, 120);
     this.milliseconds = 0; // of a control step, a running mean
@@ -40,6 +42,7 @@ class Page {
     const spent = performance.now() - start;
     this.milliseconds += (spent - this.milliseconds) / Math.min(simulation.steps, 25);
     this.trace.add(simulation.wall.peakMax);
+    this.gamepads.feel(simulation.wall.max);
     if (simulation.success) {
       this.end(`Reached after ${simulation.time.toFixed(1)} s. Press R to reset.`, "good");
     } else if (simulation.failed) {
@@ -64,6 +67,7 @@ class Page {
     if (!this.running) return;
     const period = 1e3 * this.simulation.task.control_timestep;
     this.clock ??= now;
+    this.gamepads.poll(this.controls, (command) => this.press(command));
     let steps = 0;
     while (!this.ended && now - this.clock >= period && steps < 3) {
       this.clock += period;

@@ -4,7 +4,8 @@
  *
  *   node visit.mjs NODE_MODULES ADDRESS SCREENSHOT.png [KEY:SECONDS …]
  *
- * Prints a JSON object: simulated seconds, insertion (m), distance (m), the largest
+ * "Pad:SECONDS" in place of a key pushes with the left stick of a gamepad that the page
+ * is told of, whose vibrations are counted. Prints a JSON object: simulated seconds, insertion (m), distance (m), the largest
  * contact (N), milliseconds of a control step, and errors of the page.
  */
 
@@ -29,10 +30,23 @@ try {
   const errors = [];
   page.on("pageerror", (error) => errors.push(error.message));
   page.on("requestfailed", (request) => errors.push(`not loaded: ${request.url()}`));
+  await page.addInitScript(() => {
+    globalThis.pad = { connected: false, mapping: "standard", axes: [0, -1, 0, 0],
+      buttons: [], felt: [], vibrationActuator: { playEffect: async (kind, how) => {
+        globalThis.pad.felt.push(how.strongMagnitude);
+      } } };
+    navigator.getGamepads = () => [null, globalThis.pad];
+  });
   await page.goto(address);
   await page.waitForFunction(() => globalThis.cathsim, null, { timeout: 300_000 });
   for (const key of keys) {
     const [name, seconds] = key.split(":");
+    if (name === "Pad") {
+      await page.evaluate(() => { globalThis.pad.connected = true; });
+      await page.waitForTimeout(1e3 * Number(seconds));
+      await page.evaluate(() => { globalThis.pad.connected = false; });
+      continue;
+    }
     const held = name.split("+");
     for (const each of held) await page.keyboard.down(each);
     await page.waitForTimeout(1e3 * Number(seconds));
@@ -46,6 +60,7 @@ try {
       distance: simulation.distance,
       largest: Math.max(0, ...trace.values) / 1e3,
       milliseconds,
+      felt: globalThis.pad.felt.length,
     };
   });
   await page.screenshot({ path: screenshot });

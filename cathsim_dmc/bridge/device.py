@@ -1,0 +1,382 @@
+"""The side of the device: it keeps the clock, and stops when its driver does not."""
+
+import contextlib
+import dataclasses
+import itertools
+import socket
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from cathsim_dmc import bounds
+from cathsim_dmc.bridge import messages
+from cathsim_dmc.bridge.messages import BridgeError, Connection
+from cathsim_dmc.bridge.records import Log, milliseconds
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.interface import action_table, observation_table
+
+HANDSHAKE = 5.0  # s, in which a driver says hello
+IDLE = 60.0  # s, for which a driver may wait between episodes
+MOST_FRAMES = 50  # in one period; more are a flood
+_SLICE = 0.2  # s, after which a wait looks around
+# Proposed threshold of rupture, docs/limits.md.
+FORCE_LIMIT = 1.5  # N
+LIMITED = ("largest", "push")
+
+
+class State(NamedTuple):
+    """What a device measures once in a period.
+
+    Attributes:
+        observation: Arrays by key, as the device's table says.
+        force: Newtons by name, those that are measured: "largest", the largest contact
+            with the wall, "sum", of all contacts, and "push", at the base.
+        time: Clock of the device, s.
+        end: Why the episode is over, such as "success" or "truncated"; None while it
+            goes on.
+    """
+
+    observation: Mapping[str, np.ndarray]
+    force: Mapping[str, float]
+    time: float
+    end: str | None = None
+
+
+class Device(Protocol):
+    """What can be served: a simulation, or a robot.
+
+    Attributes:
+        name: Name for people.
+        period: Duration of a control step, s.
+        action: A dictionary for each entry of an action, see `interface.action_table`:
+            "name", "unit", "low" and "high". Entries whose unit is a speed are 0 where
+            the device is to hold still.
+        observation: A dictionary for each array, see `interface.observation_table`:
+            "key", "shape" and "dtype".
+    """
+
+    name: str
+    period: float
+    action: Sequence[Mapping[str, Any]]
+    observation: Sequence[Mapping[str, Any]]
+
+    def start(self, seed: int | None) -> State:
+        """Go to the start of an episode."""
+        ...
+
+    def command(self, action: np.ndarray) -> None:
+        """Take the action (A,) of the present period; called as soon as it is there."""
+        ...
+
+    def read(self) -> State:
+        """Measure at the end of a period."""
+        ...
+
+    def stop(self) -> None:
+        """Stand still now; called whenever an episode is over, for whatever reason."""
+        ...
+
+
+class SimulatedDevice:
+    """A task of the suite as a device."""
+
+    period = CONTROL_TIMESTEP
+
+    def __init__(self, environment: Any, name: str):
+        """Takes what `suite.load` returns."""
+        self.name, self._env = name, environment
+        task, chain = environment.task, environment.task.scene.catheter
+        self.action: Sequence[Mapping[str, Any]] = action_table(chain)
+        self.observation: Sequence[Mapping[str, Any]] = observation_table(task)
+
+    def start(self, seed: int | None) -> State:
+        """Reset; a seed gives the same episode as the suite's `random`."""
+        if seed is not None:
+            self._env.random_state.seed(seed)
+        return self._state(self._env.reset())
+
+    def command(self, action: np.ndarray) -> None:
+        """Keep the action until `read`."""
+        self._action = action
+
+    def read(self) -> State:
+        """Simulate the period with the action."""
+        return self._state(self._env.step(self._action))
+
+    def stop(self) -> None:
+        """Nothing moves between two steps of a simulation."""
+
+    def _state(self, timestep: Any) -> State:
+        task = self._env.task
+        info, end = task.info(), None
+        if timestep.last():
+            kinds = (k for k in ("success", "physics_error") if info[k])
+            end = next(kinds, "truncated")
+        force = {"largest": task.wall_force.max, "sum": task.wall_force.sum}
+        force["push"] = task.readings.push_force
+        forces = {name: float(np.asarray(value)) for name, value in force.items()}
+        return State(timestep.observation, forces, float(self._env.physics.time()), end)
+
+
+@dataclasses.dataclass(frozen=True)
+class ServeOptions:
+    """How a device is served.
+
+    Attributes:
+        lockstep: Whether each period waits for its action, at any speed; otherwise the
+            clock does not wait.
+        missed: What the device does in a period whose action has not come in time:
+            "still", no translation and no rotation, or "hold", the last action.
+        watchdog: Silence of the driver after which the device stops, s.
+        force_limit: Largest contact or push above which the device stops, N; None for
+            none.
+    """
+
+    lockstep: bool = False
+    missed: str = "still"
+    watchdog: float = 0.2
+    force_limit: float | None = FORCE_LIMIT
+
+    def __post_init__(self) -> None:
+        bounds.choice("missed", self.missed, ("still", "hold"))
+        bounds.number("watchdog", self.watchdog, 0.0, 3600.0, "s", positive=True)
+        if self.force_limit is not None:
+            bounds.number("force_limit", self.force_limit, unit="N", positive=True)
+
+
+def serve(
+    device: Device,
+    listener: socket.socket,
+    options: ServeOptions | None = None,
+    *,
+    episodes: int | None = None,
+    log: Log | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> list[dict[str, Any]]:
+    """Serve one driver after the other.
+
+    Args:
+        listener: A socket that listens, see `listen`.
+        episodes: Number of episodes after which it returns; None for ever.
+        log: What was received and applied.
+        say: Function that is called with a line of progress.
+
+    Returns:
+        For each episode "end", "steps", "missed", "late", "force" (largest, N), and
+        percentiles of "answer" (from a state to its action) and "tick" (by how much a
+        period begins late), ms.
+    """
+    done: list[dict[str, Any]] = []
+    log = log or Log(None)
+    while episodes is None or len(done) < episodes:
+        listener.settimeout(_SLICE)
+        try:
+            sock, (peer, port, *_) = listener.accept()
+        except TimeoutError:
+            continue
+        link, wrong = Connection(sock), None
+        log.write("connected", peer=f"{peer}:{port}")
+        session = _Session(device, link, listener, options or ServeOptions(), log)
+        try:
+            session.greet()
+            while (episodes is None or len(done) < episodes) and session.begins():
+                done.append(session.episode())
+                say(f"{peer}:{port}: {done[-1]['end']} after {done[-1]['steps']} steps")
+        except BridgeError as error:
+            wrong = error
+            say(f"{peer}:{port}: {error}")
+            log.write("refused", fault=error.fault, reason=error.text)
+            if session.running is not None:
+                done.append(session.summary(error.fault))
+        finally:
+            device.stop()
+            link.close(wrong)
+    return done
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that listens; OSError if the port is taken, 0 takes a free one."""
+    bounds.whole("port", port, 0, 65535)
+    try:
+        return socket.create_server((host, port), backlog=8)
+    except OSError as error:
+        text = f"cannot listen on {host}:{port}; choose another --port or --host"
+        raise OSError(f"{text}: {error}") from error
+
+
+@dataclasses.dataclass
+class _Running:
+    """Counts of an episode."""
+
+    step: int = 0
+    missed: int = 0
+    late: int = 0
+    force: float = 0.0
+    answers: list[float] = dataclasses.field(default_factory=list)
+    ticks: list[float] = dataclasses.field(default_factory=list)
+
+
+class _Session:
+    """One driver."""
+
+    running: _Running | None = None
+
+    def __init__(
+        self,
+        device: Device,
+        link: Connection,
+        listener: socket.socket,
+        options: ServeOptions,
+        log: Log,
+    ):
+        self._device, self._link, self._listener = device, link, listener
+        self._options, self._log = options, log
+        speeds = ["/s" in str(one["unit"]) for one in device.action]
+        self._speeds = np.array(speeds, dtype=bool)
+
+    def greet(self) -> None:
+        hello = self._wait(HANDSHAKE, "hello")
+        messages.require_version(hello)
+        device = self._device
+        self._link.send(
+            HANDSHAKE, "welcome", protocol=messages.PROTOCOL, name=device.name,
+            period=device.period, action=list(device.action),
+            observation=list(device.observation), watchdog=self._options.watchdog,
+            force_limit=self._options.force_limit, lockstep=self._options.lockstep,
+        )  # fmt: skip
+
+    def begins(self) -> bool:
+        """Wait for the start of an episode; False if the driver has left."""
+        try:
+            # Actions on their way when the last episode ended have no effect.
+            message = self._wait(IDLE, "start", "action", "stop")
+            while message["kind"] != "start":
+                message = self._wait(IDLE, "start", "action", "stop")
+        except BridgeError as error:
+            if error.fault == "peer_lost":
+                return False
+            raise
+        if message["seed"] is not None:
+            try:
+                bounds.seed("seed", message["seed"])
+            except ValueError as error:
+                raise BridgeError("bad_message", str(error)) from error
+        self._seed = message["seed"]
+        return True
+
+    def episode(self) -> dict[str, Any]:
+        """Play one; whatever happens, the device stands still afterwards."""
+        device, options = self._device, self._options
+        self.running = run = _Running()
+        self._heard = due = time.monotonic()
+        last = np.zeros(len(self._speeds))
+        try:
+            state = device.start(self._seed)
+            self._heard = due = time.monotonic()
+            while True:
+                end = state.end or self._too_much(state.force)
+                self._send(run.step, state, end)
+                if end is not None:
+                    break
+                due = max(due, time.monotonic() - device.period) + device.period
+                action, reason = self._action(due)
+                if reason is not None:
+                    end = "stopped"
+                    self._log.write("stop", step=run.step, reason=reason)
+                    self._link.send(device.period, "stop", reason=reason)
+                    break
+                if action is None:
+                    run.missed += 1
+                    hold = options.missed == "hold"
+                    action = last if hold else np.where(self._speeds, 0.0, last)
+                    device.command(action)
+                if not options.lockstep:
+                    time.sleep(max(0.0, due - time.monotonic()))
+                    run.ticks.append(time.monotonic() - due)
+                last = action
+                self._log.write(
+                    "applied", step=run.step, action=action.tolist(),
+                    force=dict(state.force),
+                )  # fmt: skip
+                run.step += 1
+                state = device.read()
+        finally:
+            device.stop()
+        self._log.write("end", step=run.step, reason=end)
+        found = self.summary(end)
+        self.running = None
+        return found
+
+    def summary(self, end: str) -> dict[str, Any]:
+        run = self.running or _Running()
+        return {
+            "end": end, "steps": run.step, "missed": run.missed, "late": run.late,
+            "force": run.force, "answer": milliseconds(run.answers),
+            "tick": milliseconds(run.ticks),
+        }  # fmt: skip
+
+    def _too_much(self, force: Mapping[str, float]) -> str | None:
+        run, limit = self.running or _Running(), self._options.force_limit
+        largest = max((abs(force[k]) for k in LIMITED if k in force), default=0.0)
+        run.force = max(run.force, largest)
+        return "force_limit" if limit is not None and largest > limit else None
+
+    def _send(self, step: int, state: State, end: str | None) -> None:
+        observation = {k: messages.to_json(v) for k, v in state.observation.items()}
+        self._sent = time.monotonic()
+        self._link.send(
+            self._options.watchdog, "state", step=step, time=state.time,
+            observation=observation, force=dict(state.force), end=end,
+        )  # fmt: skip
+
+    def _action(self, due: float) -> tuple[np.ndarray | None, str | None]:
+        """The action of the present period, if it comes, and why to stop, or None."""
+        run, options = self.running or _Running(), self._options
+        for frames in itertools.count():
+            now = time.monotonic()
+            until = self._heard + options.watchdog
+            if now > until:
+                return None, f"watchdog: no action for {now - self._heard:.3f} s"
+            message = self._link.receive(until if options.lockstep else min(due, until))
+            self._turn_away()
+            if message is None:
+                if options.lockstep or time.monotonic() < due:
+                    continue
+                return None, None
+            if frames > MOST_FRAMES:
+                raise BridgeError("flood", f"over {MOST_FRAMES} frames in a period")
+            message = messages.require_kind(message, "action", "stop")
+            if message["kind"] == "stop":
+                return None, f"driver: {message['reason'][:200]}"
+            self._heard = time.monotonic()
+            size = (len(self._speeds),)
+            given = messages.to_array("action", message["action"], size, "float64")
+            if message["step"] > run.step:
+                text = f"action of step {message['step']}, but step {run.step} runs"
+                raise BridgeError("out_of_order", text)
+            if message["step"] < run.step:
+                run.late += 1  # of a state that is over
+                continue
+            run.answers.append(self._heard - self._sent)
+            action = np.clip(given, -1.0, 1.0)
+            self._device.command(action)
+            return action, None
+        raise AssertionError("unreachable")
+
+    def _wait(self, seconds: float, *kinds: str) -> dict[str, Any]:
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            message = self._link.receive(time.monotonic() + min(left, _SLICE))
+            self._turn_away()
+            if message is not None:
+                return messages.require_kind(message, *kinds)
+        return messages.require_kind(None, *kinds)
+
+    def _turn_away(self) -> None:
+        """Tell another driver that there is one already."""
+        self._listener.settimeout(0.0)
+        with contextlib.suppress(OSError):
+            sock, _ = self._listener.accept()
+            Connection(sock).close(BridgeError("busy", "another program drives it"))

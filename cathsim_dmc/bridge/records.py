@@ -1,0 +1,60 @@
+"""What was sent and when: a log that outlives a crash, and percentiles of times."""
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc import files
+
+PERCENTILES = (50, 95, 99)
+
+
+class Log:
+    """Lines of JSON, each written at once, so that they outlive a crash.
+
+    Each has "t", the seconds since the log was opened.
+    """
+
+    def __init__(self, path: str | Path | None):
+        """Opens a new file; None keeps no log. FileExistsError if it is there."""
+        self._began = time.monotonic()
+        self._file = None
+        if path is not None:
+            self._file = open(files.require_file(path, make=True), "x")
+
+    def write(self, event: str, **values: Any) -> None:
+        """Add a line."""
+        if self._file is not None:
+            line = {"t": round(time.monotonic() - self._began, 6), "event": event}
+            self._file.write(json.dumps({**line, **values}) + "\n")
+            self._file.flush()
+
+    def __enter__(self) -> "Log":
+        """The log itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Say what ended it, and close the file."""
+        if error is not None:
+            self.write("error", reason=f"{type(error).__name__}: {error}")
+        if self._file is not None:
+            self._file.close()
+
+
+def milliseconds(seconds: Sequence[float]) -> dict[str, float] | None:
+    """Percentiles and the largest of some times, ms; None of none."""
+    if not len(seconds):
+        return None
+    times = 1e3 * np.asarray(seconds)
+    found = {f"p{p}": float(np.percentile(times, p)) for p in PERCENTILES}
+    return {n: round(t, 3) for n, t in {**found, "max": float(times.max())}.items()}

@@ -1,0 +1,200 @@
+"""Where N heads are on their routes, and what is remembered of their attempts."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.tasks import observations, retry
+from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.observation_kind import ROUTE
+from cathsim_dmc.tasks.retry import Memory
+from cathsim_dmc.tasks.route import Ahead, Place, Route, locate_each, look_ahead
+
+_NARROW_AHEAD = 10e-3  # m along the route within which a narrow lumen is seen
+_ROOM = 1.5  # radii of the device; a lumen with less room is too narrow for it
+_SHOWN = ("route_retry", "biplane_retry")
+
+
+class Progress:
+    """Places of the heads on the routes, and the memory of the attempts.
+
+    Attributes:
+        shown: Whether policies observe the memory.
+        ends: Whether episodes end where it gives up.
+        settings: Of the memory.
+        memory: Arrays (N,); None where neither task nor policy needs it.
+    """
+
+    def __init__(
+        self, names: Sequence[str], cases: Sequence[Case], count: int, ends: bool
+    ):
+        """Prepares what observations of these names and the end of episodes need.
+
+        Raises:
+            ValueError: if an objective is not `Routed`, or two memories are observed.
+        """
+        self._cases, self._count, self.ends = cases, count, ends
+        shown = [name for name in _SHOWN if name in names]
+        if len(shown) > 1:
+            raise ValueError(
+                f"observation has {' and '.join(shown)}, but there is one memory of "
+                "attempts; leave one of the two out"
+            )
+        self.shown, self._of_images = bool(shown), shown == ["biplane_retry"]
+        chain = cases[0].scene.catheter
+        self._coaxial, self._radius = chain.coaxial, chain.devices[0].outer_radius
+        self.settings = retry.COAXIAL if self._coaxial else retry.SINGLE
+        self.memory: Memory | None = None
+        self._observed = observations.needs(names, ROUTE)
+        self._routes: list[Route] = []
+        if self._observed:
+            self._routes = [Route.of(case.objective) for case in cases]
+        # A memory that a policy alone has asked for is no part of the task.
+        self.state = ("memory",) if self.shown or ends else ()  # see `snapshot`
+        if self.state:
+            self._prepare()
+
+    def _prepare(self) -> None:
+        """A memory of nothing yet, and what it needs to know of the routes."""
+        if not self._of_images:  # otherwise a policy does not know them
+            self._routes = self._routes or [Route.of(c.objective) for c in self._cases]
+        routes = [] if self._of_images else self._routes
+        least = _ROOM * self._radius
+        tight = [route.arc_length[route.radii < least] for route in routes]
+        last = len(self.settings.leads) - 1
+        blunt = [retry.blunt(self.settings, route) for route in routes]
+        self._tight, self._first = tight, last * np.array(blunt, int)
+        nowhere = Place(np.full(self._count, np.nan), np.zeros(self._count))
+        self.memory = Memory.at(nowhere, np.zeros(self._count))
+
+    def remember(self, chosen: np.ndarray, state: Readings | None) -> Memory:
+        """The memory; it begins now if there was none.
+
+        Args:
+            chosen: (N,) int, number of the anatomy of each simulation.
+            state: Of the devices in the vessel at rest; None before any episode.
+
+        Raises:
+            ValueError: if an objective is not `Routed`.
+        """
+        if self.memory is None:
+            self._prepare()
+            if state is not None:
+                self.restart(np.arange(self._count), chosen, state)
+        assert self.memory is not None
+        return self.memory
+
+    @property
+    def given_up(self) -> np.ndarray | bool:
+        """(N,) bool, whose episodes end because the memory gives up."""
+        return self.ends and self.memory is not None and self.memory.given_up
+
+    def steady(self, rows: np.ndarray, begins: bool) -> np.ndarray:
+        """(N,) m, places to stay near, see `route.locate`; NaN where there are none.
+
+        Args:
+            rows: (K,) numbers of the simulations that are observed anew.
+            begins: Whether they begin an episode.
+        """
+        last = np.full(self._count, np.nan)
+        if self.memory is not None:
+            last = self.memory.steady
+            if begins:
+                last[rows] = np.nan
+        return last
+
+    def see(
+        self,
+        rows: np.ndarray,
+        begins: bool,
+        chosen: np.ndarray,
+        state: Readings,
+        images: Mapping[str, np.ndarray],
+    ) -> None:
+        """Begins or advances the memory, if there is one, after a control step.
+
+        Args:
+            rows: (K,) numbers of the simulations that begin, otherwise of all; none
+                where nothing has moved.
+            begins: Whether they begin an episode.
+            chosen: (N,) int, number of the anatomy of each simulation.
+            state: Of the devices as policies see them, in the vessel at rest.
+            images: What sensors see, with "biplane_place" and "biplane_deviation"
+                where the memory is of the route through both roadmaps.
+        """
+        if self.memory is None or not len(rows):
+            return
+        if self._of_images:
+            place = Place(
+                *(images[f"biplane_{n}"][:, 0] for n in ("place", "deviation"))
+            )
+        else:
+            last = self.steady(rows, begins)
+            place = locate_each(self._routes, chosen, state.head, last)
+        if begins:
+            self._begin(rows, chosen, place, state.insertion)
+        else:
+            seen = place, state.insertion, state.push_force
+            narrow = self._narrow(chosen, place)
+            self.memory = retry.advance(self.settings, self.memory, *seen, narrow)
+
+    def restart(self, rows: np.ndarray, chosen: np.ndarray, state: Readings) -> None:
+        """Begins a memory that is no part of the task, where heads are put elsewhere.
+
+        Args:
+            rows: (K,) numbers of the simulations.
+            chosen: (N,) int, number of the anatomy of each simulation.
+            state: Of the devices, in the vessel at rest.
+        """
+        if self.memory is not None and not self.state:
+            place = locate_each(self._routes, chosen, state.head)
+            self._begin(rows, chosen, place, state.insertion)
+
+    def _begin(
+        self, rows: np.ndarray, chosen: np.ndarray, place: Place, insertion: np.ndarray
+    ) -> None:
+        assert self.memory is not None
+        new = Memory.at(place, insertion)
+        if len(self._first):
+            new = new._replace(first=self._first[chosen])
+        begun = np.zeros(self._count, bool)
+        begun[rows] = True
+        pairs = zip(self.memory, new, strict=True)
+        self.memory = Memory(*(np.where(begun, b, a) for a, b in pairs))
+
+    def _narrow(self, chosen: np.ndarray, place: Place) -> np.ndarray:
+        """(N,) bool, whether the lumen ahead is narrower than the device."""
+        narrow = np.zeros(self._count, bool)
+        for number, tight in enumerate(self._tight):
+            if len(tight):
+                rows = np.flatnonzero(chosen == number)
+                where = place.arc_length[rows]
+                nearest = np.append(tight, np.inf)[np.searchsorted(tight, where)]
+                narrow[rows] = nearest < where + _NARROW_AHEAD
+        return narrow
+
+    def ahead(
+        self, chosen: np.ndarray, head: np.ndarray, frame: np.ndarray
+    ) -> Ahead | None:
+        """The route ahead, from the place in the memory where that is observed.
+
+        Args:
+            chosen: (N,) int, number of the anatomy of each simulation.
+            head: (N, 3), m, in the vessel at rest.
+            frame: (N, 3, 3), orientation of each tip, its axes in columns.
+        """
+        if not self._observed:
+            return None
+        if self.shown and not self._of_images and self.memory is not None:
+            place = Place(self.memory.arc_length, self.memory.excess)
+        else:
+            place = locate_each(self._routes, chosen, head)
+        return look_ahead(self._routes, chosen, place, head, frame)
+
+    def seen(self, state: Readings) -> np.ndarray | None:
+        """What policies see of the memory, see `retry.shown`; None if nothing."""
+        if not self.shown or self.memory is None:
+            return None
+        own = state.insertion, state.push_force, self._coaxial
+        return retry.shown(self.settings, self.memory, *own)

@@ -1,0 +1,295 @@
+"""Memory of the attempts along a route, from what a policy may see alone.
+
+An automaton over the place of the head on the route, the insertion and the force of the
+base. A task advances it once in a control step, whoever acts; the expert decides by it,
+and a policy that observes it needs no recurrence.
+
+When the head makes no progress, has left the tube of the route as in a wrong branch, or
+the base is pushed too hard, the device is withdrawn until the head is back in the
+route, from farther back with each retry, and tries again. A shaft that buckles into a
+wide vessel while the head stays is given up too; taking up that slack lets the head
+spring forward, so of such retries most withdraw only as long as the head does not come
+back. Where the lumen ahead is narrower than the device, or the base was pushed too hard
+at one place several times, there is no further attempt.
+
+Pure functions of arrays with leading batch axes, written `...`; metres and newtons.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from cathsim_dmc.tasks.route import Place, Route
+
+_WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
+_GROWING = 4  # retries over which the way back grows
+_SAME_PLACE = 5e-3  # m of the route
+# Scales of what a policy sees.
+_SEEN_WAY, _SEEN_LEAD, _SEEN_ATTEMPTS = 20e-3, 20e-3, 4
+RETRY_ENTRIES, COAXIAL_RETRY_ENTRIES = 11, 15
+
+
+@dataclasses.dataclass(frozen=True)
+class RetrySettings:
+    """When to give an attempt up, how far to withdraw, and what the next one changes.
+
+    Attributes:
+        progress: m; what the head must gain to count as moving.
+        patience: control steps without progress until a retry.
+        lost_patience: control steps outside the route's tube until a retry.
+        tolerance: by how much of its radius the lumen may exceed the route's tube.
+        hard_push: force of the base above which it is pushed too hard, N.
+        push_patience: control steps of such a push until a retry.
+        most_pushed: retries after such pushes at one place, with which it gives up.
+        backoff: way back of the first retry, m.
+        backoff_growth: of the way back from each retry to the next, up to the fourth.
+        longest: control steps after which a withdrawal ends inside the tube.
+        slack: what the base may advance while the head does not, m.
+        give: distance that the head may move back while slack is taken up, m.
+        thorough: every n-th retry withdraws the whole way, not the slack alone.
+        lookahead_factors: of the look-ahead in successive attempts, over and over.
+        leads: by how much each coaxial device is ahead of the one around it in
+            successive attempts, over and over, m; negative where it stays behind in it.
+        offsets: added to the direction of coaxial devices likewise, rad.
+        sharp, planar: turn of the route into its last branch, rad, and cosine between
+            the planes of this turn and of the bend before it, below either of which
+            the attempts begin with the last of the leads, see `blunt`.
+    """
+
+    progress: float = 0.3e-3
+    patience: int = 40
+    lost_patience: int = 10
+    tolerance: float = 0.25
+    hard_push: float = 0.1
+    push_patience: int = 2
+    most_pushed: int = 6
+    backoff: float = 15e-3
+    backoff_growth: float = 0.5
+    longest: int = 120
+    slack: float = np.inf
+    give: float = 0.0
+    thorough: int = 1
+    lookahead_factors: tuple[float, ...] = (1.0, 0.75, 1.3)
+    leads: tuple[float, ...] = (0.0,)
+    offsets: tuple[float, ...] = (0.0,)
+    sharp: float = 0.0
+    planar: float = -1.0
+
+
+SINGLE = RetrySettings()
+COAXIAL = RetrySettings(
+    progress=0.5e-3,
+    patience=60,
+    lost_patience=15,
+    hard_push=np.inf,
+    slack=12e-3,
+    give=2e-3,
+    thorough=4,
+    lookahead_factors=(1.4, 1.0, 0.75),
+    leads=(0.02, -0.03, -0.045, -0.02),
+    offsets=(0.0, 0.0, 0.0, 0.7, -0.7, 0.0, 1.4, -1.4),
+    sharp=0.84,
+    planar=0.85,
+)
+
+
+class Memory(NamedTuple):
+    """What is remembered of the attempts of an episode, arrays (...).
+
+    Attributes:
+        arc_length: of the place of the head on the route, m.
+        excess: `Place.excess` there.
+        retracting: bool.
+        taking_up: bool, whether the retraction ends when the slack is taken up.
+        turn: insertion to be withdrawn to while retracting, m.
+        best: farthest place on the route in this attempt, m.
+        held: insertion when the head was there, m.
+        stale: control steps since then, or since the withdrawal began.
+        lost: control steps out of the route's tube.
+        pressed: control steps of too hard a push.
+        barrier: place of the first retry after such a push, m.
+        pushed: number of these retries at that place.
+        attempts: retries so far.
+        first: number of the lead that the first attempt has.
+        given_up: bool, whether there is no further attempt.
+    """
+
+    arc_length: np.ndarray
+    excess: np.ndarray
+    retracting: np.ndarray
+    taking_up: np.ndarray
+    turn: np.ndarray
+    best: np.ndarray
+    held: np.ndarray
+    stale: np.ndarray
+    lost: np.ndarray
+    pressed: np.ndarray
+    barrier: np.ndarray
+    pushed: np.ndarray
+    attempts: np.ndarray
+    first: np.ndarray
+    given_up: np.ndarray
+
+    @classmethod
+    def at(cls, place: Place, insertion: np.ndarray) -> "Memory":
+        """Memory (...) at the start of an episode, of heads at a place."""
+        arc_length, shape = np.array(place.arc_length), np.shape(insertion)
+        no, zero, none = np.zeros(shape, bool), np.zeros(shape), np.zeros(shape, int)
+        return cls(
+            arc_length=arc_length,
+            excess=np.array(place.excess),
+            best=arc_length,
+            held=np.array(insertion),
+            barrier=arc_length,
+            **dict.fromkeys(("retracting", "taking_up", "given_up"), no),
+            **dict.fromkeys(("stale", "lost", "pressed"), none),
+            **dict.fromkeys(("pushed", "attempts", "first"), none),
+            turn=zero,
+        )
+
+    @property
+    def steady(self) -> np.ndarray:
+        """Places (...) to stay near, m; NaN in even attempts.
+
+        In every other attempt the head's place does not jump: both ways fail in some
+        branchings.
+        """
+        return np.where(self.attempts % 2 == 1, self.arc_length, np.nan)
+
+
+def advance(
+    settings: RetrySettings,
+    memory: Memory,
+    place: Place,
+    insertion: np.ndarray,
+    push: np.ndarray,
+    narrow: np.ndarray | bool = False,
+) -> Memory:
+    """Counts progress over a control step; begins and ends retries.
+
+    Args:
+        place: Of the head on the route, arrays (...).
+        insertion: (...), of the head's device, m.
+        push: (...), force of the base, positive forward, N.
+        narrow: (...) bool, whether the lumen ahead is narrower than the device.
+    """
+    m, s = memory, settings
+    outside, on = place.excess > s.tolerance, ~(m.retracting | m.given_up)
+    gained = place.arc_length > m.best + s.progress
+    stale = np.where(gained & on, 0, m.stale + 1)
+    lost = np.where(outside & on, m.lost + 1, 0)
+    pressed = np.where((push > s.hard_push) & on, m.pressed + 1, 0)
+    held = np.where(gained | m.retracting, np.minimum(insertion, m.held), m.held)
+    held = np.where(gained, insertion, held)
+    buckled = on & (insertion > held + s.slack)
+    strayed, forced = lost > s.lost_patience, pressed > s.push_patience
+    give_up = on & ((stale > s.patience) | buckled) | strayed | forced
+    attempts = m.attempts + give_up
+    taking_up = ~strayed & ~forced & (attempts % s.thorough != 0)
+    taking_up = np.where(give_up, taking_up, m.taking_up)
+    growth = 1 + s.backoff_growth * (m.attempts % _GROWING)
+    turn = np.where(give_up, insertion - s.backoff * growth, m.turn)
+    best = np.where(give_up | gained, place.arc_length, m.best)
+    # Taking up slack ends when the head comes back with the shaft.
+    comes_back = taking_up & ~give_up & (place.arc_length < best - s.give)
+    back = (insertion <= turn) | comes_back | m.retracting & (stale > s.longest)
+    back = back & ~outside | (insertion <= _WITHDRAWN)
+    retracting = (m.retracting | give_up) & ~back
+    again = m.retracting & ~retracting
+    barrier, pushed = _barrier(m, place, forced)
+    return m._replace(
+        arc_length=np.array(place.arc_length),
+        excess=np.array(place.excess),
+        retracting=retracting,
+        taking_up=taking_up,
+        turn=turn,
+        best=np.where(again, place.arc_length, best),
+        held=np.where(again, insertion, held),
+        stale=np.where(give_up | again, 0, stale),
+        lost=lost,
+        pressed=np.where(give_up, 0, pressed),
+        barrier=barrier,
+        pushed=pushed,
+        attempts=attempts,
+        given_up=m.given_up | (pushed >= s.most_pushed) | narrow & ~outside,
+    )
+
+
+def _barrier(
+    memory: Memory, place: Place, forced: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Place of the first too hard push, and number of retries after one there."""
+    farther = place.arc_length > memory.barrier + _SAME_PLACE
+    barrier = np.where(forced & farther, place.arc_length, memory.barrier)
+    pushed = np.where(farther, 0, memory.pushed) + forced
+    return barrier, pushed
+
+
+def lookahead(settings: RetrySettings, memory: Memory) -> np.ndarray:
+    """Factor (...) of the look-ahead in the present attempt."""
+    return _nth(settings.lookahead_factors, memory.attempts)
+
+
+def lead(settings: RetrySettings, memory: Memory) -> np.ndarray:
+    """Lead (...) of coaxial devices in the present attempt, m."""
+    return _nth(settings.leads, memory.attempts + memory.first)
+
+
+def offset(settings: RetrySettings, memory: Memory) -> np.ndarray:
+    """Offset (...) of the direction of coaxial devices likewise, rad."""
+    return _nth(settings.offsets, memory.attempts)
+
+
+def _nth(values: tuple[float, ...], number: np.ndarray) -> np.ndarray:
+    return np.asarray(values)[number % len(values)]
+
+
+def shown(
+    settings: RetrySettings,
+    memory: Memory,
+    insertion: np.ndarray,
+    push: np.ndarray,
+    coaxial: bool,
+) -> np.ndarray:
+    """What a policy sees of it: (..., `RETRY_ENTRIES` or `COAXIAL_RETRY_ENTRIES`)."""
+    m, s = memory, settings
+    left = np.clip((insertion - m.turn) / _SEEN_WAY, -1.0, 2.0)
+    turns = m.attempts % len(s.lookahead_factors)
+    columns = [
+        m.retracting,
+        np.where(m.retracting, left, 0.0),
+        np.clip(m.stale / s.patience, 0.0, 2.0),
+        np.clip(m.lost / s.lost_patience, 0.0, 2.0),
+        np.minimum(m.attempts, _SEEN_ATTEMPTS) / _SEEN_ATTEMPTS,
+        *(turns == number for number in range(3)),
+        m.attempts % 2 == 1,
+        push,
+        m.given_up,
+    ]
+    if coaxial:
+        angle = offset(s, m)
+        columns += [m.taking_up, lead(s, m) / _SEEN_LEAD, np.cos(angle), np.sin(angle)]
+    return np.stack([np.asarray(column, float) for column in columns], axis=-1)
+
+
+def blunt(settings: RetrySettings, route: Route, way: float = 20e-3) -> bool:
+    """Whether attempts of coaxial devices begin with the last of the leads.
+
+    The bend before a take-off presses a wire on the outer wall of the vessel in the
+    plane of the bend; it hooks a branch that leaves there, and passes by one that
+    leaves aside or goes nearly straight on. The shaped end of a catheter, turned there,
+    enters these.
+
+    Args:
+        way: Over which the directions before and after the take-off are measured, m.
+    """
+    ostium = float(route.arc_length[np.diff(route.radii).argmin()])
+    points = route.at(ostium + way * np.array([-2.0, -1.0, 0.0, 1.0]))
+    ways = np.diff(points, axis=0)
+    ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
+    turn = float(np.arccos(np.clip(ways[1] @ ways[2], -1.0, 1.0)))
+    planes = np.cross(ways[:2], ways[1:])
+    planes /= np.maximum(np.linalg.norm(planes, axis=1, keepdims=True), 1e-9)
+    planar = abs(float(planes[0] @ planes[1]))
+    return turn < settings.sharp or planar < settings.planar

@@ -1,0 +1,405 @@
+"""Device and driver over local sockets: who stops when, and what is refused by name."""
+
+import contextlib
+import json
+import socket
+import struct
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import bridge
+from cathsim_dmc.bridge import device as device_module
+from cathsim_dmc.bridge import messages
+from cathsim_dmc.bridge.driver import Driver, connect
+
+PERIOD = 0.02
+WAIT = 20.0  # s, for what must happen, on a busy machine
+
+
+class Robot:
+    """A device of two entries, whose force is what a test makes it."""
+
+    name, period = "robot", PERIOD
+    action = [{"name": "bend", "unit": "N·m"}, {"name": "push", "unit": "m/s"}]
+    observation = [
+        {"key": "place", "shape": [3], "dtype": "float64"},
+        {"key": "view", "shape": [2, 2, 1], "dtype": "uint8"},
+    ]
+
+    def __init__(self, steps=10, force=0.0):
+        self.steps, self.force = steps, force
+        self.taken, self.stops, self.seeds = [], 0, []
+
+    def start(self, seed):
+        self.seeds.append(seed)
+        self.count = 0
+        return self._state()
+
+    def command(self, action):
+        self.taken.append(np.array(action))
+
+    def read(self):
+        self.count += 1
+        return self._state()
+
+    def stop(self):
+        self.stops += 1
+
+    def _state(self):
+        end = "success" if self.count == self.steps else None
+        seen = {"place": np.full(3, 0.5 * self.count),
+                "view": np.full((2, 2, 1), self.count, np.uint8)}  # fmt: skip
+        force = self.force(self.count) if callable(self.force) else self.force
+        return bridge.State(seen, {"push": force}, PERIOD * self.count, end)
+
+
+class Served:
+    """A robot that is served in a thread."""
+
+    def __init__(self, robot, episodes=1, log=None, **options):
+        self.robot, self.done, self.said = robot, None, []
+        # The clock of a busy machine has hiccups.
+        options = bridge.ServeOptions(**{"watchdog": 5.0, **options})
+        self._listener = device_module.listen("127.0.0.1", 0)
+        self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
+
+        def run():
+            kept = {"log": log, "say": self.said.append}
+            self.done = bridge.serve(
+                robot, self._listener, options, episodes=episodes, **kept
+            )
+
+        self._thread = threading.Thread(target=run, daemon=True)
+        self._thread.start()
+
+    def joined(self):
+        self._thread.join(WAIT)
+        assert not self._thread.is_alive()
+        self._listener.close()
+        return self.done
+
+    def raw(self):
+        """A socket that has said hello, and its connection."""
+        link = connect(self.address)
+        link.send(1.0, "hello", protocol=messages.PROTOCOL, name="raw")
+        assert link.receive(time.monotonic() + WAIT)["kind"] == "welcome"
+        return link
+
+
+def push(observation):
+    assert observation["place"].shape == (3,) and observation["view"].dtype == np.uint8
+    return np.array([observation["place"][0], 1.0])
+
+
+SLOW = bridge.DriveOptions(watchdog=WAIT, warm_up=2)
+
+
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_an_episode_is_driven_and_every_action_applied(lockstep, tmp_path):
+    robot = Robot()
+    with bridge.Log(tmp_path / "a" / "device.jsonl") as log:
+        served = Served(robot, log=log, lockstep=lockstep, missed="hold")
+        with bridge.Log(tmp_path / "driver.jsonl") as own:
+            found = bridge.drive(push, served.address, seed=4, options=SLOW, log=own)
+        (done,) = served.joined()
+    assert (found.end, done["end"], done["steps"]) == ("success", "success", 10)
+    assert found.steps + found.skipped == 10 == len(robot.taken)
+    assert robot.seeds == [4] and robot.stops
+    if lockstep:
+        wanted = [[min(0.5 * k, 1.0), 1.0] for k in range(10)]  # clipped
+        np.testing.assert_array_equal(robot.taken, wanted)
+        assert found.steps == 10 and done["missed"] == 0 and done["tick"] is None
+    else:
+        assert done["tick"]["max"] >= done["tick"]["p50"] >= 0
+    assert found.compute["p50"] > 0 and done["answer"]["p99"] > 0
+    lines = [
+        json.loads(x) for x in (tmp_path / "driver.jsonl").read_text().splitlines()
+    ]
+    sent = [one for one in lines if one["event"] == "sent"]
+    assert len(sent) == found.steps and sent[0]["action"] == [0.0, 1.0]
+    assert lines[-1]["event"] == "end" and sent[0]["force"] == {"push": 0.0}
+    text = (tmp_path / "a" / "device.jsonl").read_text()
+    assert text.count('"applied"') == 10
+
+
+def test_a_log_is_never_overwritten(tmp_path):
+    (tmp_path / "a.jsonl").write_text("old")
+    with pytest.raises(FileExistsError):
+        bridge.Log(tmp_path / "a.jsonl")
+
+
+@pytest.mark.parametrize("side", ["device", "driver"])
+def test_too_much_force_stops_the_device(side):
+    robot = Robot(steps=100, force=lambda count: 2.0 if count == 5 else -0.1)
+    served = Served(robot, force_limit=1.5 if side == "device" else None, lockstep=True)
+    own = bridge.DriveOptions(
+        watchdog=WAIT, warm_up=0, force_limit=None if side == "device" else 1.5
+    )
+    found = bridge.drive(push, served.address, options=own)
+    (done,) = served.joined()
+    assert found.end == "force_limit" and len(robot.taken) == 5 and robot.stops
+    assert done["end"] == ("force_limit" if side == "device" else "stopped")
+    assert done["force"] == 2.0 == found.force
+
+
+def test_a_device_stops_when_its_driver_falls_silent():
+    robot = Robot(steps=10_000)
+    served = Served(robot, watchdog=5 * PERIOD)
+    link = served.raw()
+    link.send(1.0, "start", seed=None)
+    link.send(1.0, "action", step=0, action=[0.3, 1.0])
+    (done,) = served.joined()
+    assert done["end"] == "stopped" and done["steps"] < 100
+    np.testing.assert_array_equal(robot.taken[0], [0.3, 1.0])
+    # It bends as before, and does not push, until it gives up.
+    for action in robot.taken[1:]:
+        np.testing.assert_array_equal(action, [0.3, 0.0])
+    assert done["missed"] == len(robot.taken) - 1 >= 2
+    kinds = []
+    with contextlib.suppress(bridge.BridgeError):
+        while message := link.receive(time.monotonic() + 1.0):
+            kinds.append(message)
+    assert kinds[-1]["kind"] == "stop" and "watchdog" in kinds[-1]["reason"]
+    link.close()
+
+
+def test_a_device_goes_on_with_the_next_driver_when_one_is_killed():
+    robot = Robot(steps=10_000)
+    served = Served(robot, episodes=2)
+    link = served.raw()
+    link.send(1.0, "start", seed=1)
+    assert link.receive(time.monotonic() + WAIT)["kind"] == "state"
+    # As of a killed process: its end is reset, with unread states.
+    link._socket.setsockopt(
+        socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0)
+    )
+    link.close()
+    robot.steps = 3
+    # Until the loss is noticed, another driver hears that it is busy.
+    for _ in range(100):
+        try:
+            found = bridge.drive(push, served.address, options=SLOW)
+            break
+        except bridge.BridgeError as error:
+            assert error.fault == "busy"
+            time.sleep(0.05)
+    first, second = served.joined()
+    assert first["end"] == "peer_lost" and second["end"] == "success" == found.end
+
+
+def test_a_driver_stops_when_its_device_falls_silent_or_is_lost():
+    listener = device_module.listen("127.0.0.1", 0)
+    address = f"127.0.0.1:{listener.getsockname()[1]}"
+    heard = []
+
+    def run(silent):
+        sock, _ = listener.accept()
+        link = bridge.Connection(sock)
+        link.receive(time.monotonic() + WAIT)
+        table = {"action": Robot.action, "observation": Robot.observation}
+        link.send(1.0, "welcome", protocol=1, name="x", period=PERIOD, **table)
+        robot = Robot()
+        state = robot.start(link.receive(time.monotonic() + WAIT)["seed"])
+        seen = {k: messages.to_json(v) for k, v in state.observation.items()}
+        link.send(1.0, "state", step=0, time=0, observation=seen, force={}, end=None)
+        heard.append(link.receive(time.monotonic() + WAIT))
+        if silent:
+            heard.append(link.receive(time.monotonic() + WAIT))
+        link.close()
+
+    for silent in (True, False):
+        thread = threading.Thread(target=run, args=(silent,), daemon=True)
+        thread.start()
+        how = bridge.DriveOptions(watchdog=0.3 if silent else WAIT)
+        if silent:
+            assert bridge.drive(push, address, options=how).end == "watchdog"
+        else:
+            with pytest.raises(bridge.BridgeError, match="peer_lost"):
+                bridge.drive(push, address, options=how)
+        thread.join(WAIT)
+    listener.close()
+    assert [one["kind"] for one in heard] == ["action", "stop", "action"]
+
+
+def test_a_slow_policy_answers_the_newest_state_or_stops():
+    def slow(observation):
+        time.sleep(4 * PERIOD)
+        return push(observation)
+
+    found = {}
+    for overrun in ("latest", "stop"):
+        served = Served(Robot(steps=20), missed="still")
+        how = bridge.DriveOptions(overrun=overrun, watchdog=WAIT, warm_up=0)
+        found[overrun] = bridge.drive(slow, served.address, options=how)
+        (done,) = served.joined()
+        if overrun == "latest":
+            assert done["missed"] > 5 and done["late"] > 0
+    assert found["latest"].end == "success" and found["latest"].skipped > 5
+    assert found["latest"].late == found["latest"].steps
+    assert found["stop"].end == "overrun" and found["stop"].steps == 1
+
+
+def test_a_driver_that_reads_nothing_is_left():
+    robot = Robot(steps=10**9)
+    shape = [1000, 1000, 1]
+    robot.observation = [Robot.observation[0], {**Robot.observation[1], "shape": shape}]
+    big = bridge.State(
+        {"place": np.zeros(3), "view": np.zeros(shape, np.uint8)}, {}, 0.0
+    )
+    robot._state = lambda: big
+    served = Served(robot, watchdog=0.5)
+    link = served.raw()
+    link.send(1.0, "start", seed=None)
+    with pytest.raises(bridge.BridgeError):  # it is closed
+        for _ in range(2000):
+            link.send(1.0, "action", step=0, action=[0, 0])
+            time.sleep(0.01)
+    (done,) = served.joined()
+    assert done["end"] == "slow_peer" and robot.stops
+    link.close()
+
+
+def frame(data):
+    return struct.pack(">I", len(data)) + data
+
+
+def action(**changed):
+    values = {"kind": "action", "step": 0, "action": [0.0, 0.0], **changed}
+    return frame(json.dumps(values).encode())
+
+
+BAD = {
+    "frame_too_long": struct.pack(">I", messages.MAX_FRAME + 1),
+    "not_json": frame(b"{nothing"),
+    "not_json ": frame(b"\xff\xfe"),
+    "not_json  ": frame(b"[" * 200_000),
+    "bad_message": frame(b"[1, 2]"),
+    "bad_message ": frame(b'{"kind": "dance"}'),
+    "bad_message  ": frame(b'{"kind": "action", "step": true, "action": []}'),
+    "bad_message   ": frame(b'{"kind": "action", "step": 0}'),
+    "not_finite": action(action=[float("nan"), 0.0]),
+    "not_finite ": frame(b'{"kind": "action", "step": 0, "action": [1e999, 0]}'),
+    "wrong_shape": action(action=[0.0, 0.0, 0.0]),
+    "wrong_shape ": action(action=[[0.0, 0.0]]),
+    "wrong_shape  ": action(action=["1", "0"]),
+    "wrong_shape   ": action(action=[10**400, 0]),
+    "wrong_shape    ": action(action=[True, False]),
+    "out_of_order": action(step=7),
+    "out_of_order ": frame(b'{"kind": "start", "seed": 3}'),
+    "flood": action(step=-1) * 200,
+}
+
+
+@pytest.fixture(scope="module")
+def patient():
+    robot = Robot(steps=10**9)
+    robot.period = 1.0  # so that a flood is one
+    served = Served(robot, episodes=len(BAD), lockstep=True, watchdog=WAIT)
+    yield served
+    assert [one["end"] for one in served.joined()] == [name.strip() for name in BAD]
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_action_is_refused_by_name_and_stops_the_device(patient, name):
+    before = patient.robot.stops
+    link = patient.raw()
+    link.send(1.0, "start", seed=None)
+    assert link.receive(time.monotonic() + WAIT)["kind"] == "state"
+    taken = len(patient.robot.taken)
+    with contextlib.suppress(OSError):
+        link._socket.sendall(BAD[name])
+    with pytest.raises(bridge.BridgeError) as wrong:
+        while True:
+            assert link.receive(time.monotonic() + WAIT)
+    assert wrong.value.fault in (name.strip(), "peer_lost" if name == "flood" else "")
+    link.close()
+    assert patient.robot.stops > before and len(patient.robot.taken) == taken
+
+
+def test_another_version_another_program_and_a_stranger_are_refused(monkeypatch):
+    monkeypatch.setattr(device_module, "HANDSHAKE", 0.3)
+    robot = Robot(steps=2)
+    served = Served(robot, lockstep=True)
+    stranger = socket.create_connection(served.address.split(":"), WAIT)
+    assert b"idle" in stranger.recv(1000)
+    stranger.close()
+    link = connect(served.address)
+    link.send(1.0, "hello", protocol=2, name="new")
+    with pytest.raises(bridge.BridgeError, match="wrong_version.* 2, this one 1"):
+        link.receive(time.monotonic() + WAIT)
+    first = served.raw()
+    with pytest.raises(bridge.BridgeError, match="busy"):
+        Driver(connect(served.address))
+    first.close()
+    for address in ("localhost", "a:b", ":5", "localhost:0"):
+        with pytest.raises(ValueError, match="host:port"):
+            connect(address)
+    for _ in range(100):  # until the first one is gone
+        with contextlib.suppress(bridge.BridgeError):
+            assert bridge.drive(push, served.address, options=SLOW).end == "success"
+            break
+    assert [one["end"] for one in served.joined()] == ["success"]
+    with pytest.raises(OSError, match="no device answers"):
+        connect(served.address)
+
+
+@pytest.mark.parametrize(
+    ("answer", "fault"),
+    [([np.nan, 0.0], "not_finite"), ([0.0], "wrong_shape"), ("up", "wrong_shape")],
+)
+def test_a_policy_that_answers_with_no_action_stops_the_device(answer, fault):
+    robot = Robot(steps=100)
+    served = Served(robot, lockstep=True)
+    how = bridge.DriveOptions(warm_up=0, watchdog=WAIT)
+    with pytest.raises(bridge.BridgeError, match=fault):
+        bridge.drive(lambda seen: answer, served.address, options=how)
+    (done,) = served.joined()
+    assert done["end"] == "stopped" and not robot.taken
+
+
+@pytest.mark.parametrize("kind", [bridge.ServeOptions, bridge.DriveOptions])
+def test_options_are_checked(kind):
+    for name in ("watchdog", "force_limit"):
+        for value in (0.0, -1.0, np.nan, "fast"):
+            with pytest.raises(ValueError, match=name):
+                kind(**{name: value})
+    with pytest.raises(ValueError, match="missed|overrun"):
+        kind(**{"missed" if kind is bridge.ServeOptions else "overrun": "faster"})
+
+
+def test_a_shipped_policy_drives_its_task_as_it_plays_it(cathsim, shared_environment):
+    """Lockstep over a socket gives the episode of the suite, bit for bit."""
+    from cathsim_dmc import agents
+    from cathsim_dmc.cli.bridging import _choose, require_fit
+    from cathsim_dmc.policies import in_environment
+    from cathsim_dmc.simulation.episodes import play_alone
+
+    options = {"observation": "tracking", "max_steps": 15}
+    env = shared_environment("femoral_type1_lcca", **options)
+    policy = agents.load_policy("pretrained:femoral_type1_lcca")
+    env.random_state.seed(3)
+    wanted = [a for a, _ in play_alone(env, in_environment(policy, env))][1:]
+    device = bridge.SimulatedDevice(env, "femoral_type1_lcca")
+    served = Served(device, lockstep=True, watchdog=WAIT)
+    taken = []
+    device.command, command = (lambda a: (taken.append(a), command(a))), device.command
+    begin = lambda welcome: require_fit(policy, welcome)  # noqa: E731
+    found = bridge.drive(
+        _choose(policy), served.address, seed=3, options=SLOW, begin=begin
+    )
+    (done,) = served.joined()
+    assert found.end == done["end"] == "truncated" and found.steps == 15
+    np.testing.assert_array_equal(taken, wanted)
+    # What does not fit is refused before the start.
+    table = {"action": device.action, "observation": device.observation}
+    for name in ("type1_lcca", "navigator"):
+        other = agents.load_policy(f"pretrained:{name}")
+        with pytest.raises(ValueError, match="of the suite: cathsim serve"):
+            require_fit(other, {"name": "x", **table})
+    code, _, told = cathsim("drive", "expert", "--connect", "127.0.0.1:9")
+    assert code == 2 and "looks at the simulation" in told
+    code, _, told = cathsim("serve", "type1_lca")
+    assert code == 2 and "type1_lcca" in told

@@ -1,0 +1,237 @@
+"""Memory of the attempts along a route: the automaton, and what tasks make of it."""
+
+import json
+
+import numpy as np
+import pytest
+from test_tasks_snapshot import undeclared
+
+from cathsim_dmc import policies, suite
+from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy.tree_file import read_tree
+from cathsim_dmc.physics.readings import part
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks import retry
+from cathsim_dmc.tasks.objectives import Cannulation
+from cathsim_dmc.tasks.retry import COAXIAL, SINGLE, Memory
+from cathsim_dmc.tasks.route import Place, Route
+
+SHORT = retry.RetrySettings(patience=5)
+
+
+def begun(arc_length, insertion, **values):
+    place = Place(np.array(arc_length), np.full(len(arc_length), -0.5))
+    values = {name: np.array(value) for name, value in values.items()}
+    return Memory.at(place, np.array(insertion))._replace(**values)
+
+
+def goes_on(memory, arc_length, insertion, *, excess=-0.5, push=0.0, settings=SINGLE):
+    shape = memory.attempts.shape
+    place = Place(np.full(shape, arc_length), np.full(shape, excess))
+    inserted, pushed = np.full(shape, insertion), np.full(shape, push)
+    return retry.advance(settings, memory, place, inserted, pushed)
+
+
+def test_a_head_that_stands_still_is_withdrawn_and_tried_again():
+    memory, insertion, retracted = begun([0.1, 0.1], [0.08] * 2), np.full(2, 0.08), []
+    for step in range(24):
+        # The first gains a millimetre a step, the second nothing.
+        place = Place(np.array([0.1 + 1e-3 * step, 0.1]), np.full(2, -0.5))
+        memory = retry.advance(SHORT, memory, place, insertion, np.zeros(2))
+        retracted.append(memory.retracting.copy())
+        insertion = insertion - 1e-3 * memory.retracting
+    retracted = np.array(retracted)
+    assert not retracted[:, 0].any()
+    assert memory.attempts.tolist() == [0, 1]
+    begins, ends = np.flatnonzero(np.diff(retracted[:, 1].astype(int)))
+    assert begins == SHORT.patience - 1
+    assert (ends - begins) * 1e-3 == pytest.approx(SHORT.backoff, abs=1.1e-3)
+
+
+def test_a_withdrawal_that_is_held_up_ends_inside_the_tube_alone():
+    memory = begun([0.1], [0.08], retracting=[True], turn=[0.0], stale=[0])
+    for _ in range(SINGLE.longest + 5):
+        memory = goes_on(memory, 0.1, 0.08, excess=1.0)
+    assert memory.retracting[0]
+    assert not goes_on(memory, 0.1, 0.08).retracting[0]
+
+
+def test_a_hard_push_ends_an_attempt_and_several_at_one_place_all():
+    memory, retries = begun([0.1], [0.08]), []
+    for _ in range(60):
+        back = bool(memory.retracting[0])
+        insertion = memory.turn[0] - 1e-6 if back else 0.08
+        push = 0.0 if back else 2 * SINGLE.hard_push
+        memory = goes_on(memory, 0.09 if back else 0.1, insertion, push=push)
+        retries.append(int(memory.attempts[0]))
+        if memory.given_up[0]:
+            break
+    assert retries[SINGLE.push_patience - 1 : SINGLE.push_patience + 1] == [0, 1]
+    assert memory.given_up[0] and memory.pushed[0] == SINGLE.most_pushed
+    last = memory.attempts[0]
+    for _ in range(2 * SINGLE.patience):
+        memory = goes_on(memory, 0.1, 0.08)
+    assert memory.attempts[0] == last and memory.given_up[0]
+    # One that has come farther is not at that place any more.
+    memory = begun([0.1], [0.08], pushed=[SINGLE.most_pushed - 1], barrier=[0.05])
+    memory = goes_on(memory, 0.1, 0.08, push=1.0)
+    assert memory.pushed[0] == 0
+
+
+def test_a_shaft_that_buckles_is_taken_back_until_the_head_comes_with_it():
+    memory = begun([0.1], [0.05])
+    memory = goes_on(memory, 0.1, 0.05 + COAXIAL.slack + 1e-4, settings=COAXIAL)
+    assert memory.retracting[0] and memory.taking_up[0] and memory.attempts[0] == 1
+    # The head springs forward: on; it comes back: the slack is gone.
+    memory = goes_on(memory, 0.104, 0.055, settings=COAXIAL)
+    assert memory.retracting[0]
+    came_back = 0.104 - 2 * COAXIAL.give
+    memory = goes_on(memory, came_back, 0.052, settings=COAXIAL)
+    assert not memory.retracting[0]
+    assert memory.best[0] == pytest.approx(came_back)
+
+
+def test_a_head_that_has_strayed_is_withdrawn_all_the_way():
+    memory = begun([0.1], [0.05], lost=[COAXIAL.lost_patience])
+    memory = goes_on(memory, 0.1, 0.05, excess=1.0, settings=COAXIAL)
+    assert memory.retracting[0] and not memory.taking_up[0]
+    came_back = 0.1 - 2 * COAXIAL.give
+    memory = goes_on(memory, came_back, 0.045, settings=COAXIAL)
+    assert memory.retracting[0]  # not yet back by `backoff`
+    memory = goes_on(memory, 0.08, 0.05 - COAXIAL.backoff, settings=COAXIAL)
+    assert not memory.retracting[0]
+
+
+def test_a_head_that_goes_on_is_left_alone():
+    memory = begun([0.0], [0.0])
+    for number in range(1, 200):
+        memory = goes_on(memory, 1e-3 * number, 1e-3 * number, settings=COAXIAL)
+    assert memory.attempts[0] == 0 and not memory.retracting[0]
+
+
+def test_attempts_differ_in_what_policies_see():
+    memory = begun([0.1] * 8, [0.08] * 8, attempts=np.arange(8))
+    for settings, coaxial in ((SINGLE, False), (COAXIAL, True)):
+        insertion = np.full(8, 0.08)
+        seen = retry.shown(settings, memory, insertion, np.zeros(8), coaxial)
+        size = retry.COAXIAL_RETRY_ENTRIES if coaxial else retry.RETRY_ENTRIES
+        assert seen.shape == (8, size) and np.abs(seen).max() <= 2.5
+        rows = np.delete(seen, 4, axis=1)  # without their number
+        distinct = {tuple(row) for row in rows.round(6)}
+        assert len(distinct) == (8 if coaxial else 6)
+    first = memory._replace(first=np.full(8, len(COAXIAL.leads) - 1))
+    assert retry.lead(COAXIAL, first)[0] == COAXIAL.leads[-1]
+    assert retry.lead(COAXIAL, first)[1] == COAXIAL.leads[0]
+
+
+# In tasks.
+
+
+def pushed(name, observation, steps=90, **options):
+    """Simulations that a straight push leads astray."""
+    task = suite.make_task(name, observation=observation, **options)
+    simulation = BatchSimulation(task, 2, seeds=3, num_threads=1)
+    action, steps_seen = np.zeros((2, task.num_actions)), [simulation.reset()]
+    action[:, list(task.scene.catheter.translations)] = 1.0
+    for _ in range(steps):
+        steps_seen.append(simulation.step(action))
+    return simulation, steps_seen
+
+
+def test_a_memory_changes_nothing_that_others_see():
+    """Neither one that a policy asks for, nor one that is observed."""
+    _, alone = pushed("type1_lcca", "route")
+    task = suite.make_task("type1_lcca", observation="route")
+    asked = BatchSimulation(task, 2, seeds=3, num_threads=1)
+    asked.reset()
+    assert asked.rollout.memory.attempts.tolist() == [0, 0]
+    observed, beside = pushed("type1_lcca", ["route", "route_retry"])
+    action = np.zeros((2, task.num_actions))
+    action[:, -1] = 1.0
+    for before, after in zip(alone[1:], beside[1:], strict=True):
+        step = asked.step(action)
+        for key, value in before.observation.items():
+            np.testing.assert_array_equal(step.observation[key], value, key)
+            if not (observed.rollout.memory.attempts % 2).any():
+                np.testing.assert_array_equal(after.observation[key], value, key)
+    assert (asked.rollout.memory.attempts > 0).all()
+    pairs = zip(asked.rollout.memory, observed.rollout.memory, strict=True)
+    for one, other in pairs:
+        np.testing.assert_array_equal(one, other)
+    retracting = beside[-1].observation["route_retry"][:, 0]
+    np.testing.assert_array_equal(retracting, observed.rollout.memory.retracting)
+
+
+def test_the_memory_is_declared_and_goes_on_from_a_snapshot():
+    simulation, _ = pushed("type1_lcca", ["route", "route_retry"], 60)
+    assert (simulation.rollout.memory.attempts > 0).any()
+    kept, action = simulation.snapshot(), np.ones((2, 21))
+    expected = [simulation.step(action).observation["route_retry"] for _ in range(5)]
+    other, _ = pushed("type1_lcca", ["route", "route_retry"], 3)
+    other.restore(kept)
+    for one in expected:
+        np.testing.assert_array_equal(
+            other.step(action).observation["route_retry"], one
+        )
+    assert undeclared(other) == set()
+
+
+def test_only_one_memory_is_observed():
+    options = {"fluoroscopy": {"view": [60, 0], "biplane": [-30, 0]}}
+    both = ["route_retry", "biplane_retry"]
+    with pytest.raises(ValueError, match="route_retry and biplane_retry.*leave one"):
+        BatchSimulation(suite.make_task("type1_bca", observation=both, **options), 1)
+
+
+@pytest.fixture(scope="module")
+def narrow(tmp_path_factory):
+    """The Type-I phantom with a left common carotid that no 5F device enters."""
+    content = json.loads((phantoms._DATA / "type1.json").read_text())
+    radii = content["vessels"]["lcca"]["radii_mm"]
+    radii[2:] = [0.8] * len(radii[2:])
+    path = tmp_path_factory.mktemp("narrow") / "narrow.json"
+    path.write_text(json.dumps(content))
+    return read_tree(path).build("ascending")
+
+
+@pytest.mark.slow
+def test_an_episode_ends_gently_before_a_lumen_that_is_too_narrow(narrow):
+    options = {"anatomy": narrow, "goal": "lcca", "random": 3, "give_up": True}
+    environment = suite.load("cathsim", "navigate", {**options, "max_steps": 300})
+    act = policies.in_environment(policies.make_policy("expert"), environment)
+    timestep, largest = environment.reset(), 0.0
+    while not timestep.last():
+        timestep = environment.step(act(timestep))
+        largest = max(largest, float(environment.task.wall_force.peak_sum))
+    assert environment.task.termination == "given_up"
+    assert timestep.discount == 0.0 and largest < 0.5
+
+
+def test_the_expert_alone_needs_no_memory_in_the_task():
+    """It begins one when it is asked, in the midst of an episode, too."""
+    simulation, _ = pushed("type1_lcca", "tracking", 30)
+    assert simulation.rollout.progress.memory is None
+    view, expert = policies.View(simulation), policies.make_policy("expert")
+    expert.reset(view, np.ones(2, bool))
+    memory = simulation.rollout.memory
+    assert (memory.best == memory.arc_length).all()
+    for index in range(2):
+        assert not part(memory, index).attempts
+    assert not any(name.startswith("progress") for name in simulation.snapshot().arrays)
+
+
+@pytest.mark.parametrize(
+    ("name", "access", "goal", "expected"),
+    [
+        ("type2", "descending", "bca", True),  # out of the plane of the arch
+        ("type3", "descending", "lcca", False),
+        ("type3", "ascending", "lsa", True),  # nearly straight on
+        ("type1", "ascending", "lcca", False),
+    ],
+)
+def test_the_lead_follows_the_take_off(name, access, goal, expected):
+    """A fixed lead of the wire reaches these branches where it is not blunt."""
+    anatomy = phantoms.load(name, access=access)
+    route = Route.of(Cannulation.to(anatomy, anatomy.goal(goal)))
+    assert retry.blunt(COAXIAL, route) is expected
+    assert not retry.blunt(SINGLE, route)
