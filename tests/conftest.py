@@ -12,7 +12,13 @@ import pytest
 from cathsim_dmc import cli, suite
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.navigation import Navigation
-from cathsim_dmc.tasks.observation_kind import BIPLANE, COAXIAL, LIVING, OPENGL
+from cathsim_dmc.tasks.observation_kind import (
+    BIPLANE,
+    COAXIAL,
+    COAXIAL_ROUTE,
+    LIVING,
+    OPENGL,
+)
 
 # A first call may import scipy or compile; how long it takes is not what is tested.
 hypothesis.settings.register_profile("default", deadline=None)
@@ -28,7 +34,7 @@ EACH_TASK = [
 OBSERVATIONS = [
     name
     for name, row in observations.OBSERVATIONS.items()
-    if row.needs not in (BIPLANE, COAXIAL, LIVING, OPENGL)
+    if row.needs not in (BIPLANE, COAXIAL, COAXIAL_ROUTE, LIVING, OPENGL)
 ]
 SHORT_EPISODE = 12  # control steps
 

@@ -10,14 +10,16 @@ from cathsim_dmc.policies import coaxial_pursuit
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan
 from cathsim_dmc.policies.expert import Teacher
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks.route import locate
+from cathsim_dmc.tasks import coaxial_ends
+from cathsim_dmc.tasks.route import SIDE_AHEAD, locate
 
 TASK = "simple1_bca_pair"
 
 
 @pytest.fixture(scope="module")
 def environment():
-    env = suite.load("cathsim", TASK, {"random": 3, "observation": "tracking"})
+    seen = ["tracking", "route_coaxial", "route_retry"]
+    env = suite.load("cathsim", TASK, {"random": 3, "observation": seen})
     yield env
     env.close()
 
@@ -36,9 +38,35 @@ def test_frames_of_the_links_are_those_of_the_simulator(environment):
     assert np.abs(joints[0, 2:]).max() > 0.02
     frame = rotations[-1:]
     for number in range(1, 9):
-        frame = coaxial_pursuit._before(frame, joints, number)
+        frame = coaxial_ends.before(frame, joints, number)
         np.testing.assert_allclose(frame[0], rotations[-1 - number], atol=1e-12)
     assert view.rollout.devices.insertion.shape == (1, 2)
+
+
+def test_a_policy_sees_the_route_from_each_shaped_end(environment):
+    """The error of direction and the bend, by which the expert turns."""
+    environment.reset()
+    for _ in range(5):
+        timestep = environment.step(np.array([1.0, 1.0, 1.0, -1.0]))
+    rollout, ahead = environment.task.rollout, np.full(1, SIDE_AHEAD)
+    plan, readings = CoaxialPlan.for_case(rollout.case()), rollout.readings
+    place = locate(plan, readings.head)
+    given = plan, readings, rollout.devices, place, ahead
+    error, away = coaxial_pursuit._directions(*given)
+    sides = timestep.observation["route_sides"].reshape(2, 5)
+    cosine, sine, x, y, z = sides.T
+    rotation = rollout.devices.tip_rotation[0]
+    np.testing.assert_allclose(
+        np.arctan2(sine, cosine), np.angle(np.exp(1j * rotation))
+    )
+    wrapped = np.angle(np.exp(1j * error[0]))
+    np.testing.assert_allclose(np.arctan2(y, x), wrapped, atol=1e-9)
+    np.testing.assert_allclose(np.arctan2(np.hypot(x, y), z), away[0], atol=1e-9)
+    lines = timestep.observation["route_lines"].reshape(2, -1, 3)
+    gaps = timestep.observation["route_gaps"]
+    # The first device ends at the head, the other that much behind it.
+    assert np.linalg.norm(lines[0, -1]) < 1e-9 and gaps[0] == 0.0
+    assert np.linalg.norm(lines[1, -1]) == pytest.approx(gaps[1], rel=0.1)
 
 
 def test_turning_by_the_error_turns_the_side_to_the_route(environment):

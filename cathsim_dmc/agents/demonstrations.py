@@ -21,6 +21,7 @@ from cathsim_dmc.recording.dataset import (
     DatasetError,
     read_episodes,
     recordings_in,
+    repeat_episodes,
 )
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.batch import BatchSimulation

@@ -26,16 +26,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from cathsim_dmc.entities import posture
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
-from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.policies import attempts
 from cathsim_dmc.policies.attempts import AttemptSettings, State
-from cathsim_dmc.policies.pursuit import turned
 from cathsim_dmc.tasks import retry
 from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.coaxial_ends import CoaxialEnds
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.retry import Memory, RetrySettings
 from cathsim_dmc.tasks.route import Place, Route
@@ -75,27 +73,21 @@ class CoaxialPlan(Route):
     """Route and devices of a task with coaxial devices; world frame, SI units.
 
     Attributes:
-        shaped: (K,), length of the pre-shaped end of each device.
-        nodes: (L + 1,), ends of the links from the end of the chain.
+        ends: the pre-shaped ends of the devices.
         ostium: arc length where the route narrows most, into its last branch.
     """
 
-    shaped: np.ndarray
-    nodes: np.ndarray
+    ends: CoaxialEnds
     ostium: float
     settings: ClassVar = CoaxialSettings()
 
     @classmethod
     def for_case(cls, case: Case) -> "CoaxialPlan":
         """Reads off an anatomy of a task."""
-        stack = case.scene.catheter
-        assert isinstance(stack, DeviceStack)
         route = Route.of(case.objective)
-        shapes = [[arc.length for arc in one.tip_shape] for one in stack.devices]
         return cls(
             **vars(route),
-            shaped=np.array([sum(lengths) for lengths in shapes]),
-            nodes=stack.stack.nodes,
+            ends=CoaxialEnds.of(case.scene.catheter),
             ostium=float(route.arc_length[np.diff(route.radii).argmin()]),
         )
 
@@ -173,26 +165,7 @@ def _directions(
     """Rotations (N, K) of the ends to the route, and its bends (N, K) away, rad."""
     insertion = devices.insertion
     gaps = insertion.max(axis=1, keepdims=True) - insertion
-    rows, last = np.arange(len(gaps)), len(plan.nodes) - 2
-    frames = [readings.head_frame]
-    error, away = np.empty(gaps.shape), np.empty(gaps.shape)
-    for k in range(gaps.shape[1]):
-        behind = gaps[:, k] + plan.shaped[k]
-        link = np.maximum((plan.nodes[:-1] > behind[:, None]).sum(axis=1) - 1, 0)
-        while len(frames) <= last - link.min():
-            frames.append(_before(frames[-1], readings.joint_positions, len(frames)))
-        frame = np.stack(frames)[last - link, rows]
-        target = plan.at(place.arc_length - gaps[:, k] + ahead)
-        way = target - readings.centreline[rows, link]
-        x, y, z = np.einsum("nij,ni->jn", frame, way)
-        error[:, k] = np.arctan2(y, x) - devices.tip_rotation[:, k]
-        away[:, k] = np.arctan2(np.hypot(x, y), z)
-    return error, away
-
-
-def _before(frame: np.ndarray, joints: np.ndarray, number: int) -> np.ndarray:
-    """Frames (N, 3, 3) of the links before given ones, `number`-th from the end."""
-    place = joints.shape[1] // 2 - number  # of the joint; two slides precede it
-    for axis in (1, 0) if posture.x_first(place) else (0, 1):
-        frame = turned(frame, axis, -joints[:, -2 * number + axis])
-    return frame
+    targets = plan.at(place.arc_length[:, None] - gaps + ahead[:, None])
+    ways = plan.ends.directions(readings, insertion, targets)
+    x, y, z = np.moveaxis(ways, -1, 0)
+    return np.arctan2(y, x) - devices.tip_rotation, np.arctan2(np.hypot(x, y), z)

@@ -28,6 +28,7 @@ from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.policies import attempts
 from cathsim_dmc.policies.attempts import AttemptSettings, State
 from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.coaxial_ends import turned
 from cathsim_dmc.tasks.retry import Memory
 from cathsim_dmc.tasks.route import Route
 
@@ -193,13 +194,3 @@ def _correction(settings: Settings, axes: np.ndarray, turn: np.ndarray) -> np.nd
     needed = np.einsum("...jai,...i->...ja", axes, turn)
     limit = settings.max_bend_rate
     return np.clip(weight[:, None] * needed, -limit, limit)
-
-
-def turned(frame: np.ndarray, axis: int, angle: np.ndarray) -> np.ndarray:
-    """Frame (..., 3, 3) turned by an angle (...) about its own axis 0, 1 or 2."""
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    cosine, sine = np.cos(angle)[..., None], np.sin(angle)[..., None]
-    turned = np.array(frame)
-    turned[..., first] = cosine * frame[..., first] + sine * frame[..., second]
-    turned[..., second] = cosine * frame[..., second] - sine * frame[..., first]
-    return turned

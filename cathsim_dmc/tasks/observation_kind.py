@@ -118,6 +118,7 @@ class Entry:
 FLUOROSCOPY, BIPLANE = "fluoroscopy", "fluoroscopy with two planes"
 ROUTE, OPENGL = "a route", "OpenGL"
 COAXIAL, LIVING = "coaxial devices", "a living vessel (option vessel)"
+COAXIAL_ROUTE = "coaxial devices and a route"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,8 +128,8 @@ class ObservationKind:
     Attributes:
         observe: function from a frame to the arrays of the observation.
         entries: its arrays.
-        needs: `FLUOROSCOPY`, `BIPLANE`, `ROUTE`, `OPENGL`, `COAXIAL` or `LIVING`;
-            empty for nothing.
+        needs: `FLUOROSCOPY`, `BIPLANE`, `ROUTE`, `OPENGL`, `COAXIAL`, `LIVING` or
+            `COAXIAL_ROUTE`; empty for nothing.
         joined: names of the rows that coaxial devices add to it.
     """
 
@@ -183,7 +184,8 @@ class ObservationTable(dict[str, ObservationKind]):
         """
         listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
         chosen = cast(tuple[str, ...], tuple(names) if listed else (names,))
-        there = {COAXIAL: coaxial is not False, LIVING: living is not False}
+        pair, lives = coaxial is not False, living is not False
+        there = {COAXIAL: pair, COAXIAL_ROUTE: pair, LIVING: lives}
         allowed = [n for n, row in self.items() if there.get(row.needs, True)]
         unknown = [n for n in chosen if not isinstance(n, str) or n not in allowed]
         if unknown or not chosen or len(set(chosen)) < len(chosen):

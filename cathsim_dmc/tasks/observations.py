@@ -9,15 +9,14 @@ import numpy as np
 
 from cathsim_dmc.imaging.options import FARTHEST_WALL
 from cathsim_dmc.physics.sliding import DEVICE_PLACES
+from cathsim_dmc.tasks import route_observations
 from cathsim_dmc.tasks.cameras import FARTHEST
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
 from cathsim_dmc.tasks.observation_kind import (
-    BIPLANE,
     COAXIAL,
     FLUOROSCOPY,
     LIVING,
     OPENGL,
-    ROUTE,
     Entry,
     Frame,
     Observation,
@@ -26,8 +25,6 @@ from cathsim_dmc.tasks.observation_kind import (
     Sizes,
     flat,
 )
-from cathsim_dmc.tasks.retry import COAXIAL_RETRY_ENTRIES, RETRY_ENTRIES
-from cathsim_dmc.tasks.route import AHEAD, into_frame
 
 TRACKED_POINTS = len(TRACKED_PLACES)
 SEQUENCE_LENGTH = 3
@@ -208,76 +205,7 @@ def tracking_2d(frame: Frame) -> Observation:
     }
 
 
-def _ahead(name: str, way: str) -> tuple[Entry, ...]:
-    """Entries of a route ahead, whose names begin with `name`."""
-    places = f"every {1e3 * AHEAD[1]:g} mm from the place of the head on, tip frame"
-    points, count = f"{len(AHEAD)} points of {way}, {places}", TRACKED_POINTS - 1
-    device = "points along the device, proximal to the head and without it, tip frame"
-    out = "by how much the head is out of the lumen, in radii there; negative inside"
-    return (
-        Entry(f"{name}_points", 3 * len(AHEAD), "m", points),
-        Entry(f"{name}_radii", len(AHEAD), "m", "of the lumen at these points", 0),
-        Entry(f"{name}_goal", 3, "m", "centre of the goal, tip frame"),
-        Entry(f"{name}_device", 3 * count, "m", f"{count} {device}"),
-        Entry(f"{name}_deviation", 1, "radius", out, -1),
-        _action(f"{name}_action"),
-    )
-
-
-@OBSERVATIONS.row(
-    *_ahead("route", "the centreline of the route"),
-    needs=ROUTE,
-    joined=("drives", "devices"),
-)
-def route(frame: Frame) -> Observation:
-    """Route ahead, device and goal in the tip frame."""
-    ahead, state = frame.ahead, frame.readings
-    assert ahead is not None
-    head, axes = state.head[..., None, :], state.head_frame
-    device = frame.chain.tracked(state.centreline)[..., :-1, :] - head
-    goal = np.broadcast_to(frame.goal, state.head.shape)[..., None, :] - head
-    return {
-        "route_points": flat(ahead.points, 2),
-        "route_radii": ahead.radii,
-        "route_goal": into_frame(goal, axes)[..., 0, :],
-        "route_device": flat(into_frame(device, axes), 2),
-        "route_deviation": ahead.excess[..., None],
-        "route_action": frame.action,
-    }
-
-
-@OBSERVATIONS.row(*_ahead("biplane", "the route through both roadmaps"), needs=BIPLANE)
-def biplane(frame: Frame) -> Observation:
-    """The entries of `route`, reconstructed from the images of two planes."""
-    parts = "points", "radii", "goal", "device", "deviation"
-    seen = {f"biplane_{part}": frame.images[f"biplane_{part}"] for part in parts}
-    return {**seen, "biplane_action": frame.action}
-
-
-def _retry(key: str) -> Entry:
-    """What is remembered of the attempts."""
-    seen = "withdrawing, way left to withdraw / 20 mm, control steps without progress "
-    seen += "and outside the route over those until a retry, retries so far / 4, three "
-    seen += "numbers of which the look-ahead of the attempt is 1, whether the place of "
-    seen += "the head stays near the last one, force of the base in N, given up; of "
-    seen += "coaxial devices then whether slack is taken up, the lead of the attempt / "
-    seen += "20 mm, cosine and sine of its offset in direction"
-    length = (RETRY_ENTRIES, COAXIAL_RETRY_ENTRIES)
-    return Entry(key, lambda sizes: length[sizes.devices > 0], "1, N", seen)
-
-
-@OBSERVATIONS.row(_retry("route_retry"), needs=ROUTE)
-def route_retry(frame: Frame) -> Observation:
-    """Memory of the attempts along the route; every other one has a steady place."""
-    assert frame.retry is not None
-    return {"route_retry": frame.retry}
-
-
-@OBSERVATIONS.row(_retry("biplane_retry"), needs=BIPLANE)
-def biplane_retry(frame: Frame) -> Observation:
-    """The memory of `route_retry`, of the route through both roadmaps."""
-    assert frame.retry is not None
-    return {"biplane_retry": frame.retry}
+route_observations.add_to(OBSERVATIONS)
 
 
 @OBSERVATIONS.row(

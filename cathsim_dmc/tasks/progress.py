@@ -4,12 +4,20 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from cathsim_dmc.physics.readings import Readings
-from cathsim_dmc.tasks import observations, retry
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
+from cathsim_dmc.tasks import coaxial_ends, observations, retry
 from cathsim_dmc.tasks.cases import Case
-from cathsim_dmc.tasks.observation_kind import ROUTE
+from cathsim_dmc.tasks.coaxial_ends import CoaxialEnds
+from cathsim_dmc.tasks.observation_kind import COAXIAL_ROUTE, ROUTE
 from cathsim_dmc.tasks.retry import Memory
-from cathsim_dmc.tasks.route import Ahead, Place, Route, locate_each, look_ahead
+from cathsim_dmc.tasks.route import (
+    SIDE_AHEAD,
+    Ahead,
+    Place,
+    Route,
+    locate_each,
+    look_ahead,
+)
 
 _NARROW_AHEAD = 10e-3  # m along the route within which a narrow lumen is seen
 _ROOM = 1.5  # radii of the device; a lumen with less room is too narrow for it
@@ -46,7 +54,10 @@ class Progress:
         self._coaxial, self._radius = chain.coaxial, chain.devices[0].outer_radius
         self.settings = retry.COAXIAL if self._coaxial else retry.SINGLE
         self.memory: Memory | None = None
-        self._observed = observations.needs(names, ROUTE)
+        self._ends: CoaxialEnds | None = None
+        if observations.needs(names, COAXIAL_ROUTE):
+            self._ends = CoaxialEnds.of(chain)
+        self._observed = observations.needs(names, ROUTE, COAXIAL_ROUTE)
         self._routes: list[Route] = []
         if self._observed:
             self._routes = [Route.of(case.objective) for case in cases]
@@ -175,22 +186,31 @@ class Progress:
         return narrow
 
     def ahead(
-        self, chosen: np.ndarray, head: np.ndarray, frame: np.ndarray
+        self, chosen: np.ndarray, state: Readings, devices: CoaxialReadings | None
     ) -> Ahead | None:
         """The route ahead, from the place in the memory where that is observed.
 
         Args:
             chosen: (N,) int, number of the anatomy of each simulation.
-            head: (N, 3), m, in the vessel at rest.
-            frame: (N, 3, 3), orientation of each tip, its axes in columns.
+            state: Of the devices as policies see them, in the vessel at rest.
+            devices: Of coaxial devices; None for one alone.
         """
         if not self._observed:
             return None
         if self.shown and not self._of_images and self.memory is not None:
             place = Place(self.memory.arc_length, self.memory.excess)
         else:
-            place = locate_each(self._routes, chosen, head)
-        return look_ahead(self._routes, chosen, place, head, frame)
+            place = locate_each(self._routes, chosen, state.head)
+        ahead = look_ahead(self._routes, chosen, place, state.head, state.head_frame)
+        if self._ends is None or devices is None:
+            return ahead
+        insertion = devices.insertion
+        gaps = insertion.max(axis=1, keepdims=True) - insertion
+        ways, targets = place.arc_length[:, None] - gaps + SIDE_AHEAD, []
+        for number, way in zip(chosen.tolist(), ways, strict=True):
+            targets.append(self._routes[number].at(way))
+        found = self._ends.directions(state, insertion, np.stack(targets))
+        return ahead._replace(sides=coaxial_ends.sides(found, devices.tip_rotation))
 
     def seen(self, state: Readings) -> np.ndarray | None:
         """What policies see of the memory, see `retry.shown`; None if nothing."""

@@ -28,6 +28,14 @@ _SAME_PLACE = 5e-3  # m of the route
 # Scales of what a policy sees.
 _SEEN_WAY, _SEEN_LEAD, _SEEN_ATTEMPTS = 20e-3, 20e-3, 4
 RETRY_ENTRIES, COAXIAL_RETRY_ENTRIES = 11, 15
+SHOWN = (
+    "withdrawing, way left to withdraw / 20 mm, control steps without progress and "
+    "outside the route over those until a retry, retries so far / 4, three numbers of "
+    "which the look-ahead of the attempt is 1, whether the place of the head stays "
+    "near the last one, force of the base in N, given up; of coaxial devices whether "
+    "slack is taken up, the lead of the attempt / 20 mm, cosine and sine of its offset "
+    "in direction"
+)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -335,7 +335,7 @@ class Rollout(Restorable):
             sensors.hold(name, view, rows)
         seen = self._at_rest(state) if self._tracking.deviation else self.resting
         self.progress.see(rows, begins, self._case_of, seen, sensors.images)
-        ahead = self.progress.ahead(self._case_of, seen.head, state.head_frame)
+        ahead = self.progress.ahead(self._case_of, seen, devices)
         frame = Frame(
             *(state, self.wall_force, self._action, goal, self._chain, sensors.images),
             *(ahead, devices, self.vessel, self.progress.seen(state)),

@@ -15,6 +15,7 @@ from cathsim_dmc.tasks.objectives import Objective, Routed
 ROUTE_SPACING = 1e-3  # m, resolution of the route
 # Way along the route from the place of the head to each of the points ahead, m.
 AHEAD = np.arange(8) * 5e-3
+SIDE_AHEAD = 25e-3  # m, way to the point of the route that a shaped end is turned to
 _NEARBY = 10e-3  # m of the route that a head can pass between two control steps
 
 
@@ -107,11 +108,14 @@ class Ahead(NamedTuple):
         points: (N, K, 3), of the route, `AHEAD` of the place of the head, m.
         radii: (N, K), of the lumen there, m.
         excess: (N,), `Place.excess` of the head.
+        sides: (N, K, 5), how coaxial devices lie to the route, `coaxial_ends.sides`;
+            None where no observation needs it.
     """
 
     points: np.ndarray
     radii: np.ndarray
     excess: np.ndarray
+    sides: np.ndarray | None = None
 
 
 def locate_each(

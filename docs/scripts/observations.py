@@ -57,6 +57,11 @@ Tasks with the suffix `_wire` or `_pair` add these entries to `internal`, `track
 `route`, and the first two to `tracking_2d`. Shapes are those of `{PAIR_TASK}`:
 
 {{table}}
+
+`route_coaxial` has the entries of `route` and, in place of those, what does not depend
+on where the anatomy lies in the world:
+
+{{relative}}
 """
 
 FLUOROSCOPY = f"""
@@ -143,11 +148,20 @@ def _row(*cells: str) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def coaxial_table() -> str:
-    """What coaxial devices add, from the specs."""
-    specs = suite.make_task(PAIR_TASK, observation="tracking").observation_specs
+# Observations of other tasks.
+_OTHERS = (
+    observation_kind.COAXIAL,
+    observation_kind.COAXIAL_ROUTE,
+    observation_kind.LIVING,
+)
+
+
+def coaxial_table(*names: str) -> str:
+    """Entries of observations of coaxial devices, from the specs."""
+    specs = suite.make_task(PAIR_TASK, observation=names).observation_specs
     rows = [_row("entry", "shape", "unit", "meaning"), _row(*["---"] * 4)]
-    for entry in observations.entries(("drives", "devices")):
+    known = observations.entries(["route"])
+    for entry in (one for one in observations.entries(names) if one not in known):
         shape = _shape(specs[entry.key].shape)
         rows.append(_row(f"`{entry.key}`", shape, entry.unit, entry.meaning))
     return "\n".join(rows)
@@ -156,9 +170,7 @@ def coaxial_table() -> str:
 def entries_table() -> str:
     """Every entry of every observation, from the specs."""
     kinds = {
-        n: k
-        for n, k in observations.OBSERVATIONS.items()
-        if k.needs not in (observation_kind.COAXIAL, observation_kind.LIVING)
+        n: k for n, k in observations.OBSERVATIONS.items() if k.needs not in _OTHERS
     }
     single = [
         name for name, kind in kinds.items() if kind.needs != observation_kind.BIPLANE
@@ -226,7 +238,9 @@ def options_table(kind: type, values: object, title: str) -> str:
 def page() -> str:
     """The whole page."""
     parts = [INTRODUCTION, entries_table() + "\n"]
-    parts.append(COAXIAL.replace("{table}", coaxial_table()))
+    coaxial = COAXIAL.replace("{table}", coaxial_table("drives", "devices"))
+    relative = coaxial_table("route_coaxial", "route_retry")
+    parts.append(coaxial.replace("{relative}", relative))
     table = options_table(FluoroscopyOptions, FluoroscopyOptions(), "default")
     parts.append(FLUOROSCOPY.replace("{table}", table))
     parts.append(ENDOLUMINAL)

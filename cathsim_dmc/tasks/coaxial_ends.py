@@ -1,0 +1,93 @@
+"""How the pre-shaped ends of coaxial devices lie to places ahead of them.
+
+A pre-shaped end leads to one side of its device, so what counts is the direction in the
+frame in which the device lies before that end, and the rotation of the end.
+"""
+
+import dataclasses
+from typing import Self
+
+import numpy as np
+
+from cathsim_dmc.entities import posture
+from cathsim_dmc.entities.chain import Chain
+from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.physics.readings import Readings
+
+
+@dataclasses.dataclass(frozen=True)
+class CoaxialEnds:
+    """Where the shaped ends of K devices begin on their common chain of L links.
+
+    Attributes:
+        shaped: (K,), length of the pre-shaped end of each device, m.
+        nodes: (L + 1,), ends of the links from the end of the chain, m.
+    """
+
+    shaped: np.ndarray
+    nodes: np.ndarray
+
+    @classmethod
+    def of(cls, chain: Chain) -> Self:
+        """Reads off the entity of coaxial devices."""
+        assert isinstance(chain, DeviceStack)
+        shapes = [[arc.length for arc in one.tip_shape] for one in chain.devices]
+        return cls(np.array([sum(one) for one in shapes]), chain.stack.nodes)
+
+    def directions(
+        self, readings: Readings, insertion: np.ndarray, targets: np.ndarray
+    ) -> np.ndarray:
+        """Ways (N, K, 3), m, to places, in the frames before the shaped ends.
+
+        Args:
+            readings: Of the chains.
+            insertion: (N, K), of the devices, m.
+            targets: (N, K, 3), m, world frame.
+        """
+        gaps = insertion.max(axis=1, keepdims=True) - insertion
+        rows, last = np.arange(len(gaps)), len(self.nodes) - 2
+        frames, ways = [readings.head_frame], np.empty(targets.shape)
+        for k in range(gaps.shape[1]):
+            behind = gaps[:, k] + self.shaped[k]
+            link = np.maximum((self.nodes[:-1] > behind[:, None]).sum(axis=1) - 1, 0)
+            while len(frames) <= last - link.min():
+                frames.append(before(frames[-1], readings.joint_positions, len(frames)))
+            frame = np.stack(frames)[last - link, rows]
+            way = targets[:, k] - readings.centreline[rows, link]
+            ways[:, k] = np.einsum("nij,ni->nj", frame, way)
+        return ways
+
+
+def before(frame: np.ndarray, joints: np.ndarray, number: int) -> np.ndarray:
+    """Frames (N, 3, 3) of the links before given ones, `number`-th from the end."""
+    place = joints.shape[1] // 2 - number  # of the joint; two slides precede it
+    for axis in (1, 0) if posture.x_first(place) else (0, 1):
+        frame = turned(frame, axis, -joints[:, -2 * number + axis])
+    return frame
+
+
+def turned(frame: np.ndarray, axis: int, angle: np.ndarray) -> np.ndarray:
+    """Frame (..., 3, 3) turned by an angle (...) about its own axis 0, 1 or 2."""
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    cosine, sine = np.cos(angle)[..., None], np.sin(angle)[..., None]
+    turned = np.array(frame)
+    turned[..., first] = cosine * frame[..., first] + sine * frame[..., second]
+    turned[..., second] = cosine * frame[..., second] - sine * frame[..., first]
+    return turned
+
+
+def sides(ways: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """What a policy sees (N, K, 5) of ways (N, K, 3) of `CoaxialEnds.directions`.
+
+    Args:
+        rotation: (N, K), of the ends, rad.
+
+    Returns:
+        Cosine and sine of the rotation, and the direction along the x, y and z that are
+        turned with the end.
+    """
+    ways = ways / np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-9)
+    cosine, sine = np.cos(rotation), np.sin(rotation)
+    along = cosine * ways[..., 0] + sine * ways[..., 1]
+    across = cosine * ways[..., 1] - sine * ways[..., 0]
+    return np.stack([cosine, sine, along, across, ways[..., 2]], axis=-1)
