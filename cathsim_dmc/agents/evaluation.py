@@ -316,7 +316,7 @@ def _play_on_cluster(
     total = sum(len(group.rows) for group in wholes)
     size = math.ceil(total / max(cluster.room(each), 1))
     pieces = [group.pieces(size) for group in wholes]
-    jobs = [(piece, observer is not None) for piece in itertools.chain(*pieces)]
+    jobs = [(piece, observer is not None) for own in pieces for piece in own]
     found: dict[int, tuple[list[EpisodeOutcome], ContactLog]] = {}
     with progress_bar(wholes[0].player.name, " groups", total=len(jobs)) as bar:
         for number, result in cluster.over(_play_apart, jobs, each):
@@ -324,10 +324,10 @@ def _play_on_cluster(
             bar.update()
     outcomes, ordered = [], (found[number] for number in range(len(jobs)))
     for own in pieces:
-        played, logs = zip(*itertools.islice(ordered, len(own)), strict=True)
-        outcomes += itertools.chain(*played)
+        results = list(itertools.islice(ordered, len(own)))
+        outcomes += [outcome for played, _ in results for outcome in played]
         if observer is not None:
-            observer.join(logs)
+            observer.join([log for _, log in results])
     return outcomes
 
 

@@ -32,7 +32,7 @@ from cathsim_dmc.agents.episodes import EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
 from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.learners import LEARNERS
-from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
+from cathsim_dmc.agents.networks import NetworkShapes, bounded
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 from cathsim_dmc.agents.training_log import TrainingLog, crossed, read_metrics
 from cathsim_dmc.simulation import environments
@@ -107,7 +107,7 @@ def train(
     if config.modules:
         suite.known(config.task, config.modules)
     text = f"torch_device={config.torch_device!r} cannot be used here, 'cpu' always can"
-    with files.refused(ConfigError, text, RuntimeError, AssertionError):
+    with files.refused(ConfigError, text, (RuntimeError, AssertionError)):
         torch.zeros(1, device=config.torch_device)
     loggers.require(config.logger)
     check_collector(config, LEARNERS[config.algorithm].learner)
@@ -226,7 +226,7 @@ def _start(
         f"evaluated: it does not fit what {checkpoint.config.algorithm} learns with"
     )
     wrong = KeyError, TypeError, AttributeError, RuntimeError
-    with files.refused(CheckpointError, text, *wrong):
+    with files.refused(CheckpointError, text, wrong):
         learner.load(policy, state.pop("learner"))
     return {"frames": checkpoint.frames, "seconds": checkpoint.seconds, **state}
 
@@ -279,7 +279,7 @@ def take_over(
         if kept or "log_std" not in key:
             state[key] = given[key]
         elif value.ndim == 1:
-            state[key] = middle.clamp(*LOG_STD_RANGE)
+            state[key] = bounded(middle)
         else:
             state[key] = torch.zeros_like(value)  # equal in all states
     network.load_state_dict(state)

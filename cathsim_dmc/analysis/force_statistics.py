@@ -90,7 +90,8 @@ class ForceTracker:
     def finish(self, simulation: int) -> EpisodeForces:
         """Statistics of a simulation's episode, which ends; the next one begins."""
         steps, self._steps[simulation] = self._steps[simulation], []
-        return EpisodeForces(*map(_statistics, np.transpose(steps)))
+        columns = zip(QUANTITIES, np.transpose(steps), strict=False)
+        return EpisodeForces(**{name: _statistics(column) for name, column in columns})
 
 
 def _statistics(row: Sequence[float] | np.ndarray) -> Statistics | None:
@@ -108,8 +109,11 @@ def recorded_forces(episode: Episode) -> EpisodeForces:
         return EpisodeForces()
     peaks = (episode.meta.get(f"wall_force_peak_{name}") for name in ("sum", "max"))
     columns = episode.wall_force_sum, episode.wall_force_max, *peaks
-    found = (None if one is None else _statistics(one) for one in columns)
-    return EpisodeForces(*found)
+    found = {
+        name: None if column is None else _statistics(column)
+        for name, column in zip(QUANTITIES, columns, strict=False)
+    }
+    return EpisodeForces(**found)
 
 
 def millinewtons(mean: float | None, deviation: float | None = None) -> str:

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -115,13 +115,12 @@ def evaluate(
     common |= {"start": None if start is None else Snapshot.load(start)}
 
     def play(who: Any, out_dir: Path | None = None) -> EvaluationResult:
-        name, asked = getattr(who, "name", who), (task, episodes, seed)
+        name = getattr(who, "name", who)
+        asked = {"task": task, "episodes": episodes, "seed": seed, **common}
         if ray:
             log = contacts if who is player else None
             with told_of_losses():
-                return agents.evaluate(
-                    who, *asked, observer=log, out_dir=out_dir, **common
-                )
+                return agents.evaluate(who, observer=log, out_dir=out_dir, **asked)
         with progress_bar(name, " steps", delay=LINE_INTERVAL) as bar:
 
             def observe(env: Any, running: np.ndarray) -> None:
@@ -131,9 +130,7 @@ def evaluate(
                 bar.set_postfix_str(text, refresh=False)
                 bar.update()
 
-            return agents.evaluate(
-                who, *asked, observer=observe, out_dir=out_dir, **common
-            )
+            return agents.evaluate(who, observer=observe, out_dir=out_dir, **asked)
 
     results = {"policy": play(player, out)}
     if baseline and policy != "random":
@@ -147,13 +144,13 @@ def evaluate(
         # No figure of a policy has a bar to keep.
         print_json({"checks": [], **values})
         return 0
-    print_results(*results.values())
+    print_results(list(results.values()))
     if report:
         print_episodes(results["policy"])
     return 0
 
 
-def print_results(*results: EvaluationResult) -> None:
+def print_results(results: Sequence[EvaluationResult]) -> None:
     """Print figures of evaluations of one task side by side."""
     first, columns = results[0], [_figures(result) for result in results]
     title = f"{first.task}, seeds from {first.seeds[0]}"
@@ -176,7 +173,10 @@ def _figures(result: EvaluationResult) -> dict[str, str]:
     return {
         "reward": f"{summary['reward']:.1f} ± {summary['reward_sd']:.1f}",
         "steps": f"{summary['length']:.0f} ± {summary['length_sd']:.0f}",
-        **{f"{n.replace('_', ' ')}, mN": millinewtons(*f) for n, f in forces.items()},
+        **{
+            f"{n.replace('_', ' ')}, mN": millinewtons(mean, sd)
+            for n, (mean, sd) in forces.items()
+        },
         "success": success,
         **{f"safe success, {limit}": f"{100 * rate:.0f} %" for limit, rate in safe},
     }
@@ -192,7 +192,7 @@ def print_episodes(result: EvaluationResult) -> None:
     )
     drawn = result.conditions or ({},) * len(result.episodes)
     played = zip(result.seeds, drawn, result.episodes, strict=True)
-    rows = [_outcome(*each) for each in played]
+    rows = [_outcome(seed, condition, one) for seed, condition, one in played]
     table = Table(*rows[0], title=title)
     for row in rows:
         table.add_row(*row.values())

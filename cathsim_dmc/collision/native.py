@@ -242,7 +242,7 @@ def fused(_, one, other, more):
     """The number one * other + more, rounded once; so numpy sums squares."""
 
     def generate(context, builder, signature, arguments):
-        return builder.fma(*arguments)
+        return builder.fma(arguments[0], arguments[1], arguments[2])
 
     return types.float64(types.float64, types.float64, types.float64), generate
 

@@ -107,8 +107,9 @@ class Places(NamedTuple):
         joints = np.searchsorted(model.jnt_qposadr, qpos)
         hinges = np.array([joints, qpos, model.jnt_dofadr[joints]])
         kind = mujoco.mjtObj.mjOBJ_GEOM
-        geoms = (mujoco.mj_name2id(model, kind, n) for n in ("wall", "sheath/bore"))
-        return cls(index.links.start, index.geoms, hinges, *geoms)
+        wall = mujoco.mj_name2id(model, kind, "wall")
+        bore = mujoco.mj_name2id(model, kind, "sheath/bore")
+        return cls(index.links.start, index.geoms, hinges, wall, bore)
 
 
 class Layout:

@@ -142,7 +142,7 @@ class Plan(Route):
         speed = attempts.translation(settings, memory, *pressing, cosine)
         action = np.zeros((*speed.shape, self.num_actions))
         motors = self.tip.size
-        action[..., :motors] = (bend / self.steering_angle).reshape(*speed.shape, -1)
+        action[..., :motors] = (bend / self.steering_angle).reshape((*speed.shape, -1))
         action[..., motors] = speed
         insertion, arc_length = np.array(readings.insertion), np.array(place.arc_length)
         return action, State(arc_length, insertion, bend)

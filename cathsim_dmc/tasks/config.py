@@ -162,10 +162,12 @@ class NavigationConfig:
                 )
 
     def _check_numbers(self):
-        for name, limits in _NUMBERS.items():
-            value = getattr(self, name)
-            if value is not None or getattr(type(self), name) is not None:
-                bounds.number(name, value, *limits)
+        required = {
+            name: limits
+            for name, limits in _NUMBERS.items()
+            if getattr(self, name) is not None or getattr(type(self), name) is not None
+        }
+        bounds.fields(self, required)
         bounds.switch("rotation", self.rotation)
         bounds.switch("give_up", self.give_up)
         bounds.whole("max_steps", self.max_steps, 1, bounds.MOST_STEPS)

@@ -105,13 +105,13 @@ def compare(
     ranks = stats.mannwhitneyu(samples, reference, alternative="two-sided")
     mean, sd = float(samples.mean()), float(samples.std(ddof=1))
     independent = effective_count(samples)
-    theirs = sd, independent, reference_mean, reference_sd, count
     sides = [
         stats.ttest_ind_from_stats(
-            mean + shift, *theirs, equal_var=False, alternative=side
+            mean + shift, sd, independent, reference_mean, reference_sd, count,
+            equal_var=False, alternative=side,
         )
         for shift, side in ((margin, "greater"), (-margin, "less"))
-    ]
+    ]  # fmt: skip
     p_value = float(max(side.pvalue for side in sides))
     return {
         "count": count,

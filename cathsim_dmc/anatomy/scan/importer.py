@@ -119,10 +119,9 @@ def import_scan(
     notes = [] if notes is None else notes
     say = progress or (lambda text: None)
 
-    def note(*texts: str) -> None:
-        notes.extend(texts)
-        for text in texts:
-            say(f"note: {text}")
+    def note(text: str) -> None:
+        notes.append(text)
+        say(f"note: {text}")
 
     given = {
         key: np.array(bounds.vector(key, place, 3))
@@ -156,8 +155,10 @@ def import_scan(
         grown = _Growth(measure, scale, device, places, changes, note)
         tree, at_end, arch = grown.tree(curves)
         turn = None if axes is None else upright(axes)
-        note(*filter(None, [unproven(tree, turn) if arch else None]))
-        opened = resized(*_opened(tree, at_end, surface), 1.0 / scale)
+        if arch and (doubt := unproven(tree, turn)):
+            note(doubt)
+        tree, inlet_found, surface = _opened(tree, at_end, surface)
+        opened = resized(tree, inlet_found, surface, 1.0 / scale)
     name = name or Path(mesh_path).name.split(".")[0]
     with file_frame(matrix, lumen.units):
         frame = FileFrame(lumen.units, matrix)
@@ -241,8 +242,9 @@ class _Growth:
         elif root != ROOT:
             tree = with_root(tree, root)
         if not drawn:
-            missed = left_out(ways, tree)
-            self._note(*filter(None, [said(missed, self.device.name, ways.device)]))
+            missed = said(left_out(ways, tree), self.device.name, ways.device)
+            if missed is not None:
+                self._note(missed)
         return tree, entry.at_end, arch
 
     def _choose_device(self, entry) -> None:
@@ -291,7 +293,8 @@ class _Growth:
             names, notes, right = Naming(naming.neutral_names(known))
         else:
             names, notes, right = arch.named(known, entry.far)
-        note(*notes)
+        for text in notes:
+            note(text)
         root, *names = self._renamed([TRUNK if arch is None else ROOT, *names], known)
         end = f"{end} (--inlet takes another)" if end and "inlet" not in places else ""
         note(f"inlet chosen at {shown(entry.position)}{end}")
