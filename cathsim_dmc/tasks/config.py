@@ -27,7 +27,7 @@ from cathsim_dmc.tasks.cameras import CameraOptions
 
 MAX_STEPS = 2000  # published
 WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
-_FRICTION = (0.0, 2.0)  # Coulomb coefficient
+_FRICTION = (0.0, 2.0, "")  # Coulomb coefficient
 # Least and largest numbers. A link is longer than its radius and shorter than the
 # diameter of a large vessel.
 _NUMBERS = {
