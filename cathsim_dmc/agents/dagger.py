@@ -29,7 +29,7 @@ _BEGUN = "step_count"  # control steps since an episode began
 class DAggerConfig(TrainingConfig):
     """DAgger from the scripted expert.
 
-    A round collects frames in which expert and learner take turns, adds them with the
+    A round collects frames in which expert and learner alternate, adds them with the
     expert's actions to all frames before, and fits the policy to them again.
 
     Attributes:

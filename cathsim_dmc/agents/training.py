@@ -116,14 +116,7 @@ def train(
         checkpoint = _prepare(run, config, resume)
         stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(config.torch_threads)
-        # A resumed run gets fresh episodes: another stretch of the same seeds.
-        stretch = [config.seed, checkpoint.frames if checkpoint else 0]
-        seed = int(np.random.SeedSequence(stretch).generate_state(1)[0]) % 2**31
-        env = make_env(
-            config.task, observation=config.collected_observation,
-            num_envs=config.num_envs, num_threads=config.num_threads, seed=seed,
-            task_kwargs=config.training_kwargs, **_place(config),
-        )  # fmt: skip
+        env = _environment(config, make_env, checkpoint.frames if checkpoint else 0)
         environments.record_errors(env, run / "errors")
         torch.manual_seed(config.seed)
         shapes = NetworkShapes.of(env.observation_spec, env.action_spec)
@@ -143,6 +136,18 @@ def train(
         interruption = stack.enter_context(_interruption())
         call = on_checkpoint or (lambda checkpoint: None)
         return _loop(run, iter(collector), learner, log, interruption, call)
+
+
+def _environment(config: TrainingConfig, make_env: EnvFactory, frames: int) -> EnvBase:
+    """The environment of a run that has collected so many frames."""
+    # A resumed run gets fresh episodes: another stretch of the same seeds.
+    stretch = [config.seed, frames]
+    seed = int(np.random.SeedSequence(stretch).generate_state(1)[0]) % 2**31
+    return make_env(
+        config.task, observation=config.collected_observation,
+        num_envs=config.num_envs, num_threads=config.num_threads, seed=seed,
+        task_kwargs=config.training_kwargs, **_place(config),
+    )  # fmt: skip
 
 
 def _place(config: TrainingConfig) -> dict[str, str]:

@@ -110,13 +110,14 @@ def evaluate(
     suite.known(task)
     task_kwargs = protocols.get(protocol).beside(task_kwargs, options.given)
     contacts = evaluation.ContactLog()
-    common: Any = {"protocol": protocol, "task_kwargs": task_kwargs}
-    common |= {"num_threads": threads, "on_cluster": ray}
-    common |= {"start": None if start is None else Snapshot.load(start)}
+    asked: Any = {
+        "task": task, "episodes": episodes, "seed": seed, "protocol": protocol,
+        "task_kwargs": task_kwargs, "num_threads": threads, "on_cluster": ray,
+        "start": None if start is None else Snapshot.load(start),
+    }  # fmt: skip
 
     def play(who: Any, out_dir: Path | None = None) -> EvaluationResult:
         name = getattr(who, "name", who)
-        asked = {"task": task, "episodes": episodes, "seed": seed, **common}
         if ray:
             log = contacts if who is player else None
             with told_of_losses():
@@ -140,14 +141,23 @@ def evaluate(
     if out is not None:
         files.write_json(out / "evaluation.json", values)
         contacts.draw(results["policy"], out / "heatmap.png")
+    _print(results, values, report, json)
+    return 0
+
+
+def _print(
+    results: Mapping[str, EvaluationResult],
+    values: Mapping[str, Any],
+    report: bool,
+    json: bool,
+) -> None:
     if json:
         # No figure of a policy has a bar to keep.
         print_json({"checks": [], **values})
-        return 0
+        return
     print_results(list(results.values()))
     if report:
         print_episodes(results["policy"])
-    return 0
 
 
 def print_results(results: Sequence[EvaluationResult]) -> None:

@@ -144,7 +144,7 @@ class Layout:
         while taken[slot]:
             slot = (slot + 1) % own.CAPACITY
         lists = [self._list("passive", "contact"), self._list("control")]
-        # Addresses in the table refer to these for as long as the process lives.
+        # Addresses in the table refer to these until the process ends.
         self._kept, self._row = (where, lists), own.TABLE[slot]
         self._row[1 : 1 + len(sizes)] = sizes
         self._row[1 + len(sizes) :] = (

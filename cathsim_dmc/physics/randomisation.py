@@ -165,7 +165,7 @@ class Randomisation:
                 return None
             if not isinstance(chosen, variation.Variation):
                 return drawn(chosen, random_state)
-            # Only now is it known what somebody's own distribution gives.
+            # A user's own distribution is checked when it is drawn.
             found = variation.evaluate(chosen, random_state=random_state)
             low, high, unit = _RANGES[name]
             return bounds.number(f"{name}, as drawn,", found, low, high, unit)

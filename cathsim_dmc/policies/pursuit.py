@@ -103,7 +103,7 @@ class Plan(Route):
         return State.fresh(shape, len(self.tip))
 
     def told(self, state: State, action: np.ndarray) -> State:
-        """Memory as if the last action were this one (..., A)."""
+        """State with the last command replaced by (..., A)."""
         bend = action[..., : self.tip.size] * self.steering_angle
         return state._replace(bend=bend.reshape(state.bend.shape))
 

@@ -201,7 +201,7 @@ class NavigationConfig:
                     f"N·m², but the physics holds up to {_STIFFEST:g} N·m²"
                 )
         if faults and not self.outside_range:
-            raise ValueError(f"{faults[0]}; outside_range=True takes it with a warning")
+            raise ValueError(f"{faults[0]}; outside_range=True overrides this check")
         for fault in faults:
             warnings.warn(fault, stacklevel=4)
 

@@ -1,4 +1,4 @@
-"""The vessel against closed forms: blood that flows, a wall that gives and moves."""
+"""Flow, compliant wall and moving wall against closed forms."""
 
 import itertools
 from collections.abc import Iterator, Sequence

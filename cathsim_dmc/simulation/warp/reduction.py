@@ -20,7 +20,7 @@ class Totals(NamedTuple):
     Attributes:
         force: (5, N) the forces of `physics.forces.WallForce`, N, and the depth of the
             deepest contact, m.
-        diverged: (N,) whether the state is no longer finite.
+        diverged: (N,) whether the state is not finite.
         beside: (N, B) sensors beside those of contacts.
     """
 
