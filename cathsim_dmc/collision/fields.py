@@ -36,9 +36,7 @@ _SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
 _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 _TYPES = int(mujoco.mjtGeom.mjNGEOMTYPES)
 
-_EXCURSION = (
-    40e-3  # m, largest displacement of a wall beyond the box of its field
-)
+_EXCURSION = 40e-3  # m, largest displacement of a wall beyond the box of its field
 
 
 class Bore:

@@ -200,9 +200,9 @@ def scene_figure(
         size = _WIDEST_IN, (_WIDEST_IN - 1.6) / sum(ratios) + _LETTERING_IN
     figure = Picture(figsize=size, dpi=120, layout="constrained")
     panels = figure.subplots(1, len(ratios), width_ratios=ratios, squeeze=False)[0]
-    for panel, view, seen in zip(panels, views, drawn, strict=False):
-        draw_scene(panel, moment, *seen)
-        _prepare(panel, seen[0], view)
+    for panel, view, (projection, seen) in zip(panels, views, drawn, strict=False):
+        draw_scene(panel, moment, projection, seen)
+        _prepare(panel, projection, view)
     if views:
         scale = Normalize(0, 1e3 * moment.force_scale)
         beside = panels[: len(views)].tolist()

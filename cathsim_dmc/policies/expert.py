@@ -78,9 +78,12 @@ class ExpertPolicy(Policy):
             raise RuntimeError("the expert must be reset before it acts")
         view = self._plans.view
         action = np.empty((view.num_simulations, view.num_actions))
-        for plan, rows, seen in self._plans.chosen():
-            own = part(self.state, rows), part(self._plans.memory, rows)
-            action[rows], state = plan.decide(plan.settings, *own, *seen)
+        for plan, rows, (readings, force, devices) in self._plans.chosen():
+            own, memory = part(self.state, rows), part(self._plans.memory, rows)
+            decided = plan.decide(
+                plan.settings, own, memory, readings, force, devices
+            )
+            action[rows], state = decided
             self.state = merged(self.state, state, rows)
         return action
 
