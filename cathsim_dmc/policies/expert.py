@@ -139,7 +139,7 @@ class Teacher:
         """
         action = np.empty(last_action.shape)
         remembers = self._plans.view.rollout.progress.shown
-        for plan, rows, seen in self._plans.chosen():
+        for plan, rows, (readings, force, devices) in self._plans.chosen():
             settings, state = plan.settings, plan.fresh((len(rows),))
             arc_length, insertion = self._last[:, rows]
             state = state._replace(arc_length=arc_length, insertion=insertion)
@@ -148,8 +148,10 @@ class Teacher:
                 memory = part(self._plans.memory, rows)
             else:
                 settings = self._one_lead if isinstance(plan, CoaxialPlan) else settings
-                memory = _of_the_moment(plan, settings, seen[0])
-            action[rows], state = plan.decide(settings, state, memory, *seen)
+                memory = _of_the_moment(plan, settings, readings)
+            action[rows], state = plan.decide(
+                settings, state, memory, readings, force, devices
+            )
             self._last[:, rows] = state.arc_length, state.insertion
         return action
 
