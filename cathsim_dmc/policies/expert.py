@@ -80,9 +80,7 @@ class ExpertPolicy(Policy):
         action = np.empty((view.num_simulations, view.num_actions))
         for plan, rows, (readings, force, devices) in self._plans.chosen():
             own, memory = part(self.state, rows), part(self._plans.memory, rows)
-            decided = plan.decide(
-                plan.settings, own, memory, readings, force, devices
-            )
+            decided = plan.decide(plan.settings, own, memory, readings, force, devices)
             action[rows], state = decided
             self.state = merged(self.state, state, rows)
         return action

@@ -341,7 +341,7 @@ class Rollout(Restorable):
         frame = Frame(
             state, self.wall_force, self._action, goal, self._chain, sensors.images,
             ahead, devices, self.vessel, self.progress.seen(state),
-        )
+        )  # fmt: skip
         return observations.observe(self._names, frame)
 
     def _views(self, indices: np.ndarray) -> dict[str, np.ndarray]:
