@@ -138,8 +138,8 @@ class Plan(Route):
         left = attempts.relaxed(settings, memory, wall_force.max)[..., None, None]
         bend = left * (bend + np.where(still[..., None, None], 0.0, correction))
         bend = np.clip(bend, -self.steering_angle, self.steering_angle)
-        pressing = wall_force.max, readings.push_force
-        speed = attempts.translation(settings, memory, *pressing, cosine)
+        contact, push = wall_force.max, readings.push_force
+        speed = attempts.translation(settings, memory, contact, push, cosine)
         action = np.zeros((*speed.shape, self.num_actions))
         motors = self.tip.size
         action[..., :motors] = (bend / self.steering_angle).reshape((*speed.shape, -1))

@@ -118,8 +118,9 @@ class Rollout(Restorable):
         self.progress = Progress(self._names, cases, count, config.give_up)
         self._chain = CommonChain(scene.catheter, config.shaft_link)
         self._sensors = ImageSensors(self._names, cases[0], count, self._chain)
-        own = self._names, self.index.geoms, scene.catheter.coaxial
-        self._cameras = cameras.opened(model, config.cameras, *own)
+        self._cameras = cameras.opened(
+            model, config.cameras, self._names, self.index.geoms, scene.catheter.coaxial
+        )
         self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
@@ -186,8 +187,8 @@ class Rollout(Restorable):
         self._layout.begin(index)
         for effect in self.effects:
             effect.restart(index, episode, random_state)
-        gain, kerma = episode.gain, episode.kerma
-        self.deviations[index] = Deviation(*episode.view, gain=gain, kerma=kerma)
+        (primary, secondary), kerma = episode.view, episode.kerma
+        self.deviations[index] = Deviation(primary, secondary, episode.gain, kerma)
         self._place_machine(index)
         self._goal_shift[index] = episode.goal_shift or 0.0
 
