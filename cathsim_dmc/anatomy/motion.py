@@ -63,7 +63,8 @@ class Motion:
         low, high = box
         heart, breath = _along_aorta(blood, tree)
         shape = np.ceil((high - low) / _STEP).astype(int) + 1
-        lattice = np.moveaxis(np.indices(shape.tolist()), 0, -1)
+        i, j, k = (np.arange(count) for count in shape)
+        lattice = np.stack(np.meshgrid(i, j, k, indexing="ij"), -1)
         points = (low + _STEP * lattice).reshape(-1, 3)
         values = np.concatenate(
             [
