@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -286,3 +290,19 @@ def with_vertebral(tree: VesselTree, rng) -> VesselTree:
     line = Centreline(points, np.full(30, 1.9e-3))
     vessel = Vessel("lva", line, tree.root.name, float(place.radius))
     return VesselTree({**tree.vessels, "lva": vessel})
+
+
+def resumed(
+    out: Path, cases: Sequence[Any], run: Callable[[Any], dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Rows of a file of JSON lines, after running the cases that are not in it."""
+    rows = []
+    if out.exists():
+        rows = [json.loads(line) for line in out.read_text().splitlines()]
+    done = {row["case"] for row in rows}
+    for case in cases:
+        if case.name not in done:
+            rows.append(run(case))
+            with out.open("a") as stream:
+                stream.write(json.dumps(rows[-1]) + "\n")
+    return rows

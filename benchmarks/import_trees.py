@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import tempfile
 import time
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
+import import_cases
 import numpy as np
 import trimesh
 
@@ -338,17 +338,8 @@ def main() -> None:
     parser.add_argument("--only", default="", help="part of a case's name")
     parser.add_argument("--seed", type=int, default=SEED, help="of the first case")
     options = parser.parse_args()
-    rows = []
-    if options.out.exists():
-        rows = [json.loads(line) for line in options.out.read_text().splitlines()]
-    done = {row["case"] for row in rows}
-    for case in cases(options.seed):
-        if case.name in done or options.only not in case.name:
-            continue
-        rows.append(run(case))
-        with options.out.open("a") as stream:
-            stream.write(json.dumps(rows[-1]) + "\n")
-    print(table(rows))
+    chosen = [case for case in cases(options.seed) if options.only in case.name]
+    print(table(import_cases.resumed(options.out, chosen, run)))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 import time
 from collections import defaultdict
@@ -142,19 +141,9 @@ def main() -> None:
     parser.add_argument("--part", default="0/1", help="k/n: every n-th case from k on")
     options = parser.parse_args()
     files.require_file(options.out)
-    rows = []
-    if options.out.exists():
-        rows = [json.loads(line) for line in options.out.read_text().splitlines()]
-    done = {row["case"] for row in rows}
     first, step = map(int, options.part.split("/"))
     chosen = [c for c in import_cases.cases(options.seed) if options.only in c.name]
-    for case in chosen[first::step]:
-        if case.name in done:
-            continue
-        rows.append(run(case))
-        with options.out.open("a") as stream:
-            stream.write(json.dumps(rows[-1]) + "\n")
-    print(table(rows))
+    print(table(import_cases.resumed(options.out, chosen[first::step], run)))
 
 
 if __name__ == "__main__":

@@ -65,6 +65,33 @@ def number(
     return float(value)
 
 
+def fields(
+    owner: Any,
+    limits: Mapping[str, tuple[float, float, str]],
+    prefix: str = "",
+    positive: Sequence[str] = (),
+) -> dict[str, float]:
+    """Attributes that are numbers within (low, high, unit); see `number`.
+
+    Args:
+        owner: Object with the attributes.
+        limits: By the names of the attributes.
+        prefix: Before their names in errors.
+        positive: Names of those that may not be 0.
+    """
+    return {
+        name: number(
+            f"{prefix}{name}",
+            getattr(owner, name),
+            low,
+            high,
+            unit,
+            positive=name in positive,
+        )  # fmt: skip
+        for name, (low, high, unit) in limits.items()
+    }
+
+
 def whole(
     name: str, value: Any, low: int | None = None, high: int | None = None
 ) -> int:

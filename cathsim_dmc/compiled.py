@@ -132,4 +132,4 @@ def for_cuda(function: Any) -> Any:
 def _names(code: types.CodeType) -> set[str]:
     """Global names in the code of a function and of those within it."""
     inner = (each for each in code.co_consts if isinstance(each, types.CodeType))
-    return set(code.co_names).union(*map(_names, inner))
+    return set(code.co_names) | {name for each in inner for name in _names(each)}

@@ -18,7 +18,7 @@ if os.name == "posix":
 
 
 def mapped(stream: BinaryIO) -> np.ndarray:
-    """The bytes (n,) uint8 of a file that nobody writes any more.
+    """The bytes (n,) uint8 of a file that is complete.
 
     What is written into them stays in this process. Where the system has no `mmap`
     they are read.

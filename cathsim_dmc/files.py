@@ -143,7 +143,9 @@ def naming(path: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def refused(
-    kind: type[Exception], text: str, *errors: type[Exception]
+    kind: type[Exception],
+    text: str,
+    errors: type[Exception] | tuple[type[Exception], ...],
 ) -> Iterator[None]:
     """Raise errors of the block as another kind: one line, a text before their own."""
     try:

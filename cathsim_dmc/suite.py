@@ -191,7 +191,8 @@ def make_task(
         return Scene.build(anatomy, goal, config, **looks), objective
 
     others = map(room, range(1, len(anatomies))) if len(anatomies) > 1 else None
-    return Navigation(*room(0), config, random, others=others, name=name)
+    scene, objective = room(0)
+    return Navigation(scene, objective, config, random, others=others, name=name)
 
 
 def _one_length(

@@ -285,7 +285,7 @@ def test_the_table_says_which_force_is_which(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
 
     result = play(policy=push, episodes=3)
-    commands.print_results(result)
+    commands.print_results([result])
     text = " ".join(capsys.readouterr().out.split())
     for name in FIGURES:
         assert f"{name.replace('_', ' ')}, mN" in text

@@ -12,8 +12,9 @@ from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.coaxial import Stack
 from cathsim_dmc.entities.torsion import rods_of
-from cathsim_dmc.laws import coaxial, torsion
-from cathsim_dmc.laws.coaxial import Lumen, Posture
+from cathsim_dmc.laws import coaxial, coaxial_forces, torsion
+from cathsim_dmc.laws.coaxial import Posture
+from cathsim_dmc.laws.coaxial_forces import Lumen
 from cathsim_dmc.laws.torsion import STICKING
 
 PAIR = ("wire_035_glide", "diagnostic_5f_simmons")
@@ -196,7 +197,9 @@ def pressed(stack, overlap, bends, turns):
     lumen = Lumen(np.zeros(devices), np.ones(devices - 1), 0.04, 1.0)
     posture, scratch = Posture(np.zeros(0), bends, turns), stack_memory.scratch(tables)
     force, drag = np.empty((devices - 1, turns.shape[1])), np.empty(devices - 1)
-    coaxial.pressure(tables, overlap, posture, axial, lumen, scratch, force, drag)
+    coaxial_forces.pressure(
+        tables, overlap, posture, axial, lumen, scratch, force, drag
+    )
     return force
 
 
@@ -211,7 +214,7 @@ def restoring(stack, overlap, bends, turns):
     """Torque (K, J) of the shapes on each device, and its rate."""
     posture, scratch = Posture(np.zeros(0), bends, turns), stack_memory.scratch
     torque, rate = np.empty((2, *turns.shape))
-    coaxial.restoring(overlap, posture, scratch(stack.tables), torque, rate)
+    coaxial_forces.restoring(overlap, posture, scratch(stack.tables), torque, rate)
     return torque, rate
 
 
@@ -258,7 +261,7 @@ def test_axial_forces_are_the_derivative_of_the_energy(pair, gaps):
     slopes *= restoring(pair, overlap, bends, turns)[0]
     posture, scratch = Posture(gaps, bends, turns), stack_memory.scratch(pair.tables)
     force = np.empty(turns.shape)
-    coaxial.axial(pair.tables, overlap, posture, slopes, scratch, force)
+    coaxial_forces.axial(pair.tables, overlap, posture, slopes, scratch, force)
     force = force.sum(axis=-1)
     step = 2e-5 * (np.arange(2) == follower)
     ends = [energy(pair, gaps + side * step, bends, angles) for side in (1, -1)]

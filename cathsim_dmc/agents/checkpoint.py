@@ -74,7 +74,7 @@ class Checkpoint:
             path = found[-1]
         description = path / _DESCRIPTION
         wrong = OSError, LookupError, TypeError, AttributeError, ValueError
-        with files.refused(CheckpointError, str(description), *wrong):
+        with files.refused(CheckpointError, str(description), wrong):
             values = json.loads(description.read_text())
             if values["format"] != FORMAT:
                 raise ValueError(f"format is {values['format']!r}, not {FORMAT}")
@@ -106,7 +106,7 @@ class Checkpoint:
         Called before networks are made to continue from it.
         """
         file = self.path / _POLICY
-        with files.refused(CheckpointError, f"{file} {_OTHER_NETWORK}", *_WRONG):
+        with files.refused(CheckpointError, f"{file} {_OTHER_NETWORK}", _WRONG):
             _require_sizes(self.policy_state(), self.shapes, self.config)
             # Of images a critic alone has hidden layers, in the other file.
             widths = self.config.hidden
@@ -172,7 +172,7 @@ def policy_of(
     path: Path, state: Mapping[str, Any], shapes: NetworkShapes, config: TrainingConfig
 ) -> TensorDictSequential:
     """A policy ready to act; CheckpointError if the weights are of another network."""
-    with files.refused(CheckpointError, f"{path} {_OTHER_NETWORK}", *_WRONG):
+    with files.refused(CheckpointError, f"{path} {_OTHER_NETWORK}", _WRONG):
         _require_sizes(state, shapes, config)
         policy = make_policy(shapes, config)
         policy.load_state_dict(dict(state))

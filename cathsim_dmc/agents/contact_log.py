@@ -1,6 +1,5 @@
 """Contacts with the wall of an evaluation, for its heatmap."""
 
-import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,20 @@ from torchrl.envs import EnvBase
 from cathsim_dmc import suite
 from cathsim_dmc.analysis import heatmap
 
-_NONE = np.zeros((0, 3)), np.zeros(0)
+# Positions (K, 3), m, and magnitudes (K,), N, of the contacts of a control step.
+_Step = tuple[np.ndarray, np.ndarray]
+
+
+def _joined(steps: Sequence[_Step]) -> _Step:
+    positions = np.concatenate([position for position, _ in steps])
+    return positions, np.concatenate([magnitude for _, magnitude in steps])
 
 
 class ContactLog:
     """An observer that keeps the contacts with the wall."""
 
     def __init__(self):
-        self._steps = [_NONE]
+        self._steps: list[_Step] = [(np.zeros((0, 3)), np.zeros(0))]
 
     def __call__(self, env: EnvBase, running: np.ndarray) -> None:
         """Adds the contacts at the end of a control step."""
@@ -28,16 +33,13 @@ class ContactLog:
 
     def join(self, logs: Sequence["ContactLog"]) -> None:
         """Adds contacts of episodes that were played apart, as if side by side."""
-        for step in itertools.zip_longest(
-            *(log._steps for log in logs), fillvalue=_NONE
-        ):
-            positions, magnitudes = map(np.concatenate, zip(*step, strict=True))
-            self._steps.append((positions, magnitudes))
+        for number in range(max((len(log._steps) for log in logs), default=0)):
+            found = [log._steps[number] for log in logs if number < len(log._steps)]
+            self._steps.append(_joined(found))
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions (K, 3), m, world frame, and magnitudes (K,), N."""
-        positions, magnitudes = map(np.concatenate, zip(*self._steps, strict=True))
-        return positions, magnitudes
+        return _joined(self._steps)
 
     def draw(self, result: Any, path: Path) -> None:
         """Writes the heatmap of an `EvaluationResult` in one anatomy as PNG."""

@@ -29,7 +29,7 @@ _BEGUN = "step_count"  # control steps since an episode began
 class DAggerConfig(TrainingConfig):
     """DAgger from the scripted expert.
 
-    A round collects frames in which expert and learner take turns, adds them with the
+    A round collects frames in which expert and learner alternate, adds them with the
     expert's actions to all frames before, and fits the policy to them again.
 
     Attributes:
@@ -116,8 +116,8 @@ class DAgger(CloningLearner):
     def __init__(self, config: DAggerConfig, shapes: NetworkShapes, directory: Path):
         super().__init__(config, shapes, directory)
         self._keys = [*shapes.raw_keys, EXPERT_ACTION]
-        limits = config.replay_frames, config.replay_bytes
-        self.replay = ReplayMemory(directory / "replay", self._keys, *limits)
+        most, size = config.replay_frames, config.replay_bytes
+        self.replay = ReplayMemory(directory / "replay", self._keys, most, size)
 
     @override
     def attach(self, env: EnvBase) -> None:

@@ -120,10 +120,15 @@ def record_demonstrations(
         description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
         f"seeds from {seed}",
     )
+    return _summary(out, buffers)
+
+
+def _summary(path: Path, buffers: Sequence[Any]) -> Demonstrations:
+    """Figures of a dataset of Minari's buffers."""
     means = [np.mean(buffer.infos["wall_force_mean_sum"][1:]) for buffer in buffers]
     largest = [np.max(buffer.infos["wall_force_mean_max"][1:]) for buffer in buffers]
     return Demonstrations(
-        path=out,
+        path=path,
         episodes=len(buffers),
         successes=sum(bool(buffer.infos["success"][-1]) for buffer in buffers),
         steps=sum(len(buffer.rewards) for buffer in buffers),

@@ -67,7 +67,7 @@ def read(path: str | Path) -> Entry:
         ValueError: the file cannot be listed; says why.
     """
     path = Path(path)
-    with files.refused(ValueError, f"{path.name} is not listed", *_WRONG):
+    with files.refused(ValueError, f"{path.name} is not listed", _WRONG):
         if path.stat().st_size > MOST_BYTES:
             raise ValueError(f"it is larger than {MOST_BYTES / 1e6:.0f} MB")
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -93,7 +93,7 @@ def replay(entry: Entry, num_threads: int | None = None) -> Replay | None:
         ValueError: the actions are not those that were submitted, or an episode is
             another one though the versions are the same.
     """
-    with files.refused(ValueError, f"{entry.path.name} is not listed", *_WRONG):
+    with files.refused(ValueError, f"{entry.path.name} is not listed", _WRONG):
         player = _player(entry)
         if player is None:
             return None
@@ -105,7 +105,7 @@ def replay(entry: Entry, num_threads: int | None = None) -> Replay | None:
             task_kwargs=settings["task_kwargs"], num_threads=num_threads,
         )  # fmt: skip
         pairs = zip(entry.result.episodes, result.episodes, strict=True)
-        equal = [_same(*pair) for pair in pairs]
+        equal = [_same(one, other) for one, other in pairs]
         if entry.values.get("versions") == submission.versions() and not all(equal):
             seeds = [s for s, one in zip(result.seeds, equal, strict=True) if not one]
             raise ValueError(

@@ -5,7 +5,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,8 @@ from cathsim_dmc.agents.policies import (
     task_and_options,
     view_of,
 )
+from cathsim_dmc.agents.results import EvaluationResult
 from cathsim_dmc.agents.training_log import progress_bar
-from cathsim_dmc.analysis.force_statistics import QUANTITIES, STATISTICS
-from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.tasks.snapshot import Snapshot
@@ -36,122 +35,6 @@ EnvFactory = Callable[..., EnvBase]
 Observer = Callable[[EnvBase, np.ndarray], None]
 
 EVALUATION_SEED = 1_000_000  # apart from the seeds of training
-
-# Largest sums of the force on the wall up to which success is called safe, N.
-SAFE_FORCES = (0.5, 1.0, 2.0)
-
-
-@dataclass(frozen=True)
-class EvaluationResult:
-    """Episodes of one policy on one task.
-
-    Attributes:
-        task: Name of the task.
-        policy: Name of the policy.
-        seeds: Seed of each episode.
-        episodes: Episodes in the order of their seeds.
-        settings: Protocol, observation, further task_kwargs, frames of a checkpoint.
-        distinct: Whether all episodes can differ by more than the jitter of the start.
-            If not, no interval over them is given.
-        conditions: What was drawn for each episode; empty without randomisation.
-    """
-
-    task: str
-    policy: str
-    seeds: tuple[int, ...]
-    episodes: tuple[EpisodeOutcome, ...]
-    settings: Mapping[str, Any]
-    distinct: bool = True
-    conditions: tuple[Mapping[str, Any], ...] = ()
-
-    def values(self, name: str) -> np.ndarray:
-        """A figure of every episode, float64 (episodes,); NaN where unknown.
-
-        Args:
-            name: Name of an attribute of `EpisodeOutcome`, with dots for what lies
-                deeper, such as "reward" or "forces.peak_sum.maximum".
-        """
-
-        def value(outcome: Any) -> Any:
-            for part in name.split("."):
-                outcome = None if outcome is None else getattr(outcome, part)
-            return outcome
-
-        return np.array([value(e) for e in self.episodes], dtype=np.float64)
-
-    def mean_sd(self, name: str) -> tuple[float | None, float | None]:
-        """Mean and sample standard deviation over the episodes; None if unknown."""
-        values = self.values(name)
-        values = values[~np.isnan(values)]
-        if not len(values):
-            return None, None
-        deviation = float(values.std(ddof=1)) if len(values) > 1 else 0.0
-        return float(values.mean()), deviation
-
-    @property
-    def successes(self) -> int:
-        """Episodes that reached the goal."""
-        return sum(episode.success for episode in self.episodes)
-
-    def safe_success(self, limit: float) -> float:
-        """Share of episodes that reach the goal with little force on the wall.
-
-        Args:
-            limit: The sum of the magnitudes over all contacts, mean over a control step
-                (`EpisodeForces.largest_sum`), stays at or below it in all of them, N.
-
-        Returns:
-            As a fraction; an episode whose force is not known is not safe.
-        """
-        safe = self.values("forces.largest_sum") <= limit
-        return float(np.mean((self.values("success") > 0) & safe))
-
-    def summary(self) -> dict[str, Any]:
-        """Means with deviations over the episodes, success rate with its interval.
-
-        The interval is None where the episodes are not distinct. Forces in N, by
-        quantity and statistic as docs/forces.md defines them.
-        """
-        count, successes = len(self.episodes), self.successes
-        interval = list(success_interval(successes, count)) if self.distinct else None
-        result: dict[str, Any] = {"episodes": count}
-        for name in ("reward", "length", "path_ratio"):
-            result[name], result[f"{name}_sd"] = self.mean_sd(name)
-        # Files of before 0.3 do not tell the means over a control step.
-        quantities = [
-            name
-            for name in QUANTITIES
-            if any(getattr(one.forces, name) is not None for one in self.episodes)
-        ]
-        result["forces"] = {quantity: {} for quantity in quantities}
-        for quantity, name in itertools.product(quantities, STATISTICS):
-            mean, deviation = self.mean_sd(f"forces.{quantity}.{name}")
-            result["forces"][quantity][name] = {"mean": mean, "sd": deviation}
-        result["physics_errors"] = sum(e.physics_error for e in self.episodes)
-        result |= {"success": successes / count, "success_ci95": interval}
-        result["safe_success"] = {
-            f"{limit:g} N": self.safe_success(limit) for limit in SAFE_FORCES
-        }
-        return result
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able: identity, summary and every episode."""
-        drawn = [{"conditions": dict(one)} for one in self.conditions]
-        drawn = drawn or [{}] * len(self.seeds)
-        played = zip(self.seeds, self.episodes, drawn, strict=True)
-        episodes = [
-            {"seed": seed, **asdict(episode), **conditions}
-            for seed, episode, conditions in played
-        ]
-        return {
-            "task": self.task,
-            "policy": self.policy,
-            "seed": self.seeds[0],
-            "settings": dict(self.settings),
-            "distinct": self.distinct,
-            "summary": self.summary(),
-            "episodes": episodes,
-        }
 
 
 def evaluate(
@@ -206,56 +89,116 @@ def evaluate(
             `start` does not fit, or the cluster has too few processors.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
-    conditions = protocols.get(protocol)
-    if start is not None:
-        episodes = _started(start, episodes, protocol)
-    episodes = conditions.episodes if episodes is None else episodes
-    bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
-    bounds.seed("seed", seed)
-    if num_threads is not None:
-        bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
-    player = load_policy(policy, seed)
-    task, options = task_and_options(player, task, task_kwargs)
-    options = options if task_kwargs is None else task_kwargs
-    options = conditions.beside(options, task_kwargs or {})
-    observed = observation or player.observation or "internal"
-    parts = protocols.parts(conditions, task, options, episodes, seed)
+    plan = _Plan.of(
+        policy, task, episodes, seed, protocol, observation, task_kwargs, start
+    )
     if on_cluster:
         cluster.connect()
-    if out_dir is not None:
-        # Now: an evaluation that cannot be written would be lost.
-        files.require_folder(out_dir, make=True)
-    errors = None if out_dir is None else Path(out_dir).absolute() / "errors"
-    wholes = [
-        _Group(
-            part, range(len(part.seeds)), player, bool(conditions.task_kwargs),
-            functools.partial(_recorded, make_env, errors, task, observation=observed),
-            num_threads, torch.get_num_threads(), start,
-        )
-        for part in parts
-    ]  # fmt: skip
-    outcomes: list[EpisodeOutcome] = []
+    groups = plan.groups(num_threads, out_dir, make_env, start)
     if on_cluster:
-        outcomes += _play_on_cluster(wholes, observer)
+        outcomes = _play_on_cluster(groups, observer)
     else:
-        for group in wholes:
-            outcomes += _play(group, observer)
-    trained = getattr(player, "checkpoint", None)
-    result = EvaluationResult(
-        task,
-        name or player.name,
-        tuple(seed for part in parts for seed in part.seeds),
-        tuple(outcomes),
-        {
-            "protocol": protocol, "observation": observed, "task_kwargs": options,
-            "frames": trained and trained.frames,
-        },
-        start is not None or protocols.distinct(task, parts[0].task_kwargs, episodes),
-        tuple(drawn for part in parts for drawn in part.conditions),
-    )  # fmt: skip
+        outcomes = [one for group in groups for one in _play(group, observer)]
+    result = plan.result(name, outcomes, start is not None)
     if out_dir is not None:
         files.write_json(Path(out_dir) / "evaluation.json", result.to_dict())
     return result
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What an evaluation plays.
+
+    Attributes:
+        player: The policy.
+        task: Name of the task.
+        options: Options of the task.
+        observation: Name or names of the observations.
+        protocol: Name of the conditions.
+        parts: Parts of the episodes, each with options of its own.
+    """
+
+    player: Policy
+    task: str
+    options: Mapping[str, Any]
+    observation: str | Sequence[str]
+    protocol: str
+    parts: Sequence[protocols.Part]
+
+    @classmethod
+    def of(
+        cls,
+        policy: PolicyLike,
+        task: str | None,
+        episodes: int | None,
+        seed: int,
+        protocol: str,
+        observation: str | Sequence[str] | None,
+        task_kwargs: Mapping[str, Any] | None,
+        start: Snapshot | None,
+    ) -> "_Plan":
+        """Checks the arguments of `evaluate`, and fills in what they leave open."""
+        conditions = protocols.get(protocol)
+        if start is not None:
+            episodes = _started(start, episodes, protocol)
+        episodes = conditions.episodes if episodes is None else episodes
+        bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
+        bounds.seed("seed", seed)
+        player = load_policy(policy, seed)
+        task, options = task_and_options(player, task, task_kwargs)
+        options = options if task_kwargs is None else task_kwargs
+        options = conditions.beside(options, task_kwargs or {})
+        observed = observation or player.observation or "internal"
+        parts = protocols.parts(conditions, task, options, episodes, seed)
+        return cls(player, task, options, observed, protocol, parts)
+
+    def groups(
+        self,
+        num_threads: int | None,
+        out_dir: str | Path | None,
+        make_env: EnvFactory,
+        start: Snapshot | None,
+    ) -> list["_Group"]:
+        """The episodes of each part, side by side."""
+        if num_threads is not None:
+            bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
+        errors = None
+        if out_dir is not None:
+            # Now: an evaluation that cannot be written would be lost.
+            files.require_folder(out_dir, make=True)
+            errors = Path(out_dir).absolute() / "errors"
+        make = functools.partial(
+            _recorded, make_env, errors, self.task, observation=self.observation
+        )
+        varied = bool(protocols.get(self.protocol).task_kwargs)
+        return [
+            _Group(
+                part, range(len(part.seeds)), self.player, varied, make,
+                num_threads, torch.get_num_threads(), start,
+            )
+            for part in self.parts
+        ]  # fmt: skip
+
+    def result(
+        self, name: str | None, outcomes: Sequence[EpisodeOutcome], started: bool
+    ) -> EvaluationResult:
+        """What was played; `started` from a snapshot, or at starts of the task."""
+        trained = getattr(self.player, "checkpoint", None)
+        first, count = self.parts[0].task_kwargs, sum(len(p.seeds) for p in self.parts)
+        return EvaluationResult(
+            task=self.task,
+            policy=name or self.player.name,
+            seeds=tuple(seed for part in self.parts for seed in part.seeds),
+            episodes=tuple(outcomes),
+            settings={
+                "protocol": self.protocol,
+                "observation": self.observation,
+                "task_kwargs": self.options,
+                "frames": trained and trained.frames,
+            },
+            distinct=started or protocols.distinct(self.task, first, count),
+            conditions=tuple(drawn for part in self.parts for drawn in part.conditions),
+        )
 
 
 @dataclass(frozen=True)
@@ -322,7 +265,7 @@ def _play_on_cluster(
     total = sum(len(group.rows) for group in wholes)
     size = math.ceil(total / max(cluster.room(each), 1))
     pieces = [group.pieces(size) for group in wholes]
-    jobs = [(piece, observer is not None) for piece in itertools.chain(*pieces)]
+    jobs = [(piece, observer is not None) for own in pieces for piece in own]
     found: dict[int, tuple[list[EpisodeOutcome], ContactLog]] = {}
     with progress_bar(wholes[0].player.name, " groups", total=len(jobs)) as bar:
         for number, result in cluster.over(_play_apart, jobs, each):
@@ -330,10 +273,10 @@ def _play_on_cluster(
             bar.update()
     outcomes, ordered = [], (found[number] for number in range(len(jobs)))
     for own in pieces:
-        played, logs = zip(*itertools.islice(ordered, len(own)), strict=True)
-        outcomes += itertools.chain(*played)
+        results = list(itertools.islice(ordered, len(own)))
+        outcomes += [outcome for played, _ in results for outcome in played]
         if observer is not None:
-            observer.join(logs)
+            observer.join([log for _, log in results])
     return outcomes
 
 

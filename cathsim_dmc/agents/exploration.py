@@ -39,7 +39,7 @@ class CorrelatedNoise:
         """The noise of the next step, of the shape and dtype of a tensor."""
         fresh = torch.randn_like(like)
         if self._shared:
-            common = torch.randn(*like.shape[:-1], self._count, dtype=like.dtype)
+            common = torch.randn((*like.shape[:-1], self._count), dtype=like.dtype)
             fresh = (
                 math.sqrt(1.0 - self._shared) * fresh
                 + math.sqrt(self._shared) * common[..., self._groups]

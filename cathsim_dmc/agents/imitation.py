@@ -14,7 +14,7 @@ from typing_extensions import override
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig, positive
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, load_transitions
 from cathsim_dmc.agents.learner import Learner, means
-from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes, network_of
+from cathsim_dmc.agents.networks import NetworkShapes, bounded, network_of
 
 # Beyond it an action counts as saturated: its deviation before the tanh says nothing.
 _SATURATED = 0.99
@@ -81,7 +81,7 @@ class CloningLearner(Learner):
         error = torch.where(free, target.clamp(-_SATURATED, _SATURATED).atanh(), mean)
         squares = (error - mean).square().sum(0) / free.sum(0).clamp_min(1)
         log_std = squares.clamp_min(1e-12).log() / 2
-        self._log_std.data.copy_(log_std.clamp(*LOG_STD_RANGE))
+        self._log_std.data.copy_(bounded(log_std))
         return float((mean.tanh() - target).square().mean().sqrt())
 
 

@@ -27,8 +27,13 @@ NORMAL_PIXELS = "pixels_normal"
 
 # A deviation below exp(-5) before the tanh explores nothing; above exp(2) all
 # actions are at their bounds.
-LOG_STD_RANGE = (-5.0, 2.0)
+_LEAST_LOG_STD, _LARGEST_LOG_STD = -5.0, 2.0
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
+
+
+def bounded(log_std: torch.Tensor) -> torch.Tensor:
+    """Logarithms of deviations, held where they can be learnt."""
+    return log_std.clamp(_LEAST_LOG_STD, _LARGEST_LOG_STD)
 
 
 @dataclass(frozen=True)
@@ -124,8 +129,8 @@ class Convolutions(nn.Module):
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         """Take any number of dimensions before the channels."""
-        flat = pixels.reshape(-1, *pixels.shape[-3:])
-        return self.head(self.filters(flat)).reshape(*pixels.shape[:-3], -1)
+        flat = pixels.reshape((-1, *pixels.shape[-3:]))
+        return self.head(self.filters(flat)).reshape((*pixels.shape[:-3], -1))
 
 
 class Body(nn.Module):
@@ -179,7 +184,7 @@ class GaussianActor(nn.Module):
         mean = self.mean(features)
         layer = self.log_std
         raw = layer(features) if isinstance(layer, nn.Linear) else layer
-        return mean, raw.clamp(*LOG_STD_RANGE).exp().expand_as(mean)
+        return mean, bounded(raw).exp().expand_as(mean)
 
 
 class Value(nn.Module):

@@ -103,7 +103,7 @@ class ImageNormaliser(nn.Module):
         """Merge images (..., c, h, w) into the mean."""
         if not self.subtract:
             return
-        images = pixels.reshape(-1, *self.mean.shape)
+        images = pixels.reshape((-1, *self.mean.shape))
         self.count += len(images)
         difference = images.float().mean(0) - self.mean
         self.mean += difference * float(len(images) / self.count)

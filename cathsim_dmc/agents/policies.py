@@ -55,7 +55,7 @@ class FunctionPolicy(Policy):
             TypeError,
             f"policy {self.name} answered with a {type(answer).__name__}; it must be "
             "actions (N, A) or a TensorDict with them as 'action'",
-            *(TypeError, ValueError, RuntimeError),
+            (TypeError, ValueError, RuntimeError),
         ):
             return torch.as_tensor(action, dtype=torch.float32).numpy()
 

@@ -60,7 +60,7 @@ def read_pretrained(
     card = read_card(weights.with_suffix(".json"))
     data = read_bytes(weights, card["sha256"])
     text = f"{weights} cannot be used"
-    with files.refused(CheckpointError, text, SafetensorError, ValueError):
+    with files.refused(CheckpointError, text, (SafetensorError, ValueError)):
         config = config_from_dict(card["config"])
         shapes = NetworkShapes.from_dict(card["shapes"])
         return card, policy_of(weights, load(data), shapes, config), shapes, config
@@ -79,7 +79,7 @@ def read_card(path: str | Path) -> dict[str, Any]:
         CheckpointError: it is missing or damaged.
     """
     errors = OSError, AttributeError, ValueError
-    with files.refused(CheckpointError, f"{path} cannot be read", *errors):
+    with files.refused(CheckpointError, f"{path} cannot be read", errors):
         card = json.loads(Path(path).read_text())
         wrong = [n for n, kind in _PARTS.items() if type(card.get(n)) is not kind]
     if wrong or card.get("format") != FORMAT:

@@ -85,7 +85,7 @@ class ReplayMemory:
                 "and collects new transitions. What was found"
             )
             wrong = OSError, ValueError, TypeError, RuntimeError, EOFError
-            with files.refused(ReplayError, text, *wrong):
+            with files.refused(ReplayError, text, wrong):
                 # "r+" would extend a file that is too short.
                 open_memmap(path, mode="r")
                 storage[key] = torch.from_numpy(open_memmap(path, mode="r+"))

@@ -121,8 +121,8 @@ class SAC(Learner):
         )
         after = [*shapes.raw_keys, "reward", "done", "terminated"]
         self.replay_keys = [*shapes.raw_keys, "action", *[("next", k) for k in after]]
-        limits = config.replay_frames, config.replay_bytes
-        self.replay = ReplayMemory(directory / "replay", self.replay_keys, *limits)
+        most, size = config.replay_frames, config.replay_bytes
+        self.replay = ReplayMemory(directory / "replay", self.replay_keys, most, size)
         self.demonstrations: TensorDictBase | None = None
         if config.demonstrations is not None:
             names, options = config.collected_observation, config.training_kwargs

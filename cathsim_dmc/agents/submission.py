@@ -167,7 +167,7 @@ class RecordedActions(Policy):
     def __init__(self, path: str | Path):
         """Reads a file of `record_actions`; ValueError if it is none or damaged."""
         wrong = LookupError, TypeError, ValueError
-        with files.refused(ValueError, f"{path} holds no recorded actions", *wrong):
+        with files.refused(ValueError, f"{path} holds no recorded actions", wrong):
             names = "header", "seeds", "actions"
             header, seeds, actions = files.read_arrays(path, names).values()
             values = json.loads(str(header))

@@ -32,7 +32,7 @@ from cathsim_dmc.agents.episodes import EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
 from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.learners import LEARNERS
-from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
+from cathsim_dmc.agents.networks import NetworkShapes, bounded
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 from cathsim_dmc.agents.training_log import TrainingLog, crossed, read_metrics
 from cathsim_dmc.simulation import environments
@@ -107,7 +107,7 @@ def train(
     if config.modules:
         suite.known(config.task, config.modules)
     text = f"torch_device={config.torch_device!r} cannot be used here, 'cpu' always can"
-    with files.refused(ConfigError, text, RuntimeError, AssertionError):
+    with files.refused(ConfigError, text, (RuntimeError, AssertionError)):
         torch.zeros(1, device=config.torch_device)
     loggers.require(config.logger)
     check_collector(config, LEARNERS[config.algorithm].learner)
@@ -116,14 +116,7 @@ def train(
         checkpoint = _prepare(run, config, resume)
         stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(config.torch_threads)
-        # A resumed run gets fresh episodes: another stretch of the same seeds.
-        stretch = [config.seed, checkpoint.frames if checkpoint else 0]
-        seed = int(np.random.SeedSequence(stretch).generate_state(1)[0]) % 2**31
-        env = make_env(
-            config.task, observation=config.collected_observation,
-            num_envs=config.num_envs, num_threads=config.num_threads, seed=seed,
-            task_kwargs=config.training_kwargs, **_place(config),
-        )  # fmt: skip
+        env = _environment(config, make_env, checkpoint.frames if checkpoint else 0)
         environments.record_errors(env, run / "errors")
         torch.manual_seed(config.seed)
         shapes = NetworkShapes.of(env.observation_spec, env.action_spec)
@@ -143,6 +136,18 @@ def train(
         interruption = stack.enter_context(_interruption())
         call = on_checkpoint or (lambda checkpoint: None)
         return _loop(run, iter(collector), learner, log, interruption, call)
+
+
+def _environment(config: TrainingConfig, make_env: EnvFactory, frames: int) -> EnvBase:
+    """The environment of a run that has collected so many frames."""
+    # A resumed run gets fresh episodes: another stretch of the same seeds.
+    stretch = [config.seed, frames]
+    seed = int(np.random.SeedSequence(stretch).generate_state(1)[0]) % 2**31
+    return make_env(
+        config.task, observation=config.collected_observation,
+        num_envs=config.num_envs, num_threads=config.num_threads, seed=seed,
+        task_kwargs=config.training_kwargs, **_place(config),
+    )  # fmt: skip
 
 
 def _place(config: TrainingConfig) -> dict[str, str]:
@@ -226,7 +231,7 @@ def _start(
         f"evaluated: it does not fit what {checkpoint.config.algorithm} learns with"
     )
     wrong = KeyError, TypeError, AttributeError, RuntimeError
-    with files.refused(CheckpointError, text, *wrong):
+    with files.refused(CheckpointError, text, wrong):
         learner.load(policy, state.pop("learner"))
     return {"frames": checkpoint.frames, "seconds": checkpoint.seconds, **state}
 
@@ -279,7 +284,7 @@ def take_over(
         if kept or "log_std" not in key:
             state[key] = given[key]
         elif value.ndim == 1:
-            state[key] = middle.clamp(*LOG_STD_RANGE)
+            state[key] = bounded(middle)
         else:
             state[key] = torch.zeros_like(value)  # equal in all states
     network.load_state_dict(state)

@@ -150,7 +150,7 @@ def read_metrics(path: Path) -> list[dict[str, float | None]]:
     if not path.exists():
         return []
     text, wrong = f"{path} holds no metrics; mend or remove it", (ValueError, csv.Error)
-    with files.refused(ConfigError, text, *wrong), open(path, newline="") as file:
+    with files.refused(ConfigError, text, wrong), open(path, newline="") as file:
         rows = csv.DictReader(file)
         if "frames" not in (rows.fieldnames or ()):
             raise ValueError("it has no column frames")
@@ -169,7 +169,9 @@ def crossed(before: int, after: int, interval: int) -> bool:
 def _episode_means(window: Iterable[Sequence[float | None]]) -> dict[str, float | None]:
     """Means over the last finished episodes; None where nothing is known."""
     means: dict[str, float | None] = dict.fromkeys(_FIGURES)
-    for name, values in zip(_FIGURES, zip(*window, strict=True), strict=False):
+    rows = list(window)
+    for column, name in enumerate(_FIGURES if rows else ()):
+        values = (row[column] for row in rows)
         known = [value for value in values if value is not None]
         means[name] = float(np.mean(known)) if known else None
     return means

@@ -112,7 +112,8 @@ class ForceTracker:
     def finish(self, simulation: int) -> EpisodeForces:
         """Statistics of a simulation's episode, which ends; the next one begins."""
         steps, self._steps[simulation] = self._steps[simulation], []
-        return EpisodeForces(*map(_statistics, np.transpose(steps)))
+        columns = zip(QUANTITIES, np.transpose(steps), strict=False)
+        return EpisodeForces(**{name: _statistics(column) for name, column in columns})
 
 
 def _statistics(row: Sequence[float] | np.ndarray) -> Statistics | None:
@@ -129,9 +130,12 @@ def recorded_forces(episode: Episode) -> EpisodeForces:
     if not episode.steps:
         return EpisodeForces()
     columns = episode.wall_force_sum, episode.wall_force_max
-    columns += (*map(episode.meta.get, NAMES[2:]),)
-    found = (None if one is None else _statistics(one) for one in columns)
-    return EpisodeForces(*found)
+    columns += tuple(map(episode.meta.get, NAMES[2:]))
+    found = {
+        name: None if column is None else _statistics(column)
+        for name, column in zip(QUANTITIES, columns, strict=False)
+    }
+    return EpisodeForces(**found)
 
 
 def millinewtons(mean: float | None, deviation: float | None = None) -> str:

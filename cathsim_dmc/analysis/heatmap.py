@@ -16,7 +16,8 @@ MARGIN = 5e-3
 # Columns of the antero-posterior projection: x (lateral, patient left on the right
 # of the picture, as the reader faces the patient) and z (up).
 AP_AXES = (0, 2)
-_PICTURE_HEIGHT_IN, _PICTURE_WIDTH_RANGE_IN, _COLOUR_BAR_IN = 7.0, (4.0, 14.0), 1.6
+_PICTURE_HEIGHT_IN, _COLOUR_BAR_IN = 7.0, 1.6
+_LEAST_WIDTH_IN, _LARGEST_WIDTH_IN = 4.0, 14.0
 _DPI = 150
 
 
@@ -99,7 +100,7 @@ def heatmap(
     field = force_map(position, force, outline.min(0) - MARGIN, outline.max(0) + MARGIN)
     x_mm, z_mm = 1e3 * field.x_edges, 1e3 * field.z_edges
     width = _PICTURE_HEIGHT_IN * np.ptp(x_mm) / np.ptp(z_mm) + _COLOUR_BAR_IN
-    size = np.clip(width, *_PICTURE_WIDTH_RANGE_IN), _PICTURE_HEIGHT_IN
+    size = np.clip(width, _LEAST_WIDTH_IN, _LARGEST_WIDTH_IN), _PICTURE_HEIGHT_IN
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
     triangles = list(1e3 * outline[surface.faces])

@@ -171,7 +171,8 @@ class Centreline:
                 np.sqrt(np.einsum("nj,nj->n", away, away)),
                 self.radii[index] * (1.0 - t) + self.radii[index + 1] * t,
             )
-        return Projection(*(values.reshape(points.shape[:-1]) for values in out))
+        arc, distance, radius = (values.reshape(points.shape[:-1]) for values in out)
+        return Projection(arc, distance, radius)
 
     def locate(self, point: ArrayLike) -> float:
         """Arc length (m) of the place nearest to one point (3,), m."""
@@ -180,7 +181,8 @@ class Centreline:
     def resampled(self, spacing: float) -> "Centreline":
         """Same curve with equal steps of about `spacing` (m), ends kept."""
         count = max(1, round(self.length / spacing))
-        return Centreline(*self.at(np.linspace(0.0, self.length, count + 1))[:2])
+        place = self.at(np.linspace(0.0, self.length, count + 1))
+        return Centreline(place.position, place.radius)
 
     def slice(self, s0: float, s1: float) -> "Centreline":
         """Part from `s0` to `s1` (m), maybe backwards; ValueError if it is empty."""
@@ -190,7 +192,8 @@ class Centreline:
             raise ValueError(f"no slice from {s0:g} to {s1:g} m of {self.length:g} m")
         inner = (self.arc_length > low + _GAP) & (self.arc_length < high - _GAP)
         s = np.concatenate([[low], self.arc_length[inner], [high]])
-        return Centreline(*self.at(s if s0 <= s1 else s[::-1])[:2])
+        place = self.at(s if s0 <= s1 else s[::-1])
+        return Centreline(place.position, place.radius)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,6 +29,16 @@ class Course(NamedTuple):
         return self.outlet + (ahead * self.branches[:, 1]).sum(axis=-1)
 
 
+class Segments(NamedTuple):
+    """The S segments of a `Circulation`, attributes as there."""
+
+    ends: Array
+    radii: Array
+    shares: Array
+    ways: Array
+    vessel: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class Circulation:
     """The inflow along the vessels, in S straight segments."""
@@ -51,8 +61,11 @@ class Circulation:
             _along(vessel.centreline, courses[name], number)
             for number, (name, vessel) in enumerate(tree.vessels.items())
         ]
-        joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
-        return cls(courses, float(root.radii[-1 if reverse else 0]), *joined)
+        joined = {
+            name: np.concatenate([getattr(column, name) for column in columns])
+            for name in Segments._fields
+        }
+        return cls(courses, float(root.radii[-1 if reverse else 0]), **joined)
 
     def check(self, name: str, tree: VesselTree, ends: Sequence[End]) -> None:
         """Raises ValueError unless blood can enter at the heart's end and leave."""
@@ -67,19 +80,20 @@ class Circulation:
             )
 
     @property
-    def arrays(self) -> tuple[np.ndarray, ...]:
-        """The segments, in the order of the attributes."""
-        return self.ends, self.radii, self.shares, self.ways, self.vessel
+    def segments(self) -> Segments:
+        """The segments, for compiled loops."""
+        return Segments(self.ends, self.radii, self.shares, self.ways, self.vessel)
 
 
-def _along(line: Centreline, course: Course, number: int) -> tuple[np.ndarray, ...]:
+def _along(line: Centreline, course: Course, number: int) -> Segments:
     count = max(2, round(line.length / _SPACING) + 1)
     s = np.linspace(0.0, line.length, count)
     way, sign = (line.length - s, -1.0) if course.reverse else (s, 1.0)
     place = line.at(s)
     values = place.position, place.radius, sign * course.share(way), course.begin + way
     pairs = [np.stack([value[:-1], value[1:]], axis=1) for value in values]
-    return (*pairs, np.full(count - 1, number))
+    ends, radii, shares, ways = pairs
+    return Segments(ends, radii, shares, ways, np.full(count - 1, number))
 
 
 def _courses(tree: VesselTree, reverse: bool, murray: bool) -> dict[str, Course]:

@@ -163,7 +163,8 @@ def _coacd(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
     del anatomy
     coacd.set_log_level("error")
     inner, outer, faces, _ = shell
-    flat = np.cross(*np.diff(inner[faces], axis=1).swapaxes(0, 1))
+    sides = np.diff(inner[faces], axis=1)
+    flat = np.cross(sides[:, 0], sides[:, 1])
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     # A patch lies on one side of its vessel.
     features = np.hstack([1e3 * inner[faces].mean(axis=1), 4.0 * flat])

@@ -141,7 +141,8 @@ class Field:
 
         kind = SurfaceDepth if isinstance(lumen, Surface) else TreeDepth
         measure = kind(lumen, ends)  # type: ignore[arg-type]
-        return cls.sampled(measure.around, *measure.box, ends)
+        low, high = measure.box
+        return cls.sampled(measure.around, low, high, ends)
 
     @classmethod
     def sampled(
@@ -193,17 +194,19 @@ class Field:
 def _corners(measure: Measure, origin: Array, shape: np.ndarray) -> Array:
     """Depths m at all corners of bricks; far outside, those of a block's middle."""
     blocks, half = -(-shape // _TOGETHER), (_TOGETHER - 1) / 2
-    middles = origin + EDGE * (_TOGETHER * _lattice(*map(np.arange, blocks)) + half)
-    local = _lattice(*[EDGE * (np.arange(_TOGETHER) - half)] * 3)
+    middles = origin + EDGE * (
+        _TOGETHER * _lattice([np.arange(count) for count in blocks]) + half
+    )
+    local = _lattice([EDGE * (np.arange(_TOGETHER) - half)] * 3)
     depth = np.repeat(measure(middles, np.zeros((1, 3))), len(local), axis=1)
     near = depth[:, 0] > _FAR
     depth[near] = measure(middles[near], local)
-    depth = depth.reshape(*blocks, _TOGETHER, _TOGETHER, _TOGETHER)
+    depth = depth.reshape((*blocks, _TOGETHER, _TOGETHER, _TOGETHER))
     depth = depth.transpose(0, 3, 1, 4, 2, 5).reshape(_TOGETHER * blocks)
     return depth[: shape[0], : shape[1], : shape[2]]
 
 
-def _lattice(*along: np.ndarray) -> Array:
+def _lattice(along: Sequence[np.ndarray]) -> Array:
     """Points (n, 3) of a lattice by their places along the three axes."""
     return np.stack(np.meshgrid(*along, indexing="ij"), -1).reshape(-1, 3)
 
@@ -217,11 +220,15 @@ def _near_wall(low: Array, high: Array) -> np.ndarray:
 
 def _measured(measure: Measure, middles: Array, cells: int) -> Array:
     """Depths (n, c + 1, c + 1, c + 1) m in bricks with middles (n, 3) m."""
-    local = _lattice(*[EDGE * (np.arange(cells + 1) / cells - 0.5)] * 3)
+    local = _lattice([EDGE * (np.arange(cells + 1) / cells - 0.5)] * 3)
     parts = [np.empty((0, len(local)))]
     for first in range(0, len(middles), _CHUNK):
         parts.append(measure(middles[first : first + _CHUNK], local))
     return np.concatenate(parts).reshape(-1, cells + 1, cells + 1, cells + 1)
+
+
+def _in_shell(depth: Array) -> Array:
+    return depth.clip(SHELL[0], SHELL[1])
 
 
 def _cells(exact: Array, eight: Array, room: int) -> np.ndarray:
@@ -229,9 +236,9 @@ def _cells(exact: Array, eight: Array, room: int) -> np.ndarray:
 
     Their depths are known at points (n, 5, 5, 5) and at the corners (n, 2, 2, 2), m.
     """
-    shell = exact.clip(*SHELL)
-    plain = np.abs(_refined(eight, 4).clip(*SHELL) - shell).reshape(len(exact), -1)
-    halves = np.abs(_refined(exact[:, ::2, ::2, ::2], 2).clip(*SHELL) - shell)
+    shell = _in_shell(exact)
+    plain = np.abs(_in_shell(_refined(eight, 4)) - shell).reshape(len(exact), -1)
+    halves = np.abs(_in_shell(_refined(exact[:, ::2, ::2, ::2], 2)) - shell)
     # Of the points in the shell, of which a brick may have few.
     within = (exact == shell).reshape(len(exact), -1)
     halves = np.sort(np.where(within, halves.reshape(within.shape), -1.0), axis=1)

@@ -89,7 +89,7 @@ def _shipped(name: str) -> Field | None:
         for one in path.stem.split("-"):
             record = np.load(stream, allow_pickle=False)[0]
             if one == name:
-                return Field(*(record[part].copy() for part in _NAMES))
+                return Field(**{part: record[part].copy() for part in _NAMES})
     return None
 
 
@@ -115,7 +115,7 @@ def _read(path: Path) -> Field:
         dtype = np.lib.format.read_array_header_1_0(stream)[-1]
         start, pages = stream.tell(), mapped(stream)
     record = np.frombuffer(pages, dtype, 1, start)[0]
-    field = Field(*(record[name] for name in _NAMES), pages=pages)
+    field = Field(**{name: record[name] for name in _NAMES}, pages=pages)
     if record[_DIGEST].tobytes() != field.digest:
         raise ValueError(f"{path} is damaged")
     return field

@@ -61,19 +61,23 @@ class Motion:
     ) -> "Motion":
         """The motion of an anatomy whose field has corners (3,), (3,) m."""
         low, high = box
-        aorta = _along_aorta(blood, tree)
+        heart, breath = _along_aorta(blood, tree)
         shape = np.ceil((high - low) / _STEP).astype(int) + 1
-        lattice = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
+        i, j, k = (np.arange(count) for count in shape)
+        lattice = np.stack(np.meshgrid(i, j, k, indexing="ij"), -1)
         points = (low + _STEP * lattice).reshape(-1, 3)
         values = np.concatenate(
-            [_values(part, ends, blood, *aorta) for part in np.array_split(points, 32)]
+            [
+                _values(part, ends, blood, heart, breath)
+                for part in np.array_split(points, 32)
+            ]
         )
         return cls(np.concatenate([low, [_STEP], shape, values.ravel()]))
 
     def check(self, name: str, heart: float, breathing: float) -> None:
         """ValueError if the largest heart (m) and breathing amplitudes fold space."""
         shape = self.lattice[4:7].astype(int)
-        values = self.lattice[7:].reshape(*shape, 8)
+        values = self.lattice[7:].reshape((*shape, 8))
         steepest = 0.0
         for share in (0.0, 1.0):
             u = share * heart * values[..., :3] + breathing * values[..., 3:6]

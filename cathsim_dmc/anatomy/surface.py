@@ -31,8 +31,10 @@ def _depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
             box = []
             for axis, places in zip(axes, part.points.T, strict=True):
                 ends = places.min() - reach, places.max() + reach
-                box.append(slice(*np.searchsorted(axis, ends)))
-            x, y, z = np.meshgrid(*(axes[i][box[i]] for i in range(3)), indexing="ij")
+                first, last = np.searchsorted(axis, ends)
+                box.append(slice(first, last))
+            near_x, near_y, near_z = (a[b] for a, b in zip(axes, box, strict=True))
+            x, y, z = np.meshgrid(near_x, near_y, near_z, indexing="ij")
             near = part.project(np.stack([x, y, z], axis=-1))
             depth = near.radius - near.distance
             # Pieces have round ends, which only repeat what the neighbouring piece

@@ -1,28 +1,24 @@
 """`cathsim eval`, `submit`, `record`, `demos` and `play`."""
 
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 from tyro import conf
 
 # torchrl goes before dm_control.
 from cathsim_dmc import agents  # isort: skip
 
-from cathsim_dmc import __version__, bounds, files, suite
+from cathsim_dmc import bounds, files, suite
 from cathsim_dmc import play as by_hand
 from cathsim_dmc.agents import evaluation, protocols, submission
 from cathsim_dmc.agents.demonstrations import DEMONSTRATION_SEED
-from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.agents.policies import task_and_options
 from cathsim_dmc.agents.training_log import LINE_INTERVAL, progress_bar
-from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons, recorded_forces
+from cathsim_dmc.analysis.force_statistics import millinewtons, recorded_forces
 from cathsim_dmc.cli.options import (
     Json,
     Modules,
@@ -33,14 +29,13 @@ from cathsim_dmc.cli.options import (
     say,
     told_of_losses,
 )
+from cathsim_dmc.cli.result_tables import print_episodes, print_results
 from cathsim_dmc.cli.task_options import TaskOptions, task_kind
-from cathsim_dmc.physics.forces import PEAK_NOTE
 from cathsim_dmc.pictures import recorded
 from cathsim_dmc.pictures.films import SUFFIXES, check_film
 from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
-from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.snapshot import Snapshot
 
 _POLICY = (
@@ -54,19 +49,6 @@ _TASK = (
 )
 PolicysTask = Annotated[str | None, conf.arg(help=_TASK)]
 Options = Annotated[TaskOptions, conf.arg(name="", constructor=task_kind())]
-_CAPTION = (
-    "Mean ± standard deviation over episodes. Forces are means over a control step, as "
-    "a load cell at 25 Hz reads them, but for the peak. Mean force: sum over all "
-    "contacts, mean over all steps. Mean contact force: largest single contact, mean "
-    "over the steps with contact. Max force: largest single contact of any step. "
-    "Largest sum: sum over all contacts of any step. Safe success: the goal reached "
-    "with a largest sum at or below a limit. Peak force: largest single contact in any "
-    f"physics step. {PEAK_NOTE}"
-)
-_NEARLY_ONE = (
-    " Success without interval: episodes differ only by 1 mm of the start, or recur; "
-    "`--protocol varied` plays distinct conditions."
-)
 
 
 def evaluate(
@@ -111,18 +93,18 @@ def evaluate(
     suite.known(task)
     task_kwargs = protocols.get(protocol).beside(task_kwargs, options.given)
     contacts = evaluation.ContactLog()
-    common: Any = {"protocol": protocol, "task_kwargs": task_kwargs}
-    common |= {"num_threads": threads, "on_cluster": ray}
-    common |= {"start": None if start is None else Snapshot.load(start)}
+    asked: Any = {
+        "task": task, "episodes": episodes, "seed": seed, "protocol": protocol,
+        "task_kwargs": task_kwargs, "num_threads": threads, "on_cluster": ray,
+        "start": None if start is None else Snapshot.load(start),
+    }  # fmt: skip
 
     def play(who: Any, out_dir: Path | None = None) -> EvaluationResult:
-        name, asked = getattr(who, "name", who), (task, episodes, seed)
+        name = getattr(who, "name", who)
         if ray:
             log = contacts if who is player else None
             with told_of_losses():
-                return agents.evaluate(
-                    who, *asked, observer=log, out_dir=out_dir, **common
-                )
+                return agents.evaluate(who, observer=log, out_dir=out_dir, **asked)
         with progress_bar(name, " steps", delay=LINE_INTERVAL) as bar:
 
             def observe(env: Any, running: np.ndarray) -> None:
@@ -132,9 +114,7 @@ def evaluate(
                 bar.set_postfix_str(text, refresh=False)
                 bar.update()
 
-            return agents.evaluate(
-                who, *asked, observer=observe, out_dir=out_dir, **common
-            )
+            return agents.evaluate(who, observer=observe, out_dir=out_dir, **asked)
 
     results = {"policy": play(player, out)}
     if baseline and policy != "random":
@@ -144,82 +124,23 @@ def evaluate(
     if out is not None:
         files.write_json(out / "evaluation.json", values)
         contacts.draw(results["policy"], out / "heatmap.png")
-    if json:
-        # No figure of a policy has a bar to keep.
-        print_json({"checks": [], **values})
-        return 0
-    print_results(*results.values())
-    if report:
-        print_episodes(results["policy"])
+    _print(results, values, report, json)
     return 0
 
 
-def print_results(*results: EvaluationResult) -> None:
-    """Print figures of evaluations of one task side by side."""
-    first, columns = results[0], [_figures(result) for result in results]
-    title = f"{first.task}, seeds from {first.seeds[0]}"
-    caption = _CAPTION + _NEARLY_ONE * (not first.distinct)
-    heads = ("policy", *(result.policy for result in results))
-    table = Table(*heads, title=title, caption=caption, caption_justify="left")
-    for name in columns[0]:
-        table.add_row(name, *(column[name] for column in columns))
-    Console().print(table)
-
-
-def _figures(result: EvaluationResult) -> dict[str, str]:
-    summary = result.summary()
-    success = f"{100 * summary['success']:.0f} %"
-    if summary["success_ci95"] is not None:
-        low, high = (round(100 * bound) for bound in summary["success_ci95"])
-        success += f" ({low}–{high})"
-    forces = {name: result.mean_sd(f"forces.{name}") for name in FIGURES}
-    safe = summary["safe_success"].items()
-    return {
-        "reward": f"{summary['reward']:.1f} ± {summary['reward_sd']:.1f}",
-        "steps": f"{summary['length']:.0f} ± {summary['length_sd']:.0f}",
-        **{f"{n.replace('_', ' ')}, mN": millinewtons(*f) for n, f in forces.items()},
-        "success": success,
-        **{f"safe success, {limit}": f"{100 * rate:.0f} %" for limit, rate in safe},
-    }
-
-
-def print_episodes(result: EvaluationResult) -> None:
-    """Print what was played and how each episode ended: task, model, outcome."""
-    settings = result.settings
-    chosen = ", ".join(f"{k}={v}" for k, v in settings["task_kwargs"].items())
-    title = (
-        f"task {result.task}, protocol {settings['protocol']}; model: "
-        f"cathsim_dmc {__version__}, {chosen or 'options of the task'}"
-    )
-    drawn = result.conditions or ({},) * len(result.episodes)
-    played = zip(result.seeds, drawn, result.episodes, strict=True)
-    rows = [_outcome(*each) for each in played]
-    table = Table(*rows[0], title=title)
-    for row in rows:
-        table.add_row(*row.values())
-    table.caption = f"Peak force: of any physics step. {PEAK_NOTE}"
-    # A pipe has no width that the columns would have to fit.
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
-
-
-def _outcome(
-    seed: int, conditions: Mapping[str, Any], episode: EpisodeOutcome
-) -> dict[str, str]:
-    missed = "given up" if episode.given_up else "out of time"
-    end = "goal reached" if episode.success else missed
-    forces = episode.forces
-    largest = forces.largest_sum
-    return {
-        "seed": str(seed),
-        "arch": str(conditions.get("arch", "–")),
-        "device": str(conditions.get("device") or "–"),
-        "end": "physics error" if episode.physics_error else end,
-        "time, s": f"{episode.length * CONTROL_TIMESTEP:.1f}",
-        "path ratio": f"{episode.path_ratio:.2f}",
-        "mean force, mN": millinewtons(forces.mean_force),
-        "peak force, mN": millinewtons(forces.peak_force),
-        "largest sum, N": "–" if largest is None else f"{largest:.2f}",
-    }
+def _print(
+    results: Mapping[str, EvaluationResult],
+    values: Mapping[str, Any],
+    report: bool,
+    json: bool,
+) -> None:
+    if json:
+        # No figure of a policy has a bar to keep.
+        print_json({"checks": [], **values})
+        return
+    print_results(list(results.values()))
+    if report:
+        print_episodes(results["policy"])
 
 
 def submit(

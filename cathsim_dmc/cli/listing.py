@@ -26,7 +26,7 @@ def show(devices: bool = False, json: Json = False, modules: Modules = ()) -> in
         print_json({"devices": rows} if devices else tasks)
         return 0
     if devices:
-        # As wide as it needs to be where nobody looks at a terminal.
+        # Unlimited width where the output is no terminal.
         width = None if sys.stdout.isatty() else 240
         Console(width=width).print(_device_table(rows))
         return 0

@@ -125,7 +125,7 @@ def _settings(arguments: list[str]) -> tuple[agents.TrainingConfig, bool]:
     path = Path(found.out or ".") / "config.json"
     if found.resume and found.out and not found.preset and path.is_file():
         text = f"{path} holds no settings of a run"
-        with files.refused(ValueError, text, ValueError, TypeError):
+        with files.refused(ValueError, text, (ValueError, TypeError)):
             config = config_from_dict(dict(json.loads(path.read_text())))
         if found.algo in (None, config.algorithm):
             return config, True

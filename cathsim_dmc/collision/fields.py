@@ -1,14 +1,14 @@
-"""Contact with a field, through MuJoCo's collision table.
+"""Registration of distance fields as walls in MuJoCo's collision table.
 
-The wall of a lumen, or of a bore, is one box geom, its carrier, which encloses it and
-names its field in `geom_user`. MuJoCo asks the collision table what a capsule or a
-sphere does to a box; the functions here answer for carriers, and hand every other box
-to the function that stood there before. They are compiled and know the process's fields
-by their keys: a model may be copied, saved and run on any thread.
+One box geom, the carrier, encloses the wall of a lumen or a bore; its `geom_user` holds
+the key of the field. Compiled functions replace those of capsule–box and sphere–box
+contact in the collision table: they compute the contacts of carriers and call the
+replaced function for every other box. They find fields by key, so a model may be
+copied, saved and run on any thread.
 
-A carrier whose field this process does not know ends the step with MuJoCo's error. In
-a process without this package it is a solid box around the device, which is thrown out
-of it at once. What a carrier is to `mj_geomDistance` and to rays is that box, too.
+MuJoCo stops with an error at a carrier whose field is not registered in the process.
+Without this package a carrier is a solid box that overlaps the device and expels it.
+`mj_geomDistance` and rays always see the box.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 from cathsim_dmc.anatomy.field import Field
 
 _MESSAGE = (
-    b"geom %d carries a field that this process does not know; register it "
+    b"geom %d carries a field that is not registered in this process; register it "
     b"(cathsim_dmc.collision.fields.register) or load the task anew"
 )
 _CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
@@ -36,21 +36,21 @@ _SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
 _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 _TYPES = int(mujoco.mjtGeom.mjNGEOMTYPES)
 
-_EXCURSION = 40e-3  # m, by which a moving wall may leave the box of its field
+_EXCURSION = 40e-3  # m, largest displacement of a wall beyond the box of its field
 
 
 class Bore:
-    """A round bore along a line, open at both ends: the inside of a sheath."""
+    """Circular bore along a polyline, open at both ends: the lumen of a sheath."""
 
     def __init__(self, points: np.ndarray, radii: np.ndarray | float):
-        """Makes the bore.
+        """Initialises the bore.
 
         Args:
-            points: (n, 3) of its axis, m.
-            radii: (n,) or one for all, m.
+            points: (n, 3), vertices of the axis, m.
+            radii: (n,) or scalar, m.
 
         Raises:
-            ValueError: if the line repeats a point, or a radius is not positive.
+            ValueError: if consecutive points coincide, or a radius is not positive.
         """
         points = np.asarray(points, dtype=np.float64)
         radii = np.broadcast_to(np.asarray(radii, dtype=np.float64), len(points))
@@ -66,12 +66,12 @@ class Bore:
 
 
 class _Table:
-    """The process's fields, by their keys, where compiled functions find them."""
+    """Table of the process's fields by key, which compiled functions read."""
 
     def __init__(self):
         from cathsim_dmc.collision import loops, table
 
-        # The arrays whose addresses are in the table, for as long as the process.
+        # Owners of the arrays in the table; never freed.
         self._kept: dict[int, list[np.ndarray]] = {}
         self._lattices: dict[int, list[np.ndarray]] = {}
         self._words, self._message = table.TABLE, ctypes.create_string_buffer(_MESSAGE)
@@ -103,17 +103,17 @@ class _Table:
         row = self._rows[slot]
         kept = [np.ascontiguousarray(array) for array in (middle, *arrays)]
         row[1 : 2 + len(kept)] = kind, *(array.ctypes.data for array in kept)
-        # Last: threads may look for other entries meanwhile.
+        # The key is written last: other threads search the table concurrently.
         self._kept[key], row[0] = kept, key
 
     def at(self, key: int) -> tuple[int, list[np.ndarray]]:
-        """Kind and arrays of an entry; KeyError for a key that is not there."""
+        """Kind and arrays of an entry; KeyError if there is none."""
         kept = self._kept[key]
         row = self._rows[np.flatnonzero(self._rows[:, 0] == key)[0]]
         return int(row[1]), kept
 
     def move(self, key: int, lattice: np.ndarray) -> None:
-        """Gives the field of an entry a motion, for simulations that have one."""
+        """Adds a motion lattice to an entry, for simulations of a moving vessel."""
         self._lattices.setdefault(key, []).append(lattice)
         row = self._rows[np.flatnonzero(self._rows[:, 0] == key)[0]]
         row[self._motion] = lattice.ctypes.data
@@ -122,7 +122,7 @@ class _Table:
         self._collide_by(moving)
 
     def _collide_by(self, module: types.ModuleType) -> None:
-        # The functions of `moving` do what those of `loops` do, and more.
+        # The functions of `moving` handle walls at rest, too.
         self._functions[_CAPSULE * _TYPES + _BOX] = module.of_capsule.address
         self._functions[_SPHERE * _TYPES + _BOX] = module.of_sphere.address
 
@@ -131,13 +131,13 @@ _get_table = functools.cache(_Table)
 
 
 def register(field: Field | Bore) -> tuple[float, ...]:
-    """Makes a field known to this process's collisions, for as long as it lives.
+    """Registers a field for collisions in this process; it is never removed.
 
     Args:
-        field: wall that touches from its inside.
+        field: Wall whose inner side is in contact.
 
     Returns:
-        What the `geom_user` of its carrier is to hold.
+        Values of `geom_user` of its carrier.
     """
     from cathsim_dmc.collision.table import BORE, LUMEN, MARK, PART
 
@@ -155,14 +155,14 @@ def register(field: Field | Bore) -> tuple[float, ...]:
 def registered(
     user: Sequence[float],
 ) -> tuple[bool, np.ndarray, list[np.ndarray]] | None:
-    """The wall that a carrier's `geom_user` names, as this process knows it.
+    """The registered wall that a carrier's `geom_user` names.
 
     Returns:
-        Whether it is a bore; place (3,) m of the carrier's middle in the frame of the
-        wall; its arrays. None for a geom that carries no wall.
+        Whether it is a bore; centre (3,) of the carrier in the frame of the wall, m;
+        its arrays. None for a geom that is no carrier.
 
     Raises:
-        KeyError: if the process does not know the wall.
+        KeyError: if the wall is not registered in this process.
     """
     from cathsim_dmc.collision.table import BORE, MARK, USER
 
@@ -175,12 +175,12 @@ def registered(
 
 
 def carrier(field: Field | Bore, motion: np.ndarray | None = None) -> dict[str, Any]:
-    """Attributes of the geom that carries a field, unseen, on a body with its frame.
+    """MJCF attributes of the invisible carrier of a field, in the field's frame.
 
     Args:
-        field: wall that touches from its inside.
-        motion: lattice of `anatomy.motion.Motion`, by which it moves in simulations
-            with `physics.motion.Moving`; None for a wall at rest.
+        field: Wall whose inner side is in contact.
+        motion: Lattice of `anatomy.motion.Motion`, which displaces the wall in
+            simulations with `physics.motion.Moving`; None for a wall at rest.
     """
     low, high = field.box
     user, around = register(field), 0.0

@@ -1,10 +1,10 @@
-"""MuJoCo's structs in memory, for callbacks that are compiled.
+"""Access of compiled callbacks to MuJoCo's structs.
 
-A compiled callback gets the addresses of `mjModel` and `mjData` as int64. The readers
-`model_field`, `data_field` and `contact_field` read their fields by name. Where a field
-lies is found, and proved, when the callback is compiled; what is kept on disk is
-compiled anew for another MuJoCo. Constants that differ from process to process, such as
-the address of a table, reach code that is kept on disk as symbols (`symbol`,
+A compiled callback receives the addresses of `mjModel` and `mjData` as int64. The
+readers `model_field`, `data_field` and `contact_field` read fields by name. Field
+offsets are determined and verified when the callback is compiled; cached code is
+compiled again for another version of MuJoCo. Cached code refers to constants that
+differ between processes, such as the address of a table, by symbol (`symbol`,
 `address_of`).
 """
 
@@ -29,15 +29,15 @@ from numba.np.numpy_support import from_dtype
 
 from cathsim_dmc import compiled_cache
 
-# Compiled code calls what this decorates without its first argument.
+# Compiled code calls intrinsics without their first argument.
 _intrinsic: Any = intrinsic
 _typed: Any = intrinsic(prefer_literal=True)
 
-COUNT = 1 << 40  # more than any array has; nothing checks it
-# Types of values that are neither pointers nor structs; the others are enumerations.
+COUNT = 1 << 40  # length of arrays of unknown length; not checked
+# NumPy types of scalars; all types not listed are enumerations.
 _KINDS = {"mjtNum": "f8", "float": "f4", "mjtBool": "i1", "mjtByte": "i1"}
 _KINDS |= dict.fromkeys(("mjtSize", "size_t", "uint64_t", "uintptr_t"), "i8")
-# Every kind of thing whose arrays callbacks may ask for, so that none is empty.
+# A model in which no array that callbacks may read is empty.
 _PROBE = """
 <mujoco>
   <size nuserdata="2" nuser_geom="3" nuser_body="2" nuser_jnt="2" nkey="1"/>
@@ -59,7 +59,7 @@ _PROBE = """
 
 @functools.cache
 def layout(struct: str) -> Any:
-    """A struct of MuJoCo, such as "mjData", as C lays it out."""
+    """NumPy dtype of a struct of MuJoCo, such as "mjData", in C layout."""
     from mujoco.introspect import ast_nodes, structs
 
     def kind(of) -> np.dtype:
@@ -83,7 +83,7 @@ def layout(struct: str) -> Any:
 
 @functools.cache
 def _probe() -> dict[str, tuple[Any, int]]:
-    """An object of each struct, and its address."""
+    """A sample of each struct and its address."""
     model = mujoco.MjModel.from_xml_string(_PROBE)
     data = mujoco.MjData(model)
     data.time = 0.5
@@ -98,19 +98,18 @@ def _probe() -> dict[str, tuple[Any, int]]:
 
 
 def field(struct: str, name: str) -> tuple[int, Any, Any]:
-    """Where a field of a struct lies, proved by what MuJoCo's Python types know.
+    """Offset of a field of a struct, verified against MuJoCo's Python bindings.
 
     Args:
         struct: "mjModel", "mjData" or "mjContact".
         name: An array, a size or a number; "opt.timestep" is one of `mjOption`.
 
     Returns:
-        Bytes from the beginning of the struct, type of what is there, and the value in
-        a sample of it.
+        Offset in bytes, type of the field, and its value in a sample of the struct.
 
     Raises:
-        RuntimeError: if it does not lie where MuJoCo's own description says, or has no
-            proof.
+        RuntimeError: if the offset in MuJoCo's description is wrong, or cannot be
+            verified.
     """
     owner, address = _probe()[struct]
     place, kind = 0, layout(struct)
@@ -119,7 +118,7 @@ def field(struct: str, name: str) -> tuple[int, Any, Any]:
             kind, offset = kind.fields[part][:2]
             place += offset
         known = operator.attrgetter(name)(owner)
-        if struct == "mjContact":  # whose arrays lie in it
+        if struct == "mjContact":  # which contains its arrays
             proved = known.ctypes.data == address + place
             proved &= known.strides[0] == layout(struct).itemsize
         else:
@@ -138,12 +137,12 @@ def field(struct: str, name: str) -> tuple[int, Any, Any]:
 
 
 def _load(builder, place, kind):
-    """What is at an address."""
+    """Loads the value at an address."""
     return builder.load(builder.inttoptr(place, kind.as_pointer()))
 
 
 def _array_at(context, builder, kind, place, shape):
-    """An array of a type and shape at an address; it owns nothing."""
+    """Array of a type and shape at an address, without ownership."""
     data = builder.inttoptr(place, context.get_data_type(kind.dtype).as_pointer())
     size = context.get_abi_sizeof(context.get_data_type(kind.dtype))
     numbers = [size * math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
@@ -206,7 +205,7 @@ def _contact_at(data, number):
 
 
 def symbol(name: str, count: int) -> np.ndarray:
-    """An array (count,) of int64, 0 at first, that has a name for `address_of`."""
+    """Array (count,) of int64, zeros, whose address has a name for `address_of`."""
     array = np.zeros(count, np.int64)
     llvm.add_symbol(name, array.ctypes.data)
     return array
@@ -239,10 +238,10 @@ def word(_, address):
 
 @_intrinsic
 def fused(_, one, other, more):
-    """The number one * other + more, rounded once; so numpy sums squares."""
+    """Fused multiply-add one * other + more, with which NumPy sums squares."""
 
     def generate(context, builder, signature, arguments):
-        return builder.fma(*arguments)
+        return builder.fma(arguments[0], arguments[1], arguments[2])
 
     return types.float64(types.float64, types.float64, types.float64), generate
 
@@ -250,7 +249,7 @@ def fused(_, one, other, more):
 def _array(kind: Any) -> Any:
     @_intrinsic
     def array(_, address):
-        """The array (COUNT,) at an address; it owns nothing."""
+        """Array (COUNT,) at an address, without ownership."""
         array = types.Array(kind, 1, "C")
 
         def generate(context, builder, signature, arguments):
@@ -267,7 +266,7 @@ longs = _array(types.int64)
 
 @_typed
 def stacked(_, rows, columns):
-    """Scratch (rows, columns) of float64 that lives as long as the function that asks.
+    """Scratch (rows, columns) of float64 on the stack of the calling function.
 
     Both sizes are literals. It holds anything at first.
     """

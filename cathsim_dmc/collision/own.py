@@ -1,9 +1,9 @@
-"""Which simulations of the process have effects of this package.
+"""Recognition of the simulations that have effects of this package.
 
-MuJoCo calls its callbacks for every model of a process. The last number of `userdata`
-of a simulation with effects is the label of its layout, which stands in a table of the
-process with the sizes of its model. Nothing else of a model is read before label and
-sizes agree; every place beyond them is one of the layout's, none the simulation's.
+MuJoCo calls its callbacks for every model of a process. In a simulation with effects
+the last number of `userdata` is the label of its layout. A table of the process holds
+the layouts with the sizes of their models. Callbacks read nothing else of a model until
+label and sizes match, and take every offset from the layout, not from the simulation.
 """
 
 import numpy as np
@@ -18,28 +18,28 @@ from cathsim_dmc.collision.native import (
 )
 from cathsim_dmc.compiled import compiled
 
-# Words of a layout. Its label, a float64 in [1, 2), and the sizes of its models:
+# Words of a layout: its label, a float64 in [1, 2), then these sizes of its models:
 SIZES = ("nuserdata", "nbody", "nq", "nv", "njnt", "ngeom")
-# Addresses of the lists of laws of each callback: their number, then of each the
-# adapter and the place of its parameters in `userdata`.
+# Addresses of the list of laws of each callback: their number, then for each law the
+# address of its adapter and the offset of its parameters in `userdata`.
 PASSIVE, CONTROL = 56, 64  # bytes from the layout
-# First link among the bodies, number of links and of joints (pairs of hinges); address
-# of the links' geoms, then of joints, positions and degrees of freedom of the hinges.
+# Body of the first link, number of links and of joints (pairs of hinges); address of
+# the geoms of the links, then of joints, positions and degrees of freedom of hinges.
 LINK, LINKS, JOINTS, PLACES = range(72, 104, 8)
-# Geoms of wall and bore of the sheath, and place of the motion's parameters in
+# Geoms of wall and bore of the sheath, and offset of the parameters of the motion in
 # `userdata`; -1 for none.
 WALL, BORE, MOTION = 104, 112, 120
-# 1 + place of the parameters of a law that has raised an error, 0 for none.
+# 1 + offset of the parameters of a law that has raised an error, 0 for none.
 FAULT = 128
 WORDS, CAPACITY, SPAN = 17, 1 << 12, 1 << 52
 SYMBOL = "cathsim_layouts"
-# Before anything that knows it by the symbol is loaded.
+# Allocated before code that refers to the symbol is loaded.
 TABLE = symbol(SYMBOL, WORDS * CAPACITY).reshape(CAPACITY, WORDS)
 
 
 @compiled
 def _agrees(model, layout):
-    """Whether a model has the sizes of a layout."""
+    """Whether the sizes of a model match a layout."""
     return (
         model_field(model, "nuserdata") == word(layout + 8)
         and model_field(model, "nbody") == word(layout + 16)
@@ -52,7 +52,7 @@ def _agrees(model, layout):
 
 @compiled
 def layout_of(model, data):
-    """Address of the layout of a simulation; 0 for one of another package."""
+    """Address of the layout of a simulation; 0 for a model of another package."""
     count = np.int64(model_field(model, "nuserdata"))
     if count < 1:
         return np.int64(0)
@@ -73,6 +73,6 @@ def layout_of(model, data):
 
 @compiled
 def motion_of(model, data):
-    """Layout of a simulation whose vessel moves; 0 where it rests."""
+    """Address of the layout of a simulation with a moving vessel; 0 otherwise."""
     layout = layout_of(model, data)
     return layout if layout != 0 and word(layout + MOTION) >= 0 else np.int64(0)

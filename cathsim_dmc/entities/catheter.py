@@ -81,7 +81,9 @@ def _half_compliances(device: devices.Device, lengths: np.ndarray, of: str):
 def _rest_angles(device: devices.Device, lengths: np.ndarray):
     """Angles of the hinges about x and y of the unloaded device, rad."""
     middles = [lengths[n:].sum() - lengths[n] / 2 for n in range(len(lengths))]
-    return [(0.0, device.rest_angle(*ends)) for ends in itertools.pairwise(middles)]
+    return [
+        (0.0, device.rest_angle(far, near)) for far, near in itertools.pairwise(middles)
+    ]
 
 
 def _twists(device: devices.Device, lengths: np.ndarray, count: int):

@@ -155,8 +155,11 @@ class Chain(composer.ModelWrapperEntity):
             place = (0, 0, links.lengths[index - 1])
             bodies.append(bodies[-1].add("body", name=f"link_{index}", pos=place))
             if index in links.twists:
-                twist = bodies[-1], f"twist_{index}", (0, 0, 1), links.twists[index]
-                twists.append(self._add_hinge(*twist, armature=TORSION_ARMATURE))
+                name, twist = f"twist_{index}", links.twists[index]
+                hinge = self._add_hinge(
+                    bodies[-1], name, (0, 0, 1), twist, armature=TORSION_ARMATURE
+                )
+                twists.append(hinge)
             bends += self._add_bends(bodies[-1], index, links)
         self.links, self.bends = tuple(bodies), tuple(bends)
         self.link_geoms = tuple(

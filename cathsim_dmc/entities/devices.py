@@ -115,12 +115,14 @@ DIAGNOSTIC_5F_SIMMONS = _shaped(
 BERENSTEIN_5F = _shaped(
     "berenstein_5f",
     f"{_OUTLINE}: 60° over 8 mm, then 8 mm straight",
-    *(Arc(8e-3, math.radians(60)), _straight(8e-3)),
+    Arc(8e-3, math.radians(60)),
+    _straight(8e-3),
 )
 VERTEBRAL_5F = _shaped(
     "vertebral_5f",
     f"{_OUTLINE}: 45° over 14 mm, then 10 mm straight",
-    *(Arc(18e-3, math.radians(45)), _straight(10e-3)),
+    Arc(18e-3, math.radians(45)),
+    _straight(10e-3),
 )
 
 # Distal part of a 2.1F tube of 0.021 inch lumen: I = π (R⁴ - r⁴) / 4 = 7.9e-15 m⁴ of

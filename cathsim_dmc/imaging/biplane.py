@@ -74,8 +74,11 @@ class Biplane:
         depth = np.log(np.maximum(self._masks, 1.0) / np.maximum(grey, 1.0))
         depth = np.ascontiguousarray(depth, dtype=np.float32)
         line = np.empty((TRACE_POINTS, 3))
-        wanted = TRACE_SPACING, float(full), TRACE_ENOUGH
-        return line[: loops.trace(depth, self.matrices, _directions(), *wanted, line)]
+        count = loops.trace(
+            depth, self.matrices, _directions(),
+            TRACE_SPACING, float(full), TRACE_ENOUGH, line,
+        )  # fmt: skip
+        return line[:count]
 
     def point(self, pixels: ArrayLike) -> np.ndarray:
         """Point (3,), m, that is seen at pixels (2, 2), (column, row) of each plane."""
@@ -109,7 +112,8 @@ class Biplane:
         half = 0.5 * arm.resolution[1] * arm.source_isocentre / arm.focal_length
         low = np.asarray(arm.isocentre) - half
         number = np.arange(int(2 * half / HULL_SPACING) + 1) * HULL_SPACING
-        grid = np.stack(np.meshgrid(*(low[:, None] + number), indexing="ij"), -1)
+        x, y, z = low[:, None] + number
+        grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), -1)
         depth = self.depth(grid)
         inside = np.argwhere(depth > _OUTSIDE)
         first, last = inside.min(axis=0), inside.max(axis=0)

@@ -72,10 +72,7 @@ class CArm:
     isocentre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        checked = {
-            name: bounds.number(name, getattr(self, name), *limits)
-            for name, limits in _BOUNDS.items()
-        }
+        checked = bounds.fields(self, _BOUNDS)
         if checked["source_detector"] < checked["source_isocentre"]:
             raise ValueError(
                 f"source_detector is {self.source_detector} m and source_isocentre "

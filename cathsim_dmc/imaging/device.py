@@ -79,8 +79,8 @@ def device_attenuation(carm: CArm, shadow: Shadow) -> np.ndarray:
     with np.errstate(invalid="ignore"):  # joints that are not finite
         camera = carm.camera(points)
     widest = _add_devices(
-        image.reshape(-1, *carm.resolution),
-        camera.reshape(-1, *points.shape[-2:]),
+        image.reshape((-1, *carm.resolution)),
+        camera.reshape((-1, *points.shape[-2:])),
         radii.reshape(-1, radii.shape[-1]),
         carm.focal_length,
         (float(shadow.mu), float(marker[0]), float(marker[1])),

@@ -114,10 +114,10 @@ class Fluoroscope:
         depth = device_attenuation(self.carm, shadows[0])
         for shadow in shadows[1:]:
             depth += device_attenuation(self.carm, shadow)
-        frames = depth.reshape(-1, *self.carm.resolution)
+        frames = depth.reshape((-1, *self.carm.resolution))
         if isinstance(random_states, np.random.RandomState):
             random_states = [random_states] * len(frames)
-        return self._developed(frames, random_states).reshape(*depth.shape, 1)
+        return self._developed(frames, random_states).reshape((*depth.shape, 1))
 
     def _developed(
         self, depths: np.ndarray, states: Sequence[np.random.RandomState] | None

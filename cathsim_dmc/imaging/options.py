@@ -72,9 +72,7 @@ class FluoroscopyOptions:
     detector_size: float = DETECTOR_SIZE
 
     def __post_init__(self) -> None:
-        for name, limits in _BOUNDS.items():
-            positive = name in ("kerma", "gain")
-            bounds.number(name, getattr(self, name), *limits, positive=positive)
+        bounds.fields(self, _BOUNDS, positive=("kerma", "gain"))
         bounds.switch("noise", self.noise)
         if not isinstance(self.contrast, bool):
             bounds.number("contrast", self.contrast, 0.0, _MOST_IODINE, "kg/m³")
@@ -122,7 +120,7 @@ class FluoroscopyOptions:
         arms = []
         for name in ("view", "biplane")[: self.planes]:
             angles = np.deg2rad(np.add(_angles(name, getattr(self, name)), deviation))
-            arm = CArm(*angles, resolution=self.resolution, **fields)
+            arm = CArm(angles[0], angles[1], resolution=self.resolution, **fields)
             arms.append(arm.centred_on(points) if self.centre is None else arm)
         return tuple(arms)
 

@@ -1,12 +1,12 @@
 """Declaration of the parameters of a law: a NamedTuple of numbers and arrays.
 
-A field without a default is a number, one with an `Array` an array:
+A field without a default is a scalar; a field with an `Array` is an array:
 
     class Wind(NamedTuple):
         force: Any = Array(3)  # N/m
         lengths: Any = Array("links")  # m
 
-`physics.effects` lays them out in memory, one set for each simulation.
+`physics.effects` allocates one set for each simulation.
 """
 
 import math
@@ -15,24 +15,24 @@ from typing import Any
 
 
 class Array:
-    """An array among the parameters of a law, float64.
+    """Declaration of an array parameter of a law, float64.
 
     Attributes:
-        shape: Numbers, or names of sizes of the chain: "links", "joints", "devices",
-            "nodes".
+        shape: Lengths of the axes, as numbers or names of sizes of the chain: "links",
+            "joints", "devices", "nodes".
     """
 
     def __init__(self, *shape: int | str):
-        """Takes the shape; only its first axis may be named in a compiled law."""
+        """Sets the shape; in a compiled law only the first axis may be named."""
         self.shape = shape
 
 
 def shapes(kind: Any, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-    """Shapes of the fields of a NamedTuple of parameters, () of a number.
+    """Shape of each field of a NamedTuple of parameters, () for a scalar.
 
     Args:
-        kind: The class.
-        sizes: The named sizes.
+        kind: NamedTuple class.
+        sizes: Sizes of the chain by name.
     """
     declared = kind._field_defaults
     return {
@@ -46,5 +46,5 @@ def _shape(shape: Sequence[int | str], sizes: Mapping[str, int]) -> tuple[int, .
 
 
 def total(kind: Any, sizes: Mapping[str, int]) -> int:
-    """How many numbers the fields of a NamedTuple of parameters have together."""
+    """Total number of scalars in a NamedTuple of parameters."""
     return sum(math.prod(shape) for shape in shapes(kind, sizes).values())

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cathsim_dmc.compiled import compiled
-from cathsim_dmc.laws import coaxial, hinges, torsion
+from cathsim_dmc.laws import coaxial, coaxial_forces, hinges, torsion
 
 _GAP_STEP = 1e-8  # m, for a derivative
 
@@ -163,13 +163,15 @@ def _push(devices, loads, state, scratch, overlap, posture):
             slopes[k, j] -= turns[k, j]
             slopes[k, j] *= torque[0, k, j] / loads.stiffness / _GAP_STEP
     memory, axial = scratch.coaxial, state.axial
-    coaxial.axial(tables, overlap, posture, slopes, memory, axial)
+    coaxial_forces.axial(tables, overlap, posture, slopes, memory, axial)
     for k in range(len(gaps)):
         for j in range(turns.shape[1]):
             axial[k, j] = loads.stiffness * axial[k, j]
     friction, force = devices.lumen_friction, scratch.pressure
-    lumen = coaxial.Lumen(ahead[1], state.ways, friction, loads.stiffness)
-    coaxial.pressure(tables, overlap, posture, axial, lumen, memory, force, state.drag)
+    lumen = coaxial_forces.Lumen(ahead[1], state.ways, friction, loads.stiffness)
+    coaxial_forces.pressure(
+        tables, overlap, posture, axial, lumen, memory, force, state.drag
+    )
     # The lumen holds back the device in it; that one is too soft in torsion to turn
     # the lumen in its turn.
     for k in range(len(gaps) - 1):
@@ -199,13 +201,15 @@ def settle(devices, loads, state, scratch, chain):
     torsion.at_joints(angles, gaps, tables.nodes, turns)
     hinges.bent(state.hinges, scratch.bends)
     posture, torque = coaxial.Posture(gaps, scratch.bends.bends, turns), scratch.loads
-    coaxial.restoring(overlap, posture, scratch.coaxial, torque[0], torque[1])
+    coaxial_forces.restoring(overlap, posture, scratch.coaxial, torque[0], torque[1])
     for k in range(len(gaps)):
         for j in range(turns.shape[1]):
             torque[0, k, j] *= loads.stiffness
             torque[1, k, j] *= loads.stiffness
     outermost, friction = overlap.outermost, loads.friction
-    coaxial.wall_friction(devices.arms, outermost, loads.force, friction, torque[2])
+    coaxial_forces.wall_friction(
+        devices.arms, outermost, loads.force, friction, torque[2]
+    )
     if len(gaps) > 1:
         _push(devices, loads, state, scratch, overlap, posture)
     torsion.at_nodes(torque, gaps, tables.nodes, scratch.borne)

@@ -143,7 +143,7 @@ def motion(model, data, layout, start):
     count, jacobian = data_field(data, "ncon"), data_field(data, "efc_J")
     if count == 0:
         return
-    # In the middle of the step, so that a device that sticks goes the wall's way.
+    # In the middle of the step, so that a sticking device follows the wall.
     time = data_field(data, "time") + 0.5 * model_field(model, "opt.timestep")
     course = course_at(_parameters(MotionParameters, data, layout, start), time)
     entry = entry_of(address_of(SYMBOL), key_of(model, wall))
@@ -175,34 +175,27 @@ def made(law: Callable, kind: Any, acts_in: str) -> Any:
     """
     # It refers to a law that changes from process to process: it is not kept on disk.
     apply = compiled(law, cache=False, checked=True)
+    state_of = links_of if acts_in == "control" else device_of
 
-    def in_passive(model, data, layout, start):
-        given, time = _parameters(kind, data, layout, start), data_field(data, "time")
+    def guarded(given, time, state, layout, start):
         try:
-            apply(given, time, device_of(model, data, layout))
+            apply(given, time, state)
         except Exception:  # noqa: BLE001  C cannot be told
             native.longs(layout + FAULT)[0] = start + 1
 
-    def in_control(model, data, layout, start):
+    guarded = compiled(guarded, cache=False)
+
+    def once(model, data, layout, start):
         given, time = _parameters(kind, data, layout, start), data_field(data, "time")
-        try:
-            apply(given, time, links_of(model, data, layout))
-        except Exception:  # noqa: BLE001  C cannot be told
-            native.longs(layout + FAULT)[0] = start + 1
+        guarded(given, time, state_of(model, data, layout), layout, start)
 
     def in_contact(model, data, layout, start):
         given, time = _parameters(kind, data, layout, start), data_field(data, "time")
         wall = word(layout + WALL)
         for n in range(data_field(data, "ncon")):
             contact = contact_at(data, n)
-            if contact_field(contact, "geom2")[0] != wall:
-                continue
-            try:
-                apply(given, time, _contact(contact))
-            except Exception:  # noqa: BLE001  C cannot be told
-                native.longs(layout + FAULT)[0] = start + 1
+            if contact_field(contact, "geom2")[0] == wall:
+                guarded(given, time, _contact(contact), layout, start)
 
-    found = {"passive": in_passive, "control": in_control, "contact": in_contact}
-    return native.callback("void(int64, int64, int64, int64)", cache=False)(
-        found[acts_in]
-    )
+    callback = native.callback("void(int64, int64, int64, int64)", cache=False)
+    return callback(in_contact if acts_in == "contact" else once)

@@ -107,8 +107,9 @@ class Places(NamedTuple):
         joints = np.searchsorted(model.jnt_qposadr, qpos)
         hinges = np.array([joints, qpos, model.jnt_dofadr[joints]])
         kind = mujoco.mjtObj.mjOBJ_GEOM
-        geoms = (mujoco.mj_name2id(model, kind, n) for n in ("wall", "sheath/bore"))
-        return cls(index.links.start, index.geoms, hinges, *geoms)
+        wall = mujoco.mj_name2id(model, kind, "wall")
+        bore = mujoco.mj_name2id(model, kind, "sheath/bore")
+        return cls(index.links.start, index.geoms, hinges, wall, bore)
 
 
 class Layout:
@@ -143,7 +144,7 @@ class Layout:
         while taken[slot]:
             slot = (slot + 1) % own.CAPACITY
         lists = [self._list("passive", "contact"), self._list("control")]
-        # Addresses in the table refer to these for as long as the process lives.
+        # Addresses in the table refer to these until the process ends.
         self._kept, self._row = (where, lists), own.TABLE[slot]
         self._row[1 : 1 + len(sizes)] = sizes
         self._row[1 + len(sizes) :] = (

@@ -131,14 +131,14 @@ class Flow(StillBlood):
         """What `velocities` finds at points (N, P, 3) in space: (N, P, 8)."""
         out = np.zeros((*points.shape[:2], 8))
         for index, row in enumerate(np.ascontiguousarray(points)):
-            vessels = self._circulations[index].arrays
+            vessels = self._circulations[index].segments
             if self._moving is None:
-                velocities(row, np.zeros(len(row)), *vessels, out[index])
+                velocities(row, np.zeros(len(row)), vessels, out[index])
             else:
                 first = self._moving.entered(index, row)
                 lattice, parameters, time = self._moving.warp(index)
                 course, there = course_of(parameters, time), out[index, first:]
-                moving_velocities(lattice, course, row[first:], *vessels, there)
+                moving_velocities(lattice, course, row[first:], vessels, there)
         return out
 
     def read(self, time: np.ndarray, state: Readings) -> dict[str, np.ndarray]:
@@ -166,14 +166,14 @@ def profile(share):
 
 
 @compiled
-def moving_velocities(lattice, course, points, ends, radii, shares, ways, vessel, out):
+def moving_velocities(lattice, course, points, segments, out):
     """As `velocities` at a time, s; `out` (P, 8) ends with that of space, m/s."""
     values, there = np.empty((VALUES, 4)), np.empty((len(points), WARP))
     for p in range(len(points)):
         x, y, z = points[p]
         warp(lattice, course, (x, y, z), values, there[p])
     rest, growth = there[:, :3].copy(), there[:, 12].copy()
-    velocities(rest, growth, ends, radii, shares, ways, vessel, out)
+    velocities(rest, growth, segments, out)
     for p in range(len(points)):
         row, at = out[p], there[p]
         if row[4] > 0.0:
@@ -202,16 +202,17 @@ def _fill(found, speed, radii, flowing, blood):
 
 
 @compiled
-def velocities(points, growth, ends, radii, shares, ways, vessel, out):
+def velocities(points, growth, segments, out):
     """Writes velocity, way from the heart and radius of the lumen at some places.
 
     Args:
         points: (P, 3), m, in the vessel at rest.
         growth: (P,), of the radius of the lumen, m.
-        ends, radii, shares, ways, vessel: of `anatomy.circulation.Circulation`.
+        segments: of the vessels, `anatomy.circulation.Segments`.
         out: (P, 5 or more): velocity for an inflow of 1 m³/s, 1/m²; way, m; radius,
             m; 0 outside the lumen.
     """
+    ends, radii, shares, ways, vessel = segments
     count = len(vessel)
     nearest = np.empty(vessel[-1] + 1)
     segment = np.empty(vessel[-1] + 1, np.int64)

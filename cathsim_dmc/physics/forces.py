@@ -50,7 +50,7 @@ class Contacts:
     @classmethod
     def from_sensor(cls, row: np.ndarray) -> "Contacts":
         """Reads the sensor's row (..., K * 14) as `entities.phantom` declares it."""
-        slots = row.reshape(*row.shape[:-1], -1, CONTACT_SIZE)
+        slots = row.reshape((*row.shape[:-1], -1, CONTACT_SIZE))
         found, local = slots[..., 0], slots[..., 1:4]
         present = found > 0
         normal, tangent = slots[..., 8:11], slots[..., 11:14]
@@ -108,5 +108,5 @@ def wall_force(rows: np.ndarray) -> tuple[WallForce, np.ndarray]:
     """
     from cathsim_dmc.physics import forces_loops  # late, as numba takes long
 
-    *force, deepest = forces_loops.summed(rows, CONTACT_SIZE)
-    return WallForce(*force), deepest
+    found = forces_loops.summed(rows, CONTACT_SIZE)
+    return WallForce._make(found[:4]), found[4]

@@ -67,8 +67,8 @@ class MotionOptions:
 
     def check(self, anatomy: Anatomy) -> None:
         """Raises ValueError if the largest amplitudes fold an anatomy."""
-        largest = (np.max(each) for each in (self.heart, self.breathing))
-        anatomy.motion.check(anatomy.name, *map(float, largest))
+        heart, breathing = float(np.max(self.heart)), float(np.max(self.breathing))
+        anatomy.motion.check(anatomy.name, heart, breathing)
 
 
 class Moving(Effect):
@@ -145,15 +145,16 @@ class Moving(Effect):
         places = state.centreline.copy()
         for index, row in enumerate(places):
             moved = row[self.entered(index, row) :]
-            moved[:] = self._motions[index].to_rest(*self.warp(index)[1:], moved)
+            _, parameters, time = self.warp(index)
+            moved[:] = self._motions[index].to_rest(parameters, time, moved)
         return state._replace(centreline=places, head=places[:, -1])
 
     def to_space(self, points: np.ndarray) -> np.ndarray:
         """Places in space (N, ..., 3) of places at rest (N, ..., 3), m."""
-        found = [
-            self._motions[index].to_space(*self.warp(index)[1:], row)[0]
-            for index, row in enumerate(points)
-        ]
+        found = []
+        for index, row in enumerate(points):
+            _, parameters, time = self.warp(index)
+            found.append(self._motions[index].to_space(parameters, time, row)[0])
         return np.array(found)
 
     def warp(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:

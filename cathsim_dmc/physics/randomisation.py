@@ -114,7 +114,7 @@ class Randomisation:
     tracking_noise: float = 0.0
 
     def __post_init__(self):
-        for name, limits in _RANGES.items():
+        for name, (low, high, unit) in _RANGES.items():
             value = getattr(self, name)
             varied = isinstance(value, variation.Variation)
             if varied and name in ("delay", "goal_shift", "start_insertion"):
@@ -124,7 +124,7 @@ class Randomisation:
                 )
             if value is not None and not varied:
                 whole = name == "delay"
-                ends = bounds.interval(name, value, *limits, integers=whole)
+                ends = bounds.interval(name, value, low, high, unit, integers=whole)
                 object.__setattr__(self, name, ends)
         bounds.number("start_radius", self.start_radius, 0.0, _FARTHEST_START, "m")
         bounds.number("tracking_noise", self.tracking_noise, 0.0, _MOST_NOISE, "m")
@@ -144,7 +144,7 @@ class Randomisation:
     @property
     def farthest_shift(self) -> float:
         """How far past its place a goal may be shifted, m."""
-        return max(0.0, *(self.goal_shift or (0.0,)))
+        return max(0.0, max(self.goal_shift or (0.0,)))
 
     @property
     def farthest_insertion(self) -> float:
@@ -165,9 +165,10 @@ class Randomisation:
                 return None
             if not isinstance(chosen, variation.Variation):
                 return drawn(chosen, random_state)
-            # Only now is it known what somebody's own distribution gives.
+            # A user's own distribution is checked when it is drawn.
             found = variation.evaluate(chosen, random_state=random_state)
-            return bounds.number(f"{name}, as drawn,", found, *_RANGES[name])
+            low, high, unit = _RANGES[name]
+            return bounds.number(f"{name}, as drawn,", found, low, high, unit)
 
         displacement = start_displacement(random_state, self.start_radius)
         names = "friction", "stiffness", "loss", "viscosity"

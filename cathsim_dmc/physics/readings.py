@@ -185,7 +185,7 @@ class ModelIndex:
                 external_force=external.copy(),
                 centreline=np.concatenate(nodes, axis=-2),
                 head=head.copy(),
-                head_frame=frame.reshape(*frame.shape[:-1], 3, 3).copy(),
+                head_frame=frame.reshape((*frame.shape[:-1], 3, 3)).copy(),
                 push_force=force.copy(),
                 push_torque=torque.copy(),
                 load_cell=-cell,

@@ -67,7 +67,7 @@ class Stepper(abc.ABC):
 
     @abc.abstractmethod
     def load(self, index: int, case: Any) -> None:
-        """Has a `tasks.cases.Case` write itself into the model of one simulation."""
+        """Loads the fields of a `tasks.cases.Case` into the model of one simulation."""
 
     @abc.abstractmethod
     def states(self, indices: np.ndarray | slice = _ALL) -> np.ndarray:
@@ -122,7 +122,7 @@ class Stepper(abc.ABC):
         limit = forces.DEEPEST if self.deepest is None else self.deepest
         depth = self._depth_at_end(depth, warned, limit)
         again: list[tuple[np.ndarray, forces.WallForce]] = []
-        # A wall that gives is soft enough for half the step, as a rule.
+        # Half the step usually suffices for a compliant wall.
         for parts in (forces.REFINEMENT,) if self.deepest is None else (2, 8):
             coarse = ((force.peak_max > forces.HARDEST) | (depth > limit)) & ~warned
             if not np.count_nonzero(coarse):
@@ -184,7 +184,7 @@ class Stepper(abc.ABC):
                 for index, value in zip(indices.tolist(), values, strict=True):
                     self.field(index, name.removeprefix("field_"))[:] = value
         self.set_states(indices, kept["state"])
-        self._forward(indices)  # for who looks at what MuJoCo derives
+        self._forward(indices)  # updates the quantities that MuJoCo derives
         self.set_states(indices, kept["state"])
         self.repeated[indices] = kept["repeated"]
         self._put_contacts(indices, kept["contacts"])
@@ -245,7 +245,7 @@ class Stepper(abc.ABC):
 
 
 class SingleStepper(Stepper):
-    """One simulation, stepped by somebody else who calls `keep` after each step."""
+    """One simulation, stepped by `step`, or by composer, which calls `keep`."""
 
     has_snapshots = True
 

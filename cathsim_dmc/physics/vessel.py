@@ -1,4 +1,4 @@
-"""The option `vessel` of a task: blood that flows, a wall that gives and moves."""
+"""Option `vessel` of a task: flow of blood, compliance and motion of the wall."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -77,11 +77,11 @@ def read(
 
 @dataclasses.dataclass(frozen=True)
 class VesselOptions:
-    """What a vessel does; None for nothing.
+    """Flow, compliance and motion options of a vessel; None for none.
 
     Attributes:
         flow: Options of the flow of blood.
-        wall: Options of a wall that gives.
+        wall: Options of a compliant wall.
         motion: Options of a vessel that moves.
     """
 

@@ -74,7 +74,7 @@ class Wall(Effect):
     state = ("_radius", "_material")
 
     def __init__(self, options: WallOptions, blood: Flow):
-        """Takes the options of the task, and the blood, which knows the vessels."""
+        """Takes the options of the task, and the blood, which holds the vessels."""
         self._options, self._blood = options, blood
 
     def bind(self, world: World) -> None:

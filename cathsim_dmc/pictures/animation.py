@@ -17,7 +17,7 @@ from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 
 FRAMES = 90
-_LENGTH = 2.0, 12.0  # s of a film, without its last pause
+_SHORTEST, _LONGEST = 2.0, 12.0  # s of a film, without its last pause
 # The last frame stays for so long before it begins again, ms.
 _HOLD_MS = 1500
 _TICK_MS = 20  # browsers do not show frames that are shorter
@@ -60,7 +60,7 @@ def animate(
     path = Path(path)
     check_film(path)
     require_file(path)
-    seconds = np.clip(episode.time[-1] - episode.time[0], *_LENGTH)
+    seconds = np.clip(episode.time[-1] - episode.time[0], _SHORTEST, _LONGEST)
     count = min(frames, episode.steps + 1)
     chosen = np.unique(np.linspace(0, episode.steps, count).round().astype(int))
     made = list(_frames(episode, surface, width, chosen))

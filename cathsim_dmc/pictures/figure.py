@@ -132,18 +132,19 @@ def draw_anatomy(axes: Any, anatomy: Anatomy, view: str = "front") -> None:
     for number, (name, vessel) in enumerate(anatomy.tree.vessels.items()):
         line = projection.flat_mm(vessel.centreline.points)
         colour = VESSEL_COLOURS[number % len(VESSEL_COLOURS)]
-        axes.plot(*line.T, color=colour, lw=1.4, label=name)
+        axes.plot(line[:, 0], line[:, 1], color=colour, lw=1.4, label=name)
         axes.annotate(name, line[-1], (2, 2), textcoords="offset points", fontsize=6)
     for goal in anatomy.goals.values():
         place = projection.flat_mm(goal.position).tolist()
         reach = min(GOAL_RADIUS_MM, 1e3 * anatomy.goal_room(goal))
         ring = Circle(place, reach, fill=False, ec=GOAL_COLOUR, lw=0.8)
         axes.add_patch(ring)
-        axes.plot(*place, ".", color=GOAL_COLOUR, ms=4)
+        axes.plot(place[0], place[1], ".", color=GOAL_COLOUR, ms=4)
     inlet = anatomy.inlet
     ends = inlet.position + np.outer((0.015, -0.015), inlet.direction)
     arrow = {"arrowstyle": "->", "color": "k"}
-    axes.annotate("", *projection.flat_mm(ends), arrowprops=arrow)
+    head, tail = projection.flat_mm(ends)
+    axes.annotate("", head, tail, arrowprops=arrow)
 
 
 def _upright(anatomy: Anatomy) -> bool:
@@ -199,9 +200,9 @@ def scene_figure(
         size = _WIDEST_IN, (_WIDEST_IN - 1.6) / sum(ratios) + _LETTERING_IN
     figure = Picture(figsize=size, dpi=120, layout="constrained")
     panels = figure.subplots(1, len(ratios), width_ratios=ratios, squeeze=False)[0]
-    for panel, view, seen in zip(panels, views, drawn, strict=False):
-        draw_scene(panel, moment, *seen)
-        _prepare(panel, seen[0], view)
+    for panel, view, (projection, seen) in zip(panels, views, drawn, strict=False):
+        draw_scene(panel, moment, projection, seen)
+        _prepare(panel, projection, view)
     if views:
         scale = Normalize(0, 1e3 * moment.force_scale)
         beside = panels[: len(views)].tolist()
@@ -232,7 +233,7 @@ def draw_scene(
     for look in (inside, {"fill": False, "lw": 1.6, "zorder": 7}):
         axes.add_patch(Circle(goal, radius, ec=GOAL_COLOUR, **look))
     way = projection.flat_mm(moment.path)
-    axes.plot(*way.T, color=PATH_COLOUR, lw=0.9, zorder=3)
+    axes.plot(way[:, 0], way[:, 1], color=PATH_COLOUR, lw=0.9, zorder=3)
     _draw_device(axes, moment, projection)
     axes.imshow(picture.glaze, extent=extent, zorder=6, interpolation="bilinear")
     _draw_forces(axes, moment, projection)
@@ -257,9 +258,10 @@ def _draw_device(axes: Any, moment: Moment, projection: ParallelProjection) -> N
         axes.add_collection(LineCollection(list(pieces), zorder=4, **look))
     for number, end in enumerate(projection.flat_mm(moment.ends)):
         look = {"ms": 1.3 * width.max(), "mfc": DEVICES[number % len(DEVICES)][1]}
-        axes.plot(*end, "o", **look, mec="0.1", mew=0.8, zorder=5)
+        axes.plot(end[0], end[1], "o", **look, mec="0.1", mew=0.8, zorder=5)
     look = {"ms": 1.6 * width[-1], "mfc": HEAD_COLOUR}
-    axes.plot(*line[-1], "o", **look, mec="white", mew=0.8, zorder=5)
+    x, y = line[-1]
+    axes.plot(x, y, "o", **look, mec="white", mew=0.8, zorder=5)
 
 
 def _draw_forces(axes: Any, moment: Moment, projection: ParallelProjection) -> None:
@@ -268,14 +270,16 @@ def _draw_forces(axes: Any, moment: Moment, projection: ParallelProjection) -> N
         return
     place = projection.flat_mm(moment.position)
     colours = force_colours(magnitude, moment.force_scale) / 255
-    axes.scatter(*place.T, s=16, c=colours, edgecolors="0.15", linewidths=0.5, zorder=8)
+    x, y = place.T
+    axes.scatter(x, y, s=16, c=colours, edgecolors="0.15", linewidths=0.5, zorder=8)
     largest = max(magnitude.max(), ARROW_LEAST_N)
     strong = magnitude > ARROW_LEAST_N
     length = np.maximum(ARROW_MM * magnitude / largest, ARROW_LEAST_MM)
     unit = moment.force / np.maximum(magnitude, 1e-12)[:, None]
     along = projection.flat_mm(unit) / 1e3 * length[:, None]
     axes.quiver(
-        *place[strong].T, *along[strong].T, color=colours[strong], angles="xy",
+        x[strong], y[strong], along[strong, 0], along[strong, 1],
+        color=colours[strong], angles="xy",
         scale_units="xy", scale=1, units="inches", width=0.037,
         edgecolor="0.15", linewidth=0.4, zorder=8,
     )  # fmt: skip

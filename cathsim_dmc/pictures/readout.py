@@ -70,8 +70,9 @@ class ForceReadout:
         ]
         if len(self):
             lines.append("     position, mm          force on the wall, mN")
-        row = "  {:6.1f} {:6.1f} {:6.1f}  {:8.2f} {:8.2f} {:8.2f}"
-        lines += [row.format(*r) for r in 1e3 * np.hstack([self.position, self.force])]
+        for place, force in zip(1e3 * self.position, 1e3 * self.force, strict=True):
+            (x, y, z), (u, v, w) = place, force
+            lines.append(f"  {x:6.1f} {y:6.1f} {z:6.1f}  {u:8.2f} {v:8.2f} {w:8.2f}")
         return "\n".join([*lines, f"* {PEAK_NOTE}"])
 
 

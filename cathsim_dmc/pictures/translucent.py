@@ -108,7 +108,8 @@ def glass(surface: Surface, projection: ParallelProjection) -> Glass:
         where, over = pixel[first[deep]], hits[first[deep] + layer]
         behind[where] = over + (1.0 - over[:, 3:]) * behind[where]
     glaze[pixel[first]] = GLAZE * hits[first + count - 1]
-    return Glass(*(_smaller(each, projection.shape) for each in (behind, glaze)))
+    shape = projection.shape
+    return Glass(_smaller(behind, shape), _smaller(glaze, shape))
 
 
 def _hits(surface: Surface, projection: ParallelProjection, shape: tuple[int, int]):

@@ -56,7 +56,7 @@ class Controls:
             tip_joints: Number of steerable joints of the device, two motors each.
             rotation: Whether the action has a rotation.
             devices: Number K of coaxial devices; 0 for a steerable device.
-            watching: Whether somebody else gives the actions.
+            watching: Whether a policy gives the actions.
             hand: A gamepad or SpaceMouse beside the keys.
         """
         self._tip_joints, self._rotation, self._devices = tip_joints, rotation, devices

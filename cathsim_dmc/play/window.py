@@ -100,7 +100,7 @@ class FluoroscopyWindow:
             x += number * columns / len(self._planes)
             radius = task.objective.goal_radius * plane.carm.focal_length / float(depth)
             box = x - radius, y - radius, x + radius, y + radius
-            self._screen.create_oval(*box, outline="green2")
+            self._screen.create_oval(box, outline="green2")
         self._panel.delete("all")
         force, (most, colour) = float(task.wall_force.max), FORCE_LEVELS[-1]
         colour = next((c for level, c in FORCE_LEVELS if force <= level), colour)

@@ -129,8 +129,8 @@ class CoaxialPlan(Route):
         leader = devices.insertion.argmax(axis=1)[:, None]
         looks = np.where(turns, np.cos(error), 1.0)
         cosine = np.take_along_axis(looks, leader, axis=1)[:, 0]
-        pressing = wall_force.mean_max, readings.push_force
-        speed = attempts.translation(settings, memory, *pressing, cosine)
+        contact, push = wall_force.mean_max, readings.push_force
+        speed = attempts.translation(settings, memory, contact, push, cosine)
         deep = np.maximum(place.arc_length - self.ostium, 0.0)
         action[:, 0::2] = _led(settings, memory, devices.insertion, speed, deep)
         insertion, arc_length = np.array(readings.insertion), np.array(place.arc_length)

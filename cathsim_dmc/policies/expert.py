@@ -78,9 +78,10 @@ class ExpertPolicy(Policy):
             raise RuntimeError("the expert must be reset before it acts")
         view = self._plans.view
         action = np.empty((view.num_simulations, view.num_actions))
-        for plan, rows, seen in self._plans.chosen():
-            own = part(self.state, rows), part(self._plans.memory, rows)
-            action[rows], state = plan.decide(plan.settings, *own, *seen)
+        for plan, rows, (readings, force, devices) in self._plans.chosen():
+            own, memory = part(self.state, rows), part(self._plans.memory, rows)
+            decided = plan.decide(plan.settings, own, memory, readings, force, devices)
+            action[rows], state = decided
             self.state = merged(self.state, state, rows)
         return action
 
@@ -136,7 +137,7 @@ class Teacher:
         """
         action = np.empty(last_action.shape)
         remembers = self._plans.view.rollout.progress.shown
-        for plan, rows, seen in self._plans.chosen():
+        for plan, rows, (readings, force, devices) in self._plans.chosen():
             settings, state = plan.settings, plan.fresh((len(rows),))
             arc_length, insertion = self._last[:, rows]
             state = state._replace(arc_length=arc_length, insertion=insertion)
@@ -145,8 +146,10 @@ class Teacher:
                 memory = part(self._plans.memory, rows)
             else:
                 settings = self._one_lead if isinstance(plan, CoaxialPlan) else settings
-                memory = _of_the_moment(plan, settings, seen[0])
-            action[rows], state = plan.decide(settings, state, memory, *seen)
+                memory = _of_the_moment(plan, settings, readings)
+            action[rows], state = plan.decide(
+                settings, state, memory, readings, force, devices
+            )
             self._last[:, rows] = state.arc_length, state.insertion
         return action
 

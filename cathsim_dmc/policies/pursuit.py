@@ -103,7 +103,7 @@ class Plan(Route):
         return State.fresh(shape, len(self.tip))
 
     def told(self, state: State, action: np.ndarray) -> State:
-        """Memory as if the last action were this one (..., A)."""
+        """State with the last command replaced by (..., A)."""
         bend = action[..., : self.tip.size] * self.steering_angle
         return state._replace(bend=bend.reshape(state.bend.shape))
 
@@ -138,11 +138,11 @@ class Plan(Route):
         left = attempts.relaxed(settings, memory, wall_force.mean_max)[..., None, None]
         bend = left * (bend + np.where(still[..., None, None], 0.0, correction))
         bend = np.clip(bend, -self.steering_angle, self.steering_angle)
-        pressing = wall_force.mean_max, readings.push_force
-        speed = attempts.translation(settings, memory, *pressing, cosine)
+        contact, push = wall_force.mean_max, readings.push_force
+        speed = attempts.translation(settings, memory, contact, push, cosine)
         action = np.zeros((*speed.shape, self.num_actions))
         motors = self.tip.size
-        action[..., :motors] = (bend / self.steering_angle).reshape(*speed.shape, -1)
+        action[..., :motors] = (bend / self.steering_angle).reshape((*speed.shape, -1))
         action[..., motors] = speed
         insertion, arc_length = np.array(readings.insertion), np.array(place.arc_length)
         return action, State(arc_length, insertion, bend)

@@ -61,7 +61,7 @@ def write(
     import minari
     from minari.dataset.minari_storage import MinariStorage
 
-    name, spaces = path.name, (observation_space, action_space)
+    name, seen, acted = path.name, observation_space, action_space
     about = {
         # The last part of an id is a name with a version.
         "dataset_id": name if re.search(r"-v\d+$", name) else f"{name}-v0",
@@ -73,7 +73,7 @@ def write(
         _check_space(temporary / "space", buffers)
         # Minari looks for the files of a relative path beneath that path again.
         data = temporary.absolute() / "data"
-        storage = MinariStorage.new(data, *spaces, env_spec, jpeg_encoding=False)
+        storage = MinariStorage.new(data, seen, acted, env_spec, jpeg_encoding=False)
         storage.update_metadata(about)
         storage.update_episodes(buffers)
     return path

@@ -179,7 +179,7 @@ class EpisodeRecorder:
         shapes = {"action": self._env.action_spec().shape}
         shapes |= {"contact_position": (3,), "contact_force": (3,)}
         for name, shape in shapes.items():
-            arrays[name] = arrays[name].reshape(-1, *shape)  # of no rows, too
+            arrays[name] = arrays[name].reshape((-1, *shape))  # of no rows, too
         return Episode(self._task_name, seed, meta, **arrays)
 
     def _meta(self, rows: _Rows, end: dict[str, Any]) -> dict[str, Any]:

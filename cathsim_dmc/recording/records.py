@@ -43,11 +43,12 @@ class CoaxialRecord:
         """Reads the devices of an episode; None if it has a single device."""
         if not (devices := episode.meta.get("devices")):
             return None
-        columns = (
-            np.array([one[name] for one in devices], np.float64).T
+        series = {
+            name: np.array([one[name] for one in devices], np.float64).T
             for name in ("radius", *DEVICE_SERIES)
-        )
-        return cls(tuple(one["name"] for one in devices), *columns)
+        }
+        names = tuple(one["name"] for one in devices)
+        return cls(names, radii=series.pop("radius"), **series)
 
     @property
     def gaps(self) -> np.ndarray:

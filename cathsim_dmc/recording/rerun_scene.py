@@ -229,8 +229,8 @@ def body_geoms(physics: Any) -> Iterator[BodyGeom]:
         visible = rgba[3] > 0 and model.geom_group[geom] < _VISIBLE_GROUPS
         if visible and kind and name.split("/", 1)[0] in ("robot", "sheath"):
             size = model.geom_size[geom][: SIZES[kind]]
-            pose = model.geom_pos[geom], model.geom_quat[geom]
-            yield BodyGeom(body, name, kind, size, *pose, rgba)
+            place, turn = model.geom_pos[geom], model.geom_quat[geom]
+            yield BodyGeom(body, name, kind, size, place, turn, rgba)
 
 
 def log_bodies(log: Log, geoms: Iterable[BodyGeom]) -> None:

@@ -127,7 +127,7 @@ def simulate(
     groups = np.array(chain.action_groups)
     mean = random.uniform(-1.0, 1.0, (count, groups.max() + 1))[:, groups]
     ways = list(chain.translations)
-    mean[:, ways] = random.uniform(*_PUSH, (count, len(ways)))
+    mean[:, ways] = random.uniform(_PUSH[0], _PUSH[1], (count, len(ways)))
     added, failed = np.zeros_like(mean), np.zeros(count, bool)
     shadows, turns, warps = [], [], []
     for _ in range(options.frames):
@@ -175,23 +175,28 @@ def ends(shadow: Shadow) -> np.ndarray:
     return found
 
 
+def _within(random: Any, ends: Sequence[float] | np.ndarray) -> float:
+    return random.uniform(ends[0], ends[1])
+
+
 class Camera:
     """C-arm, contrast and dose of one sequence, as drawn."""
 
     def __init__(self, anatomy: Anatomy, size: int, aim: np.ndarray, random: Any):
         """Draws them; the isocentre lies from the lumen's middle towards `aim`, m."""
-        self.angles = random.uniform(*PRIMARY), random.uniform(*SECONDARY)
+        self.angles = _within(random, PRIMARY), _within(random, SECONDARY)
         middle = np.mean(anatomy.lumen.box, axis=0)
         isocentre = middle + random.uniform() * (aim - middle)
+        primary, secondary = np.radians(self.angles)
         self.arm = CArm(
-            *np.radians(self.angles), magnification=random.uniform(*ZOOM),
+            primary, secondary, magnification=_within(random, ZOOM),
             detector_size=DETECTOR_SIZE, resolution=(size, size),
             isocentre=tuple(isocentre),
         )  # fmt: skip
-        iodine = random.uniform(*IODINE)
+        iodine = _within(random, IODINE)
         self.iodine = iodine if random.uniform() < 0.5 else 0.0
-        self.kerma = float(np.exp(random.uniform(*np.log(KERMA))))
-        self.gain = random.uniform(*GAIN)
+        self.kerma = float(np.exp(_within(random, np.log(KERMA))))
+        self.gain = _within(random, GAIN)
 
     def seen(self, places: np.ndarray) -> np.ndarray:
         """Column, row and state (T, K, 3) of places (T, K, 3) m, NaN for none."""
@@ -209,7 +214,8 @@ class Camera:
         """The fluoroscope before the vessel, as it has moved at one time."""
         surface = anatomy.surface
         if warp is not None:
-            surface = anatomy.motion.surface(*warp, surface)
+            parameters, time = warp
+            surface = anatomy.motion.surface(parameters, time, surface)
         depth = surface_thickness(self.arm, surface, 1)
         return Fluoroscope(
             self.arm, depth, depth > 0.0, self.iodine, kerma=self.kerma, gain=self.gain

@@ -36,7 +36,7 @@ _ALIVE: weakref.WeakSet["BatchSimulation"] = weakref.WeakSet()
 
 
 def _keep_in_fork():
-    """Keeps batches for ever in a fork: freeing one waits for its threads."""
+    """Leaks batches in forked children, whose threads are gone."""
     for simulation in _ALIVE:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(simulation.batch))
 
@@ -278,7 +278,7 @@ class _BatchStepper(Stepper):
         return self._copy
 
     def load(self, index: int, case: Case) -> None:
-        """There is one anatomy."""
+        """Nothing to load: all simulations share one anatomy."""
 
     def states(self, indices: np.ndarray | slice = slice(None)) -> np.ndarray:
         return np.array(self.batch.state[indices])

@@ -78,7 +78,7 @@ class PhysicsError:
         """
         meta, arrays = read_arrays(path, _KIND)
         with files.refused(
-            ValueError, f"{path} holds no physics error", KeyError, TypeError
+            ValueError, f"{path} holds no physics error", (KeyError, TypeError)
         ):
             action = bounds.array("action", arrays.pop(_ACTION)[0], "f", (-1,))
             snapshot = Snapshot.of(path, meta, arrays)

@@ -1,4 +1,4 @@
-"""Cases of a task: anatomies that take turns in one compiled model.
+"""Cases of a task: anatomies that share one compiled model.
 
 All anatomies are compiled once. What differs between their models is kept and written
 into the model of the first, and everything that was bound to that stays bound.
@@ -109,7 +109,7 @@ def _differences(
     host: mujoco.MjModel, model: mujoco.MjModel, scene: Scene, first: Scene
 ) -> Fields:
     """What of a model differs from the host, and its statistics."""
-    names = f"{scene.anatomy.name!r} cannot take turns with {first.anatomy.name!r}"
+    names = f"{scene.anatomy.name!r} cannot share a model with {first.anatomy.name!r}"
     fields: Fields = {}
     for name in dir(host):
         room, value = getattr(host, name), getattr(model, name)

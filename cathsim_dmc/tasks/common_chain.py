@@ -5,6 +5,8 @@ A task simulates what can leave the sheath. Observations show a device of
 straight and moves with its base.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from cathsim_dmc.compiled import compiled
@@ -16,6 +18,14 @@ from cathsim_dmc.tasks.placement import COMMON_LENGTH
 # Distances of the tracked points from the head, m. They are joints of the steerable
 # device, whose links are 7 mm long in the tip and 16.9 mm in the shaft.
 TRACKED_PLACES = np.array([120.625, 86.875, 63.0, 49.0, 42.0, 28.0, 14.0, 0.0]) * 1e-3
+
+
+class LinkState(NamedTuple):
+    """Inertia (N, L, 10), velocity and force (N, L, 6) of links."""
+
+    inertia: np.ndarray
+    velocity: np.ndarray
+    force: np.ndarray
 
 
 class CommonChain:
@@ -62,7 +72,7 @@ class CommonChain:
         taken[..., self._missing] = 0.0
         return taken
 
-    def links(self, state: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def links(self, state: Readings) -> LinkState:
         """Inertia (N, L, 10), velocity and force (N, L, 6) of the links shown.
 
         They are MuJoCo's `cinert`, `cvel` and `cfrc_ext`, about the centre of mass of
@@ -72,14 +82,13 @@ class CommonChain:
         Args:
             state: readings of N simulations.
         """
-        arrays = state.com_inertia, state.com_velocity, state.external_force
+        arrays = LinkState(state.com_inertia, state.com_velocity, state.external_force)
         if not self._behind:
-            inertia, velocity, force = (a[:, -self.num_links :] for a in arrays)
-            return inertia, velocity, force
+            return LinkState._make(a[:, -self.num_links :] for a in arrays)
         shape = len(state.com_inertia), self.num_links
         inertia, velocity, force = (np.zeros((*shape, width)) for width in (10, 6, 6))
-        found = inertia, velocity, force
-        _continued(*arrays, state.centreline, self._behind, *found)
+        found = LinkState(inertia, velocity, force)
+        _continued(arrays, state.centreline, self._behind, found)
         return found
 
     def tracked(self, line: np.ndarray) -> np.ndarray:
@@ -89,8 +98,10 @@ class CommonChain:
 
 
 @compiled
-def _continued(inertia, velocity, force, line, behind, inertias, velocities, forces):
-    """Writes inertia, velocity and force of all links, see `CommonChain.links`."""
+def _continued(simulated_links, line, behind, out):
+    """Writes the state of all links, see `CommonChain.links`."""
+    inertia, velocity, force = simulated_links
+    inertias, velocities, forces = out
     count, simulated = inertia.shape[:2]
     back, shift = np.zeros(3), np.zeros(3)
     for i in range(count):

@@ -27,7 +27,7 @@ from cathsim_dmc.tasks.cameras import CameraOptions
 
 MAX_STEPS = 2000  # published
 WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
-_FRICTION = (0.0, 2.0)  # Coulomb coefficient
+_FRICTION = (0.0, 2.0, "")  # Coulomb coefficient
 # Least and largest numbers. A link is longer than its radius and shorter than the
 # diameter of a large vessel.
 _NUMBERS = {
@@ -162,10 +162,12 @@ class NavigationConfig:
                 )
 
     def _check_numbers(self):
-        for name, limits in _NUMBERS.items():
-            value = getattr(self, name)
-            if value is not None or getattr(type(self), name) is not None:
-                bounds.number(name, value, *limits)
+        required = {
+            name: limits
+            for name, limits in _NUMBERS.items()
+            if getattr(self, name) is not None or getattr(type(self), name) is not None
+        }
+        bounds.fields(self, required)
         bounds.switch("rotation", self.rotation)
         bounds.switch("give_up", self.give_up)
         bounds.whole("max_steps", self.max_steps, 1, bounds.MOST_STEPS)
@@ -199,7 +201,7 @@ class NavigationConfig:
                     f"N·m², but the physics holds up to {_STIFFEST:g} N·m²"
                 )
         if faults and not self.outside_range:
-            raise ValueError(f"{faults[0]}; outside_range=True takes it with a warning")
+            raise ValueError(f"{faults[0]}; outside_range=True overrides this check")
         for fault in faults:
             warnings.warn(fault, stacklevel=4)
 

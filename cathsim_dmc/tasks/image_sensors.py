@@ -87,8 +87,10 @@ class ImageSensors:
                 # The roadmaps show the vessel at rest.
                 resting = [self.planes[index] for index in rows]
                 marked = angiographs.pixels(resting, points[-1][rows, None])[:, :, 0]
-                given = resting, image, marked, handles[rows], rows, begins, last[rows]
-                for key, value in self.sight.see(*given).items():
+                seen = self.sight.see(
+                    resting, image, marked, handles[rows], rows, begins, last[rows]
+                )
+                for key, value in seen.items():
                     if key != "place" or self._wants("biplane_retry"):
                         self.hold(f"biplane_{key}", value, rows)
         if self._wants("segmentation"):

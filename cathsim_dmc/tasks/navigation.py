@@ -115,8 +115,9 @@ class Navigation(composer.Task):
 
     def make_rollout(self, model: mujoco.MjModel, stepper: Stepper) -> Rollout:
         """The course of the task's episodes; see `Rollout`."""
-        own = self._scene, self._objective, model, self.config
-        chosen = self._cases or [cases.Case(*own)]
+        chosen = self._cases or [
+            cases.Case(self._scene, self._objective, model, self.config)
+        ]
         return Rollout(chosen, self.config, model, stepper, self.observation_specs)
 
     @property

@@ -138,7 +138,7 @@ class Progress:
             return
         if self._of_images:
             place = Place(
-                *(images[f"biplane_{n}"][:, 0] for n in ("place", "deviation"))
+                images["biplane_place"][:, 0], images["biplane_deviation"][:, 0]
             )
         else:
             last = self.steady(rows, begins)
@@ -146,9 +146,11 @@ class Progress:
         if begins:
             self._begin(rows, chosen, place, state.insertion)
         else:
-            seen = place, state.insertion, state.push_force
             narrow = self._narrow(chosen, place)
-            self.memory = retry.advance(self.settings, self.memory, *seen, narrow)
+            self.memory = retry.advance(
+                self.settings, self.memory, place,
+                state.insertion, state.push_force, narrow,
+            )  # fmt: skip
 
     def restart(self, rows: np.ndarray, chosen: np.ndarray, state: Readings) -> None:
         """Begins a memory that is no part of the task, where heads are put elsewhere.
@@ -172,7 +174,7 @@ class Progress:
         begun = np.zeros(self._count, bool)
         begun[rows] = True
         pairs = zip(self.memory, new, strict=True)
-        self.memory = Memory(*(np.where(begun, b, a) for a, b in pairs))
+        self.memory = Memory._make(np.where(begun, b, a) for a, b in pairs)
 
     def _narrow(self, chosen: np.ndarray, place: Place) -> np.ndarray:
         """(N,) bool, whether the lumen ahead is narrower than the device."""
@@ -216,5 +218,7 @@ class Progress:
         """What policies see of the memory, see `retry.shown`; None if nothing."""
         if not self.shown or self.memory is None:
             return None
-        own = state.insertion, state.push_force, self._coaxial
-        return retry.shown(self.settings, self.memory, *own)
+        return retry.shown(
+            self.settings, self.memory,
+            state.insertion, state.push_force, self._coaxial,
+        )  # fmt: skip

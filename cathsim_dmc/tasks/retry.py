@@ -53,7 +53,7 @@ class RetrySettings:
         backoff: way back of the first retry, m.
         backoff_growth: of the way back from each retry to the next, up to the fourth.
         longest: control steps after which a withdrawal ends inside the tube.
-        slack: what the base may advance while the head does not, m.
+        slack: Buckling threshold: advance of the base without the head, m.
         give: distance that the head may move back while slack is taken up, m.
         thorough: every n-th retry withdraws the whole way, not the slack alone.
         lookahead_factors: of the look-ahead in successive attempts, over and over.

@@ -118,8 +118,9 @@ class Rollout(Restorable):
         self.progress = Progress(self._names, cases, count, config.give_up)
         self._chain = CommonChain(scene.catheter, config.shaft_link)
         self._sensors = ImageSensors(self._names, cases[0], count, self._chain)
-        own = self._names, self.index.geoms, scene.catheter.coaxial
-        self._cameras = cameras.opened(model, config.cameras, *own)
+        self._cameras = cameras.opened(
+            model, config.cameras, self._names, self.index.geoms, scene.catheter.coaxial
+        )
         self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
@@ -186,8 +187,8 @@ class Rollout(Restorable):
         self._layout.begin(index)
         for effect in self.effects:
             effect.restart(index, episode, random_state)
-        gain, kerma = episode.gain, episode.kerma
-        self.deviations[index] = Deviation(*episode.view, gain=gain, kerma=kerma)
+        (primary, secondary), kerma = episode.view, episode.kerma
+        self.deviations[index] = Deviation(primary, secondary, episode.gain, kerma)
         self._place_machine(index)
         self._goal_shift[index] = episode.goal_shift or 0.0
 
@@ -266,8 +267,10 @@ class Rollout(Restorable):
         before, everyone = self.resting.head, np.arange(len(self.steps))
         self._measure(force, everyone)
         self._way = self._way + straight(before, self.resting.head)
-        old, where = self._errors, (self.case, self.steps, self.resting.centreline)
-        self._errors = physics_errors.found(*where, warned, force.peak_max)
+        old, nodes = self._errors, self.resting.centreline
+        self._errors = physics_errors.found(
+            self.case, self.steps, nodes, warned, force.peak_max
+        )
         for error, last, steps in zip(self._errors, old, self.steps, strict=True):
             if error is not None and last is None:
                 _LOG.error("%s after %d steps", error, steps)
@@ -297,14 +300,12 @@ class Rollout(Restorable):
 
     def _step(self, rows: np.ndarray, begins: bool = False) -> Step:
         """Judges and observes; captures images of all, or of those that have begun."""
-        actions = self._action, self._previous_action
         distance = straight(self.resting.head, self.resting_goal)
         failed = np.array([error is not None for error in self._errors])
-        outcome = judge(
-            self.objectives,
-            Measurement(self.resting, self.wall_force, *actions, distance),
-            failed if failed.any() else None,
+        measured = Measurement(
+            self.resting, self.wall_force, self._action, self._previous_action, distance
         )
+        outcome = judge(self.objectives, measured, failed if failed.any() else None)
         observation = self._observe(rows, begins)
         ended = outcome.success | failed | self.progress.given_up
         ended = ended & (not begins) & (self.steps > 0)
@@ -329,17 +330,19 @@ class Rollout(Restorable):
             ends = ends.reshape(len(goal), -1, 3)
             points = state.centreline, ends, goal
             handles = self.index.handles(self._state.cdof)
-            own = points, self.shadows, handles, random, self.around
-            sensors.capture(rows, begins, *own, self.progress.steady(rows, begins))
+            last = self.progress.steady(rows, begins)
+            sensors.capture(
+                rows, begins, points, self.shadows, handles, random, self.around, last
+            )
         for name, view in self._views(rows).items() if len(rows) else ():
             sensors.hold(name, view, rows)
         seen = self._at_rest(state) if self._tracking.deviation else self.resting
         self.progress.see(rows, begins, self._case_of, seen, sensors.images)
         ahead = self.progress.ahead(self._case_of, seen, devices)
         frame = Frame(
-            *(state, self.wall_force, self._action, goal, self._chain, sensors.images),
-            *(ahead, devices, self.vessel, self.progress.seen(state)),
-        )
+            state, self.wall_force, self._action, goal, self._chain, sensors.images,
+            ahead, devices, self.vessel, self.progress.seen(state),
+        )  # fmt: skip
         return observations.observe(self._names, frame)
 
     def _views(self, indices: np.ndarray) -> dict[str, np.ndarray]:

@@ -142,7 +142,7 @@ class Snapshot:
     ) -> "Snapshot":
         """The snapshot in what `read_arrays` has read; ValueError if there is none."""
         text = f"{path} holds no snapshot"
-        with files.refused(ValueError, text, KeyError, TypeError, AttributeError):
+        with files.refused(ValueError, text, (KeyError, TypeError, AttributeError)):
             counts = {array.shape[:1] for array in arrays.values()}
             if len(counts) != 1 or not min(counts)[0]:
                 raise TypeError("its arrays are of different numbers of simulations")
@@ -181,7 +181,7 @@ def read_arrays(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """What describes the arrays of a file, and they; ValueError if it is another."""
     wrong = ValueError, KeyError, TypeError, RecursionError
-    with files.refused(ValueError, f"{path} is no file of a {kind}", *wrong):
+    with files.refused(ValueError, f"{path} is no file of a {kind}", wrong):
         held = files.read_arrays(path)
         if any(array.dtype.kind not in _KINDS for array in held.values()):
             raise ValueError("it holds something other than numbers and texts")

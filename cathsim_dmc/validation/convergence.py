@@ -116,7 +116,11 @@ def study(script: Script, parameter: str, values: Sequence[float]) -> dict[str, 
 def studies() -> list[dict[str, Any]]:
     """Studies of both parameters for each script."""
     resolutions = {"physics_timestep": TIMESTEPS, "shaft_link": SHAFT_LINKS}
-    return [study(script, *each) for script in SCRIPTS for each in resolutions.items()]
+    return [
+        study(script, name, values)
+        for script in SCRIPTS
+        for name, values in resolutions.items()
+    ]
 
 
 def checks(results: Sequence[dict[str, Any]]) -> Iterator[Check]:
@@ -133,5 +137,5 @@ def checks(results: Sequence[dict[str, Any]]) -> Iterator[Check]:
         yield Check.at_most(away, path, PATH_BOUND, "mm", note)
         reference = one["force_mean"][0]
         if reference > LEAST_FORCE:
-            both = 1e3 * force, 1e3 * reference
-            yield Check.deviation(f"{name}wall force", *both, FORCE_BOUND, "mN")
+            what, expected = f"{name}wall force", 1e3 * reference
+            yield Check.deviation(what, 1e3 * force, expected, FORCE_BOUND, "mN")

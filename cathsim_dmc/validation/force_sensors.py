@@ -94,8 +94,9 @@ def dead_end(command: float, size: tuple[float, float] = GUIDING_TUBE) -> DeadEn
         pressed = task.rollout.index.contacts(data.sensordata).force[:, 2].sum()
         rim = _axial_force_on(model, data, sheath)
         rows.append((reading.push_force, reading.load_cell[2], pressed, rim))
-    means = np.mean(rows, axis=0).tolist()
-    return DeadEnd(push, *means, ripple=float(np.std(rows, axis=0)[0]))
+    base, cell, pressed, rim = np.mean(rows, axis=0).tolist()
+    ripple = float(np.std(rows, axis=0)[0])
+    return DeadEnd(push, base, cell, pressed, rim, ripple=ripple)
 
 
 def _axial_force_on(model, data, sheath: np.ndarray) -> float:

@@ -119,8 +119,8 @@ class Capstan(NamedTuple):
         name = f"capstan, friction {self.friction:g} over {angle:.0f}°"
         note = f"friction {self.acting:.4f} acts, ratio {self.mean:.4f}, "
         note += f"{self.free:.4f} without friction, expected {self.expected:.4f}"
-        both = self.acting, self.friction
-        return Check.deviation(name, *both, CAPSTAN_BOUND, "", note)
+        expected, bound = self.friction, CAPSTAN_BOUND
+        return Check.deviation(name, self.acting, expected, bound, "", note)
 
 
 def capstan(friction: float, wrap: float = np.pi) -> Capstan:
@@ -134,8 +134,8 @@ def capstan(friction: float, wrap: float = np.pi) -> Capstan:
         RuntimeError: if the rod sticks to the drum.
     """
     (angle, travel, ratio), (_, way, free) = _pulled(friction, wrap), _pulled(0.0, wrap)
-    means = float(ratio[travel > _LEAD].mean()), float(free[way > _LEAD].mean())
-    return Capstan(friction, angle, *means, travel, ratio)
+    mean, without = float(ratio[travel > _LEAD].mean()), float(free[way > _LEAD].mean())
+    return Capstan(friction, angle, mean, without, travel, ratio)
 
 
 def _pulled(
@@ -206,5 +206,5 @@ def checks(pulled: list[Capstan]) -> Iterator[Check]:
         yield Check.at_most(f"{name}creep", 1e3 * creep(device), CREEP_BOUND, "mm/s")
     name = f"device drawn round an arch under {TENSION:g} N: ripple of the force"
     yield Check.at_most(name, 100 * arch_ripple(), ARCH_RIPPLE, "%")
-    pulled.extend(capstan(*case) for case in CAPSTANS)
+    pulled.extend(capstan(friction, wrap) for friction, wrap in CAPSTANS)
     yield from (one.check() for one in pulled)

@@ -157,9 +157,9 @@ def section_flow(anatomy: Anatomy, time: float) -> float:
     area = np.cross(along, around) / (4 * step * turn[..., None])
     points = there(radius, angle)[0].reshape(-1, 3)
     out = np.zeros((len(points), 8))
-    vessels = anatomy.circulation.arrays
+    vessels = anatomy.circulation.segments
     now = course_of(course, time)
-    moving_velocities(anatomy.motion.lattice, now, points, *vessels, out)
+    moving_velocities(anatomy.motion.lattice, now, points, vessels, out)
     through = (out[:, :3].reshape(area.shape) * area).sum(axis=-1)
     return float((through * weights).sum() * grown / 2 * 2 * np.pi / len(radius))
 

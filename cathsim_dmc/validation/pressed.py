@@ -1,7 +1,6 @@
 """Devices pressed on a wall and pushed along it: rest, contacts, repeated steps."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -126,10 +125,11 @@ def push_checks() -> Iterator[Check]:
         each = f"{contacts / max(links, 1):.2f} contacts for each link that has one"
         deep = 1e3 * np.concatenate(depth)
         usual = f"99th percentile {np.percentile(deep[deep > 0.0], 99):.3f} mm"
-        rows: dict[str, Any] = {
-            "control steps done again": (again, REPEATED, "%", each),
-            "deepest penetration": (deep.max(), DEEPEST, "mm", usual),
-            "largest contact": (force, HARDEST, "N"),
-        }
-        for what, row in rows.items():
-            yield Check.at_most(f"{task}, full push: {what}", *row)
+        name = f"{task}, full push: "
+        yield Check.at_most(
+            f"{name}control steps done again", again, REPEATED, "%", each
+        )
+        yield Check.at_most(
+            f"{name}deepest penetration", deep.max(), DEEPEST, "mm", usual
+        )
+        yield Check.at_most(f"{name}largest contact", force, HARDEST, "N")

@@ -58,6 +58,20 @@ def effective_count(samples: np.ndarray) -> float:
     return float(max(1.0, n / (1 + 2 * correlation[1:stop].sum())))
 
 
+def _enough(samples: np.ndarray) -> np.ndarray:
+    """Samples (n,) as float64; ValueError if there are too few, or one is NaN."""
+    samples = np.asarray(samples, dtype=np.float64)
+    if samples.ndim != 1 or len(samples) < _LEAST_SAMPLES:
+        raise ValueError(
+            f"force samples of shape {samples.shape} are too few for statistics; give "
+            f"{_LEAST_SAMPLES} or more, of an episode in which the device touches the "
+            "wall"
+        )
+    if not np.isfinite(samples).all():
+        raise ValueError("force samples hold NaN or infinite entries; leave them out")
+    return samples
+
+
 def compare(
     samples: np.ndarray,
     reference_mean: float = REFERENCE_MEAN,
@@ -86,15 +100,7 @@ def compare(
         ValueError: if there are too few samples, one is not finite, or a number is
             not positive.
     """
-    samples = np.asarray(samples, dtype=np.float64)
-    if samples.ndim != 1 or len(samples) < _LEAST_SAMPLES:
-        raise ValueError(
-            f"force samples of shape {samples.shape} are too few for statistics; give "
-            f"{_LEAST_SAMPLES} or more, of an episode in which the device touches the "
-            "wall"
-        )
-    if not np.isfinite(samples).all():
-        raise ValueError("force samples hold NaN or infinite entries; leave them out")
+    samples = _enough(samples)
     bounds.number("reference_mean", reference_mean, low=0.0)
     for name, value in (("reference_sd", reference_sd), ("margin", margin)):
         bounds.number(name, value, positive=True)
@@ -105,13 +111,13 @@ def compare(
     ranks = stats.mannwhitneyu(samples, reference, alternative="two-sided")
     mean, sd = float(samples.mean()), float(samples.std(ddof=1))
     independent = effective_count(samples)
-    theirs = sd, independent, reference_mean, reference_sd, count
     sides = [
         stats.ttest_ind_from_stats(
-            mean + shift, *theirs, equal_var=False, alternative=side
+            mean + shift, sd, independent, reference_mean, reference_sd, count,
+            equal_var=False, alternative=side,
         )
         for shift, side in ((margin, "greater"), (-margin, "less"))
-    ]
+    ]  # fmt: skip
     p_value = float(max(side.pvalue for side in sides))
     return {
         "count": count,

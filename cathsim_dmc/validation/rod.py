@@ -107,8 +107,8 @@ class Buckling(NamedTuple):
         name = f"{name}, clamped - guided, guide {self.end}"
         note = f"{1e3 * self.critical:.2f} mN, Euler {1e3 * self.expected:.2f} mN "
         note += f"over {1e3 * self.length:.0f} mm"
-        loads = self.critical, self.expected
-        return Check.deviation(name, *loads, BUCKLING_BOUND, "N", note)
+        found, expected = self.critical, self.expected
+        return Check.deviation(name, found, expected, BUCKLING_BOUND, "N", note)
 
 
 def buckling(

@@ -1,4 +1,4 @@
-"""The vessel against closed forms: blood that flows, a wall that gives and moves."""
+"""Flow, compliant wall and moving wall against closed forms."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -117,7 +117,7 @@ def profile() -> tuple[float, float]:
     r = radius * (places + 1) / 2
     points = np.stack([r, 0 * r, 0.1 + 0 * r], axis=-1)
     out = np.empty((len(r), 5))
-    velocities(points, np.zeros(len(r)), *circulation.arrays, out)
+    velocities(points, np.zeros(len(r)), circulation.segments, out)
     mean, n = 1 / (np.pi * radius**2), EXPONENT
     expected = mean * (n + 2) / n * (1 - (r / radius) ** n)
     flow = (out[:, 2] * 2 * np.pi * r * weights).sum() * radius / 2
@@ -164,7 +164,7 @@ def stiffened(factor: float) -> float:
         for _ in range(50):
             batch.step(action)
         found.append(batch.batch.qpos.copy())
-    return float(np.abs(np.subtract(*found)).max())
+    return float(np.abs(found[0] - found[1]).max())
 
 
 def _checks() -> Iterator[Check]:

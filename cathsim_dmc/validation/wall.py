@@ -99,7 +99,7 @@ def validate_wall() -> Report:
     studies = convergence.studies()
     pulled: list[friction.Capstan] = []
     checks = itertools.chain(
-        *map(lumen_checks, anatomies),
+        itertools.chain.from_iterable(map(lumen_checks, anatomies)),
         friction.checks(pulled),
         s_bend.checks(),
         pressed.push_checks(),

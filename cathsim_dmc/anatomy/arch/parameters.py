@@ -69,8 +69,7 @@ class BranchParameters:
     second_bend_azimuth: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, limits in _OF_BRANCH.items():
-            bounds.number(f"branch {name}", getattr(self, name), *limits)
+        bounds.fields(self, _OF_BRANCH, "branch ")
         for name in ("bend_radius", "second_bend_radius"):
             if getattr(self, name) is not None or name == "bend_radius":
                 least = 3.0 * self.radius
@@ -142,8 +141,7 @@ class ArchParameters:
             if getattr(self, name) is not None or name != "aberrant":
                 bounds.instance(name, getattr(self, name), BranchParameters)
         bounds.switch("bovine", self.bovine)
-        for name, limits in _OF_ARCH.items():
-            bounds.number(name, getattr(self, name), *limits)
+        bounds.fields(self, _OF_ARCH)
         self._check_bends()
         self._check_spacings()
 

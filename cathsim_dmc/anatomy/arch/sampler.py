@@ -79,10 +79,10 @@ def sample(
     bounds.choice("variant", variant, VARIANTS)
     for _ in range(_ATTEMPTS):
         # Independent draws now and then give branches that cross: draw again.
-        drop = random_state.uniform(*DROP_RANGES[arch_type])
+        drop = _uniform(random_state, DROP_RANGES[arch_type])
         try:
             params = _draw(random_state, drop, variant)
-            length = _normal(random_state, *ASCENDING_LENGTH)
+            length = _normal(random_state, ASCENDING_LENGTH)
             params = _corrected(params, drop, length)
         except ValueError:
             continue
@@ -97,7 +97,13 @@ def kind_at(share: float) -> str:
     return list(DROP_RANGES)[min(int(place), 2)]
 
 
-def _normal(source: Random, mean: float = 0.0, deviation: float = 1.0) -> float:
+def _uniform(source: Random, ends: tuple[float, float]) -> float:
+    return source.uniform(ends[0], ends[1])
+
+
+def _normal(source: Random, spread: tuple[float, float] = (0.0, 1.0)) -> float:
+    """A draw of a mean and deviation, cut off at `_CUT` deviations."""
+    mean, deviation = spread
     # Again, not clipped, or the bounds would be likely values.
     while True:
         z = float(source.normal())
@@ -143,7 +149,7 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
     aberrant = None
     if variant == "aberrant":
         # The first branch is the right carotid, as wide as the left one.
-        radius = 0.5 * _normal(source, *BRANCH_DIAMETERS["lcca"])
+        radius = 0.5 * _normal(source, BRANCH_DIAMETERS["lcca"])
         branches["bca"] = replace(
             branches["bca"], radius=radius, end_radius=min(radius, 3.15e-3)
         )
@@ -167,23 +173,23 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
             along = max(source.uniform(10e-3, 18e-3), least)
         both = sum(spacings.values())
         spacings = {"bca_lcca_spacing": along, "lcca_lsa_spacing": both}
-    arch_radius = _normal(source, *_ARCH_RADIUS)
+    arch_radius = _normal(source, _ARCH_RADIUS)
     last = aberrant.radius if aberrant else 0.0
     return ArchParameters(
         **branches,
         **aorta,
         ascending_length=40e-3,  # corrected to the drawn length up to the BCA
-        descending_length=source.uniform(*_DESCENDING_LENGTH),
+        descending_length=_uniform(source, _DESCENDING_LENGTH),
         arch_radius=arch_radius,
-        arch_height=arch_radius * source.uniform(*_ARCH_ASPECT),
-        plane_rotation=math.radians(_normal(source, *PLANE_ROTATION)),
+        arch_height=arch_radius * _uniform(source, _ARCH_ASPECT),
+        plane_rotation=math.radians(_normal(source, PLANE_ROTATION)),
         bca_drop=drop,
         bovine=variant.startswith("bovine"),
-        ascending_bend=max(0.0, math.radians(_normal(source, *ASCENDING_BEND))),
-        descending_bend=math.radians(_normal(source, *_DESCENDING_BEND)),
-        plane_tilt=math.radians(_normal(source, *_PLANE_TILT)),
-        bow=_normal(source, *_BOW),
-        sway=_normal(source, *_SWAY),
+        ascending_bend=max(0.0, math.radians(_normal(source, ASCENDING_BEND))),
+        descending_bend=math.radians(_normal(source, _DESCENDING_BEND)),
+        plane_tilt=math.radians(_normal(source, _PLANE_TILT)),
+        bow=_normal(source, _BOW),
+        sway=_normal(source, _SWAY),
         aberrant=aberrant,
         lsa_aberrant_spacing=radii["lsa"] + last + source.uniform(2e-3, 6e-3),
         **spacings,
@@ -191,7 +197,7 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
 
 
 def _branch(source: Random, name: str) -> BranchParameters:
-    radius = 0.5 * _normal(source, *BRANCH_DIAMETERS[name])
+    radius = 0.5 * _normal(source, BRANCH_DIAMETERS[name])
     # Taper: the LCCA narrows to a mid common carotid of 6.3 mm, others by a tenth.
     end = min(radius, 3.15e-3) if name == "lcca" else 0.9 * radius
     # Downstream at first for those that lean upstream, and back for the LSA.
@@ -201,14 +207,14 @@ def _branch(source: Random, name: str) -> BranchParameters:
     return BranchParameters(
         radius=radius,
         end_radius=end,
-        take_off=math.radians(_normal(source, *TAKE_OFFS[name])),
+        take_off=math.radians(_normal(source, TAKE_OFFS[name])),
         length=source.uniform(45e-3, 55e-3),
-        bend_radius=source.uniform(*bends),
+        bend_radius=_uniform(source, bends),
         bend_azimuth=towards + turn,
-        lean=math.radians(_normal(source, *_LEAN)),
-        second_bend_radius=source.uniform(*bends),
+        lean=math.radians(_normal(source, _LEAN)),
+        second_bend_radius=_uniform(source, bends),
         # Most turn back, as arteries that go up the neck do.
         second_bend_azimuth=math.remainder(
-            towards + turn + math.pi + _normal(source, 0.0, 0.8), 2.0 * math.pi
+            towards + turn + math.pi + _normal(source, (0.0, 0.8)), 2.0 * math.pi
         ),
     )

@@ -104,6 +104,6 @@ def _smoothed(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 
 def _gauss(points: np.ndarray, sigma: float) -> np.ndarray:
-    """Twice smoothed less smoothed twice: keeps bends up to their third derivative."""
+    """Bias-corrected Gaussian smoothing; keeps bends up to their third derivative."""
     once = gaussian_filter1d(points, sigma, axis=0, mode="nearest")
     return 2.0 * once - gaussian_filter1d(once, sigma, axis=0, mode="nearest")

@@ -222,7 +222,7 @@ def centrelines(
             todo.append(way)
     todo.sort(key=lambda way: -float(ways.depth[way].sum()))
     # Rings last: what they share with a branch that has an end is that branch's.
-    closed = (round_ring(cover, *pair) for pair in rings(ways, before))
+    closed = (round_ring(cover, one, other) for one, other in rings(ways, before))
     found = []
     for way in chain(todo, closed):
         own = cover.own_part(way[::-1])[::-1]

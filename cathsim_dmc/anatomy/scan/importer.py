@@ -21,13 +21,12 @@ from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.curves import inside_part, read_curves
 from cathsim_dmc.anatomy.scan.extract import listed
 from cathsim_dmc.anatomy.scan.left_out import left_out, said
-from cathsim_dmc.anatomy.scan.lumen import read_lumen
+from cathsim_dmc.anatomy.scan.lumen import Lumen, read_lumen
 from cathsim_dmc.anatomy.scan.naming import ROOT, TRUNK, VESSEL_NAME, Naming
 from cathsim_dmc.anatomy.scan.places import (
-    cut_open,
     flat_ends,
+    opened_at_inlet,
     place_goals,
-    place_inlet,
     resized,
 )
 from cathsim_dmc.anatomy.scan.tree import grow_tree, name_trunk, with_root
@@ -36,7 +35,6 @@ from cathsim_dmc.anatomy.scan.ways import DEVICE_RADIUS, Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
-SHARES = (1.0, 0.6, 0.3)  # of a blind end that are tried to be cut off at the inlet
 
 
 class Calibre(Protocol):
@@ -116,14 +114,62 @@ def import_scan(
             does not agree with the surface; says how to mend it.
     """
     started = time.monotonic()
-    notes = [] if notes is None else notes
-    say = progress or (lambda text: None)
+    told = _Told([] if notes is None else notes, progress or (lambda text: None))
+    given, changes = _checked(inlet, heart, rename, device)
+    # Refused before the long steps; read again when the unit is known.
+    read_curves(centreline_paths, units or "mm", mesh_frame, axes)
+    lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, told.say)
+    told.notes.extend(lumen.notes)
+    frame = FileFrame(lumen.units, to_lps(lumen.units, mesh_frame, axes))
+    curves = read_curves(centreline_paths, lumen.units, mesh_frame, axes)
+    wishes = _Wishes(given, curves, changes, device, axes)
+    parts, bore = _grown(lumen, frame, wishes, told)
+    anatomy = _anatomy(name or Path(mesh_path).name.split(".")[0], parts, bore, told)
+    told.say(
+        f"done in {time.monotonic() - started:.0f} s, "
+        f"goals {', '.join(anatomy.goals) or 'none'}"
+    )
+    return anatomy
 
-    def note(*texts: str) -> None:
-        notes.extend(texts)
-        for text in texts:
-            say(f"note: {text}")
 
+class _Told(NamedTuple):
+    """Where an import says what it does and guesses."""
+
+    notes: list[str]
+    say: Callable[[str], None]
+
+    def note(self, text: str) -> None:
+        """Says and keeps what was guessed, mended or left out."""
+        self.notes.append(text)
+        self.say(f"note: {text}")
+
+
+class _Wishes(NamedTuple):
+    """What the user gives: places and curves in the file's frame, names, device."""
+
+    places: dict[str, np.ndarray]
+    curves: dict[str, np.ndarray]
+    changes: Mapping[str, str]
+    device: Calibre | None
+    axes: str | ArrayLike | None
+
+
+class _Parts(NamedTuple):
+    """A tree cut open at its inlet, and the frame of the file."""
+
+    tree: VesselTree
+    opening: Inlet
+    surface: Surface
+    frame: FileFrame
+
+
+def _checked(
+    inlet: Sequence[float] | None,
+    heart: Sequence[float] | None,
+    rename: Mapping[str, str] | None,
+    device: Calibre | None,
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Places (3,) that are given, and new names, or ValueError."""
     given = {
         key: np.array(bounds.vector(key, place, 3))
         for key, place in {"inlet": inlet, "heart": heart}.items()
@@ -134,65 +180,68 @@ def import_scan(
         bounds.refuse("rename", rename, "names of small letters, digits and '_'")
     if device is not None:
         bounds.number("device radius", device.outer_radius, positive=True)
-    # Refused before the long steps; read again when the unit is known.
-    read_curves(centreline_paths, units or "mm", mesh_frame, axes)
-    lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, say)
-    notes.extend(lumen.notes)
+    return given, changes
+
+
+def _grown(
+    lumen: Lumen, frame: FileFrame, wishes: _Wishes, told: _Told
+) -> tuple[_Parts, Calibre]:
+    """The tree of a lumen, cut open, and the device that passes it."""
     # Enlarged if it is small, so that every length of the import suits it.
-    scale, surface = lumen.scale, lumen.surface
+    scale, surface, matrix = lumen.scale, lumen.surface, frame.to_lps
     if scale != 1.0:
         surface = Surface(scale * surface.vertices, surface.faces)
     measure = SurfaceDepth(surface)
-    matrix = to_lps(lumen.units, mesh_frame, axes)
-    curves = read_curves(centreline_paths, lumen.units, mesh_frame, axes)
-    say(f"tree: looking for vessels in {len(surface.faces):,} triangles")
+    told.say(f"tree: looking for vessels in {len(surface.faces):,} triangles")
     with file_frame(matrix, lumen.units, scale):
         middle = shown(surface.vertices.mean(axis=0))
         places = {
             k: _placed(k, scale * (matrix @ x), measure, middle)
-            for k, x in given.items()
+            for k, x in wishes.places.items()
         }
+        curves = wishes.curves
         curves = {k: inside_part(k, scale * c, measure) for k, c in curves.items()}
-        grown = _Growth(measure, scale, device, places, changes, note)
-        tree, at_end, arch = grown.tree(curves)
-        turn = None if axes is None else upright(axes)
-        note(*filter(None, [unproven(tree, turn) if arch else None]))
-        opened = resized(*_opened(tree, at_end, surface), 1.0 / scale)
-    name = name or Path(mesh_path).name.split(".")[0]
-    with file_frame(matrix, lumen.units):
-        frame = FileFrame(lumen.units, matrix)
-        anatomy = _anatomy(name, opened, grown.device, frame, say, note)
-    seconds = time.monotonic() - started
-    say(f"done in {seconds:.0f} s, goals {', '.join(anatomy.goals) or 'none'}")
-    return anatomy
-
-
-def _anatomy(name, opened, device, frame, say, note) -> Anatomy:
-    """The anatomy of a tree, proved against its surface; notes goals left out."""
-    tree, opening, surface = opened
-    sizes = [
-        f"{key} {vessel.centreline.length * 1e3:.0f} mm"
-        + (f" from {vessel.parent}" if vessel.parent else "")
-        for key, vessel in tree.vessels.items()
-    ]
-    say(f"tree: {', '.join(sizes)}")
-    ends = flat_ends(tree, opening)
-    goals = place_goals(tree, device.outer_radius)
-    anatomy = Anatomy(name, tree, opening, goals, ends, surface, frame)
-    for where, missed in unreachable(anatomy).items():
-        note(
-            f"{where}, where a device starts: {', '.join(missed)} left out of the "
-            "goals; choose another inlet (--inlet) to reach them"
+        grown = _Growth(
+            measure, scale, wishes.device, places, wishes.changes, told.note
         )
-        goals = {k: goal for k, goal in anatomy.goals.items() if k not in missed}
-        anatomy = replace(anatomy, goals=goals)
-    for check, wrong in check_tree(anatomy).items():
-        if wrong:
-            raise ValueError(
-                f"the tree does not agree with the surface ({check}): {wrong}. Mend "
-                "the surface or the centrelines there, or give its frame (mesh_frame, "
-                "axes), the inlet, other names, or other centrelines."
+        tree, at_end, arch = grown.tree(curves)
+        turn = None if wishes.axes is None else upright(wishes.axes)
+        if arch and (doubt := unproven(tree, turn)):
+            told.note(doubt)
+        tree, opening, surface = opened_at_inlet(tree, at_end, surface)
+        tree, opening, surface = resized(tree, opening, surface, 1.0 / scale)
+    return _Parts(tree, opening, surface, frame), grown.device
+
+
+def _anatomy(name: str, parts: _Parts, bore: Calibre, told: _Told) -> Anatomy:
+    """The anatomy of a tree, proved against its surface; notes goals left out."""
+    with file_frame(parts.frame.to_lps, parts.frame.unit):
+        tree = parts.tree
+        sizes = [
+            f"{key} {vessel.centreline.length * 1e3:.0f} mm"
+            + (f" from {vessel.parent}" if vessel.parent else "")
+            for key, vessel in tree.vessels.items()
+        ]
+        told.say(f"tree: {', '.join(sizes)}")
+        ends = flat_ends(tree, parts.opening)
+        goals = place_goals(tree, bore.outer_radius)
+        anatomy = Anatomy(
+            name, tree, parts.opening, goals, ends, parts.surface, parts.frame
+        )
+        for where, missed in unreachable(anatomy).items():
+            told.note(
+                f"{where}, where a device starts: {', '.join(missed)} left out of the "
+                "goals; choose another inlet (--inlet) to reach them"
             )
+            goals = {k: goal for k, goal in anatomy.goals.items() if k not in missed}
+            anatomy = replace(anatomy, goals=goals)
+        for check, wrong in check_tree(anatomy).items():
+            if wrong:
+                raise ValueError(
+                    f"the tree does not agree with the surface ({check}): {wrong}. "
+                    "Mend the surface or the centrelines there, or give its frame "
+                    "(mesh_frame, axes), the inlet, other names, or other centrelines."
+                )
     return anatomy
 
 
@@ -241,8 +290,9 @@ class _Growth:
         elif root != ROOT:
             tree = with_root(tree, root)
         if not drawn:
-            missed = left_out(ways, tree)
-            self._note(*filter(None, [said(missed, self.device.name, ways.device)]))
+            missed = said(left_out(ways, tree), self.device.name, ways.device)
+            if missed is not None:
+                self._note(missed)
         return tree, entry.at_end, arch
 
     def _choose_device(self, entry) -> None:
@@ -291,7 +341,8 @@ class _Growth:
             names, notes, right = Naming(naming.neutral_names(known))
         else:
             names, notes, right = arch.named(known, entry.far)
-        note(*notes)
+        for text in notes:
+            note(text)
         root, *names = self._renamed([TRUNK if arch is None else ROOT, *names], known)
         end = f"{end} (--inlet takes another)" if end and "inlet" not in places else ""
         note(f"inlet chosen at {shown(entry.position)}{end}")
@@ -321,28 +372,6 @@ class _Growth:
                 "(--rename) does"
             )
         return names
-
-
-def _opened(
-    tree: VesselTree, at_end: bool, surface: Surface
-) -> tuple[VesselTree, Inlet, Surface]:
-    """The tree from its inlet on, the inlet, and the surface cut off there."""
-    # Less is cut off where the plane of the inlet would meet a branch.
-    for share in SHARES if at_end else SHARES[:1]:
-        opened, inlet = place_inlet(tree, at_end, share)
-        last = not at_end or share == SHARES[-1]
-        try:
-            points, shell, cap = cut_open(surface.vertices, surface.faces, inlet)
-        except ValueError:
-            if last:
-                raise
-            continue
-        used, numbers = np.unique(np.concatenate([shell, cap]), return_inverse=True)
-        cut = Surface(points[used], numbers.reshape(-1, 3))
-        tips = [vessel.centreline.points[-1] for vessel in opened.vessels.values()]
-        if last or (SurfaceDepth(cut)(np.array(tips)) > 0.0).all():
-            break
-    return opened, inlet, cut
 
 
 def _placed(

@@ -121,7 +121,9 @@ def name_branches(
 
 def neutral_names(curves: Sequence[np.ndarray]) -> list[str]:
     """Names of curves that leave no arch, in the order in which they part."""
-    leave = [max(0, 0, *(common(a, b) for b in curves if b is not a)) for a in curves]
+    leave = [
+        max((common(a, b) for b in curves if b is not a), default=0) for a in curves
+    ]
     order = np.argsort(np.argsort(leave, kind="stable"))
     return [f"branch_{place + 1}" for place in order]
 

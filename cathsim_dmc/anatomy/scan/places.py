@@ -10,12 +10,14 @@ from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
 from cathsim_dmc.anatomy.scan.topology import adjacent, groups
 from cathsim_dmc.anatomy.scan.units import shown
 from cathsim_dmc.anatomy.scan.ways import DEVICE_RADIUS
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 GOAL_PAST_OSTIUM = 30e-3  # m along a branch, its first goal
 GOAL_DISTAL = 0.8  # of the passable part of a branch, its second goal
 ROOT_REST = 3.0  # radii, least length of a root past its last branch that has a goal
 INLET_WIDTH = 0.8  # of the lumen near the inlet; the rest of the blind end is cut off
 INLET_SEARCH = 40e-3  # m of the root in which that width is looked for
+SHARES = (1.0, 0.6, 0.3)  # of a blind end that are tried to be cut off at the inlet
 
 
 def passable_length(vessel: Vessel, device: float = DEVICE_RADIUS) -> float:
@@ -199,3 +201,25 @@ def describe(anatomy: Anatomy, device: float = DEVICE_RADIUS) -> dict[str, Any]:
         "vessels": vessels,
         "goals": goals,
     }
+
+
+def opened_at_inlet(
+    tree: VesselTree, at_end: bool, surface: Surface
+) -> tuple[VesselTree, Inlet, Surface]:
+    """The tree from its inlet on, the inlet, and the surface cut off there."""
+    # Less is cut off where the plane of the inlet would meet a branch.
+    for share in SHARES if at_end else SHARES[:1]:
+        opened, inlet = place_inlet(tree, at_end, share)
+        last = not at_end or share == SHARES[-1]
+        try:
+            points, shell, cap = cut_open(surface.vertices, surface.faces, inlet)
+        except ValueError:
+            if last:
+                raise
+            continue
+        used, numbers = np.unique(np.concatenate([shell, cap]), return_inverse=True)
+        cut = Surface(points[used], numbers.reshape(-1, 3))
+        tips = [vessel.centreline.points[-1] for vessel in opened.vessels.values()]
+        if last or (SurfaceDepth(cut)(np.array(tips)) > 0.0).all():
+            break
+    return opened, inlet, cut

@@ -78,7 +78,7 @@ class _Work:
         inner = None
         if len(large) == 2 and not quiet:
             shells = [self.faces[label == k] for k in large]
-            inner = topology.inner_shell(self.vertices, *shells)
+            inner = topology.inner_shell(self.vertices, shells)
         if inner is not None:
             self.notes.append("thick wall: the inner of two surfaces taken")
             large = large[[inner]]

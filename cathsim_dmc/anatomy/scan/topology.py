@@ -1,7 +1,7 @@
 """Triangles and how they hang together: parts, borders, orientation, walls."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -184,7 +184,7 @@ def without_slivers(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     return faces, removed
 
 
-def inner_shell(vertices: np.ndarray, *shells: np.ndarray) -> int | None:
+def inner_shell(vertices: np.ndarray, shells: Sequence[np.ndarray]) -> int | None:
     """Which of two surfaces, faces (n, 3), lies inside the other; None if neither."""
     import igl
 
@@ -215,8 +215,8 @@ def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
 
     def enclosed(rows: np.ndarray) -> tuple[np.ndarray, bool]:
         """Share of the rays from some faces that hit, and whether many do of enough."""
-        places = middles[rows], outward[rows]
-        hits = igl.ambient_occlusion(1e3 * vertices, faces, *places, RAYS)
+        places, normals = middles[rows], outward[rows]
+        hits = igl.ambient_occlusion(1e3 * vertices, faces, places, normals, RAYS)
         inside = area[rows][hits > ENCLOSED].sum()
         return hits, bool(inside > WALL * area[rows].sum())
 

@@ -55,7 +55,8 @@ def file_frame(matrix: np.ndarray, unit: str, scale: float = 1.0) -> Iterator[No
 @contextlib.contextmanager
 def enlarged(scale: float) -> Iterator[None]:
     """As `file_frame`, of the same file, `scale` times as large."""
-    with file_frame(*_FILE.get()[:2], scale):
+    matrix, unit, _ = _FILE.get()
+    with file_frame(matrix, unit, scale):
         yield
 
 

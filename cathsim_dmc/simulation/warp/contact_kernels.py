@@ -26,116 +26,19 @@ from cathsim_dmc.laws.places import Capsule
 from cathsim_dmc.laws.planes import MOST, PLANES
 from cathsim_dmc.laws.vectors import into
 from cathsim_dmc.laws.wall import Wall, is_straight_bore
+from cathsim_dmc.simulation.warp.contact_arrays import (
+    Contacts,
+    Fields,
+    Found,
+    Links,
+    Motion,
+    Walls,
+)
 from cathsim_dmc.simulation.warp.devices import Scratch
 
 SCRATCH: Scratch = ((SAMPLES,), (PLANES, 4), (MOST, CONTACT))
 _LEAST_FRICTION = 1e-5  # MuJoCo's mjMINMU
 _CONSTRAINT = 1  # mujoco_warp's ContactType.CONSTRAINT
-
-
-class Links(NamedTuple):
-    """The links and the carriers of the compiled model.
-
-    Attributes:
-        geoms: (L,) geoms of the links.
-        joints: (L,) bodies whose origin is the joint of a link; -1 for none.
-        carriers: (C,) geoms that carry a wall.
-        last_dof: (L,) last degree of freedom that moves a link; -1 for none.
-        roots: (L,) bodies at the roots of the links' trees.
-        parents: (nv,) degree of freedom before each one; -1 for none.
-        dims: (L, C) dimensions of a contact.
-        priorities: (L, C) 1 where the carrier's parameters hold, -1 where the link's
-            do, 0 where they are mixed.
-        mix: (L, C) weight of the link's `solref` and `solimp`.
-    """
-
-    geoms: Any
-    joints: Any
-    carriers: Any
-    last_dof: Any
-    roots: Any
-    parents: Any
-    dims: Any
-    priorities: Any
-    mix: Any
-
-
-class Walls(NamedTuple):
-    """Walls of all anatomies, one after the other, and that of each world.
-
-    Attributes:
-        head, coarse, bricks, samples: As `laws.field.FieldArrays`, of all lumens.
-        line: As `laws.wall.Wall`, of all bores.
-        starts: (F, 5, 2) first and last place of wall f in each of these arrays.
-        is_bore: (F,) whether a wall is a bore.
-        middle: (F, 3) m, place of the carrier's middle in the frame of the wall.
-        of_world: (N, C) wall of a carrier in each world.
-    """
-
-    head: Any
-    coarse: Any
-    bricks: Any
-    samples: Any
-    line: Any
-    starts: Any
-    is_bore: Any
-    middle: Any
-    of_world: Any
-
-
-class Fields(NamedTuple):
-    """Fields of Warp's model, (1 or N, ...)."""
-
-    size: Any
-    friction: Any
-    solref: Any
-    solimp: Any
-    timestep: Any
-
-
-class Motion(NamedTuple):
-    """Arrays of Warp's data (N, ...) that a contact depends on."""
-
-    geom_xpos: Any
-    geom_xmat: Any
-    xpos: Any
-    cdof: Any
-    qvel: Any
-    subtree_com: Any
-
-
-class Found(NamedTuple):
-    """Contacts of all threads, before they are counted.
-
-    Attributes:
-        count: (T,) contacts of a thread.
-        rows: (T, MOST, 7) of each the distance m, the place (3) m, and the direction
-            (3) from the link into the wall.
-    """
-
-    count: Any
-    rows: Any
-
-
-class Contacts(NamedTuple):
-    """Arrays of mujoco_warp's `Contact`, and their number."""
-
-    dist: Any
-    pos: Any
-    frame: Any
-    includemargin: Any
-    friction: Any
-    solref: Any
-    solreffriction: Any
-    solimp: Any
-    dim: Any
-    geom: Any
-    efc_address: Any
-    worldid: Any
-    type: Any
-    geomcollisionid: Any
-    adhesion: Any
-    nacon: Any
 
 
 @compiled

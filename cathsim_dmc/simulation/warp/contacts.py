@@ -10,15 +10,17 @@ import numpy as np
 
 from cathsim_dmc.collision.fields import registered
 from cathsim_dmc.laws.planes import MOST
-from cathsim_dmc.simulation.warp.contact_kernels import (
-    SCRATCH,
+from cathsim_dmc.simulation.warp.contact_arrays import (
     Contacts,
     Fields,
     Found,
     Links,
     Motion,
-    Scene,
     Walls,
+)
+from cathsim_dmc.simulation.warp.contact_kernels import (
+    SCRATCH,
+    Scene,
     Written,
     find,
     is_near,

@@ -95,19 +95,17 @@ class Device:
             scratch: Shapes of arrays of float64 that each thread has for itself.
             given: Named tuple of arrays, numbers and named tuples.
         """
-        if not self.is_cuda:
-            loop = _chosen_loop if isinstance(count, Chosen) else _loop
-            loop(function)(count, tuple(map(np.zeros, scratch)), given)
-        elif isinstance(count, Chosen):
-            total = len(count.threads)
-            self._run(_chosen_kernel(function, scratch), total, (count, given))
+        picked = isinstance(count, Chosen)
+        if self.is_cuda:
+            total = len(count.threads) if picked else count
+            self._run(_kernel(function, scratch, picked), total, (count, given))
         else:
-            self._run(_kernel(function, scratch), count, (count, given))
+            _loop(function, picked)(count, tuple(map(np.zeros, scratch)), given)
 
     def select(self, test: Any, chosen: Chosen, given: Any) -> Chosen:
         """Chooses the threads in which `test(thread, given)` is true."""
         if self.is_cuda:
-            self._run(_clear_kernel(), 1, (chosen.found, 0))
+            self.launch(_forget, 1, NONE, chosen)
             self._run(_test_kernel(test), len(chosen.threads), (chosen, given))
         else:
             _test_loop(test)(chosen, given)
@@ -129,24 +127,35 @@ def _cuda() -> Any:
 # Loops and kernels refer to the function: none is kept on disk.
 
 
-@functools.cache
-def _loop(function: Any) -> Any:
-    """A compiled loop over the threads of a thread function."""
+@compiled
+def _every(count, n):
+    """The number of a thread, -1 for none."""
+    return n if n < count else -1
 
-    def loop(count, scratch, given):
-        for thread in range(count):
+
+@compiled
+def _picked(chosen, n):
+    """The number of a chosen thread, -1 for none."""
+    return chosen.threads[n] if n < chosen.found[0] else -1
+
+
+@compiled
+def _forget(thread, scratch, chosen):
+    """Chooses no thread."""
+    chosen.found[thread] = 0
+
+
+@functools.cache
+def _loop(function: Any, picked: bool) -> Any:
+    """A compiled loop over the threads of a thread function, or the chosen ones."""
+    number = _picked if picked else _every
+
+    def loop(threads, scratch, given):
+        n, thread = 0, number(threads, 0)
+        while thread >= 0:
             function(thread, scratch, given)
-
-    return compiled(loop, cache=False)
-
-
-@functools.cache
-def _chosen_loop(function: Any) -> Any:
-    """A compiled loop over the chosen threads of a thread function."""
-
-    def loop(chosen, scratch, given):
-        for n in range(chosen.found[0]):
-            function(chosen.threads[n], scratch, given)
+            n += 1
+            thread = number(threads, n)
 
     return compiled(loop, cache=False)
 
@@ -167,41 +176,22 @@ def _test_loop(test: Any) -> Any:
 
 
 @functools.cache
-def _kernel(function: Any, scratch: Scratch) -> Any:
-    """A kernel of a thread function."""
+def _kernel(function: Any, scratch: Scratch, picked: bool) -> Any:
+    """A kernel of a thread function, of all threads or the chosen ones."""
     cuda, inner = _cuda(), for_cuda(function)
+    number = for_cuda(_picked if picked else _every)
     one, two, three = scratch
 
     @cuda.jit
-    def kernel(count, given):
-        thread = cuda.grid(1)
-        if thread < count:
+    def kernel(threads, given):
+        thread = number(threads, cuda.grid(1))
+        if thread >= 0:
             own = (
                 cuda.local.array(one, np.float64),
                 cuda.local.array(two, np.float64),
                 cuda.local.array(three, np.float64),
             )
             inner(thread, own, given)
-
-    return kernel
-
-
-@functools.cache
-def _chosen_kernel(function: Any, scratch: Scratch) -> Any:
-    """A kernel of the chosen threads of a thread function."""
-    cuda, inner = _cuda(), for_cuda(function)
-    one, two, three = scratch
-
-    @cuda.jit
-    def kernel(chosen, given):
-        n = cuda.grid(1)
-        if n < chosen.found[0]:
-            own = (
-                cuda.local.array(one, np.float64),
-                cuda.local.array(two, np.float64),
-                cuda.local.array(three, np.float64),
-            )
-            inner(chosen.threads[n], own, given)
 
     return kernel
 
@@ -216,17 +206,5 @@ def _test_kernel(test: Any) -> Any:
         thread = cuda.grid(1)
         if thread < len(chosen.threads) and inner(thread, given):
             chosen.threads[cuda.atomic.add(chosen.found, 0, 1)] = thread
-
-    return kernel
-
-
-@functools.cache
-def _clear_kernel() -> Any:
-    """A kernel that writes the first place of an array."""
-    cuda = _cuda()
-
-    @cuda.jit
-    def kernel(array, value):
-        array[0] = value
 
     return kernel

@@ -20,7 +20,7 @@ class Totals(NamedTuple):
     Attributes:
         force: (7, N) the forces of `physics.forces.WallForce`, N, of the means the sums
             over the physics steps, and the depth of the deepest contact, m.
-        diverged: (N,) whether the state is no longer finite.
+        diverged: (N,) whether the state is not finite.
         beside: (N, B) sensors beside those of contacts.
     """
 

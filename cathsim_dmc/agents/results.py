@@ -1,0 +1,128 @@
+"""Results of an evaluation: figures over its episodes, with intervals."""
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.agents.episodes import EpisodeOutcome
+from cathsim_dmc.analysis.force_statistics import QUANTITIES, STATISTICS
+from cathsim_dmc.analysis.intervals import success_interval
+
+# Largest sums of the force on the wall up to which success is called safe, N.
+SAFE_FORCES = (0.5, 1.0, 2.0)
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """Episodes of one policy on one task.
+
+    Attributes:
+        task: Name of the task.
+        policy: Name of the policy.
+        seeds: Seed of each episode.
+        episodes: Episodes in the order of their seeds.
+        settings: Protocol, observation, further task_kwargs, frames of a checkpoint.
+        distinct: Whether all episodes can differ by more than the jitter of the start.
+            If not, no interval over them is given.
+        conditions: What was drawn for each episode; empty without randomisation.
+    """
+
+    task: str
+    policy: str
+    seeds: tuple[int, ...]
+    episodes: tuple[EpisodeOutcome, ...]
+    settings: Mapping[str, Any]
+    distinct: bool = True
+    conditions: tuple[Mapping[str, Any], ...] = ()
+
+    def values(self, name: str) -> np.ndarray:
+        """A figure of every episode, float64 (episodes,); NaN where unknown.
+
+        Args:
+            name: Name of an attribute of `EpisodeOutcome`, with dots for what lies
+                deeper, such as "reward" or "forces.peak_sum.maximum".
+        """
+
+        def value(outcome: Any) -> Any:
+            for part in name.split("."):
+                outcome = None if outcome is None else getattr(outcome, part)
+            return outcome
+
+        return np.array([value(e) for e in self.episodes], dtype=np.float64)
+
+    def mean_sd(self, name: str) -> tuple[float | None, float | None]:
+        """Mean and sample standard deviation over the episodes; None if unknown."""
+        values = self.values(name)
+        values = values[~np.isnan(values)]
+        if not len(values):
+            return None, None
+        deviation = float(values.std(ddof=1)) if len(values) > 1 else 0.0
+        return float(values.mean()), deviation
+
+    @property
+    def successes(self) -> int:
+        """Episodes that reached the goal."""
+        return sum(episode.success for episode in self.episodes)
+
+    def safe_success(self, limit: float) -> float:
+        """Share of episodes that reach the goal with little force on the wall.
+
+        Args:
+            limit: The sum of the magnitudes over all contacts, mean over a control step
+                (`EpisodeForces.largest_sum`), stays at or below it in all of them, N.
+
+        Returns:
+            As a fraction; an episode whose force is not known is not safe.
+        """
+        safe = self.values("forces.largest_sum") <= limit
+        return float(np.mean((self.values("success") > 0) & safe))
+
+    def summary(self) -> dict[str, Any]:
+        """Means with deviations over the episodes, success rate with its interval.
+
+        The interval is None where the episodes are not distinct. Forces in N, by
+        quantity and statistic as docs/forces.md defines them.
+        """
+        count, successes = len(self.episodes), self.successes
+        interval = list(success_interval(successes, count)) if self.distinct else None
+        result: dict[str, Any] = {"episodes": count}
+        for name in ("reward", "length", "path_ratio"):
+            result[name], result[f"{name}_sd"] = self.mean_sd(name)
+        # Files of before 0.3 do not tell the means over a control step.
+        quantities = [
+            name
+            for name in QUANTITIES
+            if any(getattr(one.forces, name) is not None for one in self.episodes)
+        ]
+        result["forces"] = {quantity: {} for quantity in quantities}
+        for quantity, name in itertools.product(quantities, STATISTICS):
+            mean, deviation = self.mean_sd(f"forces.{quantity}.{name}")
+            result["forces"][quantity][name] = {"mean": mean, "sd": deviation}
+        result["physics_errors"] = sum(e.physics_error for e in self.episodes)
+        result |= {"success": successes / count, "success_ci95": interval}
+        result["safe_success"] = {
+            f"{limit:g} N": self.safe_success(limit) for limit in SAFE_FORCES
+        }
+        return result
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able: identity, summary and every episode."""
+        drawn = [{"conditions": dict(one)} for one in self.conditions]
+        drawn = drawn or [{}] * len(self.seeds)
+        played = zip(self.seeds, self.episodes, drawn, strict=True)
+        episodes = [
+            {"seed": seed, **asdict(episode), **conditions}
+            for seed, episode, conditions in played
+        ]
+        return {
+            "task": self.task,
+            "policy": self.policy,
+            "seed": self.seeds[0],
+            "settings": dict(self.settings),
+            "distinct": self.distinct,
+            "summary": self.summary(),
+            "episodes": episodes,
+        }
