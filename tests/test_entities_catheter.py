@@ -9,10 +9,10 @@ from dm_control import mjcf
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, AngiographyArena
+from cathsim_dmc.entities.armature import LARGEST
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.chain import (
     CARRIAGE_MASS,
-    HINGE_ARMATURE,
     MAX_PUSH_FORCE,
     MAX_PUSH_SPEED,
     ROTOR_INERTIA,
@@ -90,7 +90,7 @@ def test_joint_stiffness_is_that_of_the_rod(name):
         max(device.relaxation_time - TIMESTEP, 0) * stiffness,
         rtol=1e-9,
     )
-    np.testing.assert_allclose(bends.armature, HINGE_ARMATURE)
+    assert 1e-8 < min(bends.armature) <= max(bends.armature) <= LARGEST
 
 
 @pytest.mark.parametrize("shaft_link", [0.007, 0.0175, 0.03])

@@ -47,7 +47,7 @@ def test_sliding_does_not_lift_a_device_off_the_wall():
 def test_a_device_that_stops_in_an_s_bend_keeps_its_push():
     """It kept 14 to 60 % of it, with friction of the wrong sign."""
     found = list(s_bend.checks())
-    assert len(found) == 5 and all(one.passed for one in found), found
+    assert len(found) == 9 and all(one.passed for one in found), found
 
 
 def test_a_tube_passes_the_checks_of_the_lumen_a_false_field_and_a_narrow_one_fail():

@@ -110,7 +110,8 @@ class Protocol:
 
 def validate(
     part: Annotated[
-        Literal["rod", "pair", "wall", "vessel", "forces", "bench"], conf.Positional
+        Literal["rod", "pair", "wall", "rest", "vessel", "forces", "bench"],
+        conf.Positional,
     ],
     /,
     data: Path | None = None,
@@ -122,7 +123,8 @@ def validate(
 
     Args:
         part: Rod and drives; coaxial devices; contact with the wall and its shape;
-            flow, wall and motion of the vessel; force sensors; guidewires on a bench.
+            devices at rest; flow, wall and motion of the vessel; force sensors;
+            guidewires on a bench.
         data: Of `bench`: folder with phantom.stl and wires.json (docs/bench.md).
         protocol: Options of `forces`.
     """

@@ -7,6 +7,7 @@ import numpy as np
 from cathsim_dmc import bounds
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
+from cathsim_dmc.entities.armature import hinge_armatures
 from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
 from cathsim_dmc.entities.coaxial import carried_mass
 from cathsim_dmc.entities.contact import device_contact
@@ -58,6 +59,7 @@ class Catheter(Chain):
                 device.outer_radius,
                 masses=(moved * lengths).tolist(),
                 compliances=compliances.tolist(),
+                armatures=hinge_armatures(device, lengths).tolist(),
                 rest_angles=_rest_angles(device, lengths),
                 axial_stiffness=device.axial_stiffness,
                 tip=first,

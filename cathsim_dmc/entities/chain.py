@@ -15,12 +15,6 @@ from cathsim_dmc.entities.posture import x_first
 # Physics step of the tasks, s. An implicit step of length h damps a spring like a
 # relaxation time of h, so the hinges have that much less.
 TIMESTEP = 4e-3
-# Rotor inertia of the hinges, kg·m². It sets the mass scale of the contact solver and
-# with it the stiffness of the rigid wall: 1.2 to 3.2 kN/m for steerable_5f
-# (`physics.wall.rigid_stiffness`). Over the damping of a hinge it is a delay of 19 to
-# 25 ms in steerable_5f, and of 2.2 s in a link of 3 mm in the tip of wire_014_micro:
-# light tips swing too slowly (docs/limits.md).
-HINGE_ARMATURE = 1e-6
 # Rotor inertia of the torsion hinges, kg·m². They are softer, so a larger one would
 # delay the twist by more than a few milliseconds.
 TORSION_ARMATURE = 1e-7
@@ -79,6 +73,7 @@ class Links(NamedTuple):
         radius: of all links, m.
         masses: n, kg.
         compliances: n - 1 of the joints in bending, rad/(N·m).
+        armatures: n - 1, rotor inertia of their hinges, kg·m², see `armature`.
         rest_angles: n - 1 pairs, of the hinges about x and y, rad.
         axial_stiffness: EA of the whole device, N.
         tip: number of the first link that is drawn as part of the tip.
@@ -90,6 +85,7 @@ class Links(NamedTuple):
     radius: float
     masses: Sequence[float]
     compliances: Sequence[float]
+    armatures: Sequence[float]
     rest_angles: Sequence[tuple[float, float]]
     axial_stiffness: float
     tip: int
@@ -249,7 +245,7 @@ class Chain(composer.ModelWrapperEntity):
                 ways[axis],
                 compliance,
                 springref=rest[axis],
-                armature=HINGE_ARMATURE,
+                armature=links.armatures[index - 1],
             )
             for axis in ("xy" if x_first(index) else "yx")
         }

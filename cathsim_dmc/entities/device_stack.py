@@ -6,6 +6,7 @@ import numpy as np
 
 from cathsim_dmc.entities import devices as library
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
+from cathsim_dmc.entities.armature import hinge_armatures
 from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
 from cathsim_dmc.entities.coaxial import Stack, carried_mass, weight_density
 from cathsim_dmc.entities.contact import FRICTION, device_contact
@@ -81,6 +82,8 @@ class DeviceStack(Chain):
         overlap = self.stack.overlap(self.start_gaps)
         rest = np.empty((len(self.stack.spans), 2))
         unloaded_hinges(overlap.rest.sum(axis=0).astype(complex), rest)
+        # Each device may reach beyond the others.
+        alone = [hinge_armatures(one, self.stack.link_lengths) for one in self.devices]
         tip = self.stack.nodes <= self.devices[0].tip_length + 1e-9
         self.density = _density(self.devices)
         self._assemble(
@@ -90,6 +93,7 @@ class DeviceStack(Chain):
                 max(device.outer_radius for device in self.devices),
                 masses=self.stack.links(overlap, 0.0).mass.tolist(),
                 compliances=overlap.compliance.tolist(),
+                armatures=np.min(alone, axis=0).tolist(),
                 rest_angles=[(x, y) for x, y in rest.tolist()],
                 axial_stiffness=sum(device.axial_stiffness for device in self.devices),
                 tip=int(tip.argmax()),

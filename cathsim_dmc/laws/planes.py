@@ -31,10 +31,10 @@ MOST = 4  # planes, so contacts, of a place
 _ASIDE = 0.4e-3  # m, to both sides, from where tangent planes are taken
 _HEAD_ON = 0.1  # sine between a capsule and the normal
 _HOLLOW = 5e-6  # m, least distance of the planes' edge from the wall
-# One plane suffices to this depth, m, at this slope. With steps of 4 ms some light tips
-# vibrate even so (docs/limits.md). Two planes bear what one does at a depth less by
-# the share `_SHARED`; from there to twice the depth they approach the wall.
-_DEEP, _SLOPED, _SHARED = 1e-4, 0.06, 0.18
+# One plane suffices to this depth, m, at this slope; with 0.1 mm, tips swing at steps
+# of 4 ms where they should rest. Two planes bear what one does at a depth less by the
+# share `_SHARED`; from there to twice the depth they approach the wall.
+_DEEP, _SLOPED, _SHARED = 0.4e-4, 0.06, 0.18
 _CORNER = -0.3  # slope of the clearance beside a place in a corner
 _STEEP = 0.5  # cosine between a wall of a corner and the normal, least to share a load
 _ROOM = 1e-4  # m, activation distance of the second wall of a corner

@@ -19,7 +19,7 @@ class Fields(NamedTuple):
     """Fields of the model that change as the devices slide, with MuJoCo's names.
 
     The constants that MuJoCo derives from masses (`body_invweight0`, ...) stay those of
-    the start: the armature of the hinges outweighs the links in them a thousand times.
+    the start: the armature of the hinges outweighs the links in them many times.
     """
 
     jnt_stiffness: np.ndarray

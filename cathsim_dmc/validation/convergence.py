@@ -11,6 +11,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import config
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check
@@ -27,6 +28,13 @@ PATH_BOUND = 1.0  # mm
 FORCE_BOUND = 10.0  # % of the mean wall force
 # Least mean wall force of a script whose force is compared, N.
 LEAST_FORCE = 1e-3
+# Judged force on the published tasks: of pushes with these commands of the tip, for so
+# long, at half speed.
+TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
+CURLS = ((0.0, 0.0), (0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3), (0.2, 0.2))
+PUSH = 6.0  # s
+JUDGED_BOUND = 5.0  # % of the mean of the judged force
+FINE = 0.001  # s
 CURL_TIME = 2.0  # s
 FIGURES = ("path_mean_mm", "path_max_mm", "track_max_mm", "force_mean")
 
@@ -139,3 +147,35 @@ def checks(results: Sequence[dict[str, Any]]) -> Iterator[Check]:
         if reference > LEAST_FORCE:
             what, expected = f"{name}wall force", 1e3 * reference
             yield Check.deviation(what, 1e3 * force, expected, FORCE_BOUND, "mN")
+
+
+def judged(task: str, timestep: float) -> tuple[float, float]:
+    """Judged force of pushes in a task: of the sum, mean over a control step, N.
+
+    Args:
+        task: Name of the task.
+        timestep: Physics step, s.
+
+    Returns:
+        Its mean over all control steps, and its largest value of a push, mean over
+        the pushes.
+    """
+    made = suite.make_task(task, physics_timestep=timestep, observation="tracking")
+    batch = BatchSimulation(made, len(CURLS), num_threads=1, seeds=[0] * len(CURLS))
+    batch.reset()
+    scripts, found = [Script("", 0.5, curl, PUSH) for curl in CURLS], []
+    for step in range(round(PUSH / CONTROL_TIMESTEP)):
+        action = np.stack([script.action(step, made) for script in scripts])
+        found.append(batch.step(action).wall_force.mean_sum)
+    return float(np.mean(found)), float(np.max(found, axis=0).mean())
+
+
+def judged_checks() -> Iterator[Check]:
+    """Whether the judged force of the published tasks is converged."""
+    for task in TASKS:
+        usual, fine = (judged(task, one) for one in (config.PHYSICS_TIMESTEP, FINE))
+        name = f"{task}: judged force, step of {1e3 * config.PHYSICS_TIMESTEP:g} ms "
+        name += f"against {1e3 * FINE:g} ms"
+        note = f"mean {1e3 * usual[0]:.2f} mN for {1e3 * fine[0]:.2f} mN, largest "
+        note += f"{1e3 * usual[1]:.1f} mN for {1e3 * fine[1]:.1f} mN"
+        yield Check.deviation(name, usual[0], fine[0], JUDGED_BOUND, "N", note)

@@ -13,7 +13,8 @@ from scipy.integrate import solve_ivp
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
-from cathsim_dmc.entities.chain import HINGE_ARMATURE, MAX_ROTATION_SPEED
+from cathsim_dmc.entities.armature import hinge_armatures
+from cathsim_dmc.entities.chain import MAX_ROTATION_SPEED
 from cathsim_dmc.entities.coaxial import carried_mass
 from cathsim_dmc.entities.posture import joints_along
 from cathsim_dmc.entities.sheath import Sheath
@@ -115,7 +116,8 @@ def _beam(
     squares = (_ROOTS / length) ** 4
     # The rotors of the hinges stand for no mass of the device. The reference in air
     # contains them, so it does not show what they change; in blood it does not.
-    rotors = 0.0 if blood else HINGE_ARMATURE * LINK / mass * squares
+    rotor = hinge_armatures(device, np.full(round(length / LINK), LINK))[0]
+    rotors = 0.0 if blood else rotor * LINK / mass * squares
     rates = device.shaft.bending_stiffness / mass * squares / (1 + rotors)
     places, weights = np.polynomial.legendre.leggauss(40)
     modes, weights = _modes((places + 1) / 2), weights / 2

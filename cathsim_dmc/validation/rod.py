@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from cathsim_dmc.entities import chain, devices
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
-from cathsim_dmc.validation import damping, platforms, theory
+from cathsim_dmc.validation import damping, helix, modes, platforms, theory
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import RESTING_TIME, Rig
 
@@ -317,6 +317,8 @@ def _checks(data: dict[str, Any]) -> Iterator[Check]:
     yield Check.deviation(name, slip_force(), chain.MAX_PUSH_FORCE, SLIP_BOUND, "N")
     yield from platforms.checks()
     yield from damping.checks()
+    yield from modes.checks()
+    yield from helix.checks()
 
 
 def validate_rod() -> Report:
@@ -345,5 +347,6 @@ def validate_rod() -> Report:
             * (one.critical / one.expected - 1)
             for one in data["short"]
         },
+        "push of a helix of links of 17.5 mm, deviation, %": helix.long_links(),
     }
     return Report("rod", checks, findings, data)

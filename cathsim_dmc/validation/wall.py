@@ -104,6 +104,7 @@ def validate_wall() -> Report:
         s_bend.checks(),
         pressed.push_checks(),
         convergence.checks(studies),
+        convergence.judged_checks(),
     )
     data = {"anatomies": anatomies, "capstans": pulled, "studies": studies}
     return Report("wall", list(checks), {"convergence": studies}, data)

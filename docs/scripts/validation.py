@@ -1,6 +1,6 @@
 """Runs the validations, keeps their figures in docs/data and draws their pictures.
 
-    python docs/scripts/validation.py [rod] [pair] [wall] [forces]
+    python docs/scripts/validation.py [rod] [pair] [wall] [rest] [forces]
 
 Each part is kept as soon as it has ended; `figures.py` writes the pages.
 """
@@ -12,7 +12,7 @@ import figures
 import validation_figures
 from rich.console import Console
 
-from cathsim_dmc.validation import force_sensors, pair, rod, wall
+from cathsim_dmc.validation import force_sensors, pair, rest, rod, wall
 
 DOCS = figures.ROOT / "docs"
 IMAGES = DOCS / "images"
@@ -20,12 +20,13 @@ IMAGES = DOCS / "images"
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", metavar="rod|pair|wall|forces")
+    parser.add_argument("parts", nargs="*", metavar="rod|pair|wall|rest|forces")
     arguments = parser.parse_args()
     runs = {
         "rod": rod.validate_rod,
         "pair": pair.validate_pair,
         "wall": wall.validate_wall,
+        "rest": rest.validate_rest,
         "forces": force_sensors.validate_forces,
     }
     chosen = arguments.parts or list(runs)
@@ -34,7 +35,8 @@ def main() -> int:
     passed = True
     for part in chosen:
         report = runs[part]()
-        validation_figures.draw(part, report, IMAGES / f"validation_{part}.png")
+        if part in validation_figures.DRAWN:
+            validation_figures.draw(part, report, IMAGES / f"validation_{part}.png")
         Console().print(report.table())
         figures.keep(f"validation_{part}", report.as_dict(), f"cathsim validate {part}")
         passed = passed and report.passed

@@ -1,0 +1,78 @@
+"""Axial force on a device that has buckled into a helix in a straight tube."""
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from cathsim_dmc.entities import devices
+from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.rig import in_tube
+
+TUBE = 0.3, 4e-3  # m, length and radius
+LINK = 5e-3  # m, of the check; those of the tasks are a finding
+FORCE = 2.0  # N, at which the push stops
+HELIX_BOUND = 3.0  # % of the force
+_REST = 50  # control steps
+_MOST = 1000  # control steps of a push
+_MIDDLE = 0.3, 0.7  # of the tube, where the helix is measured
+
+
+def helix(link: float, force: float = FORCE) -> tuple[float, float, float]:
+    """Pushes a uniform device against the end of a frictionless tube.
+
+    Its helix of the angle α to the axis bears F = 2 EI sin²α cos α / r² (the change of
+    the bending energy with the shortening of a rod that is free to turn).
+
+    Args:
+        link: Length of the links, m.
+        force: Push force at which the base stops, N.
+
+    Returns:
+        Push force and F, N, and α, rad.
+
+    Raises:
+        RuntimeError: the push force is not reached.
+    """
+    shaft = devices.STEERABLE_5F.shaft
+    uniform = dataclasses.replace(
+        devices.STEERABLE_5F,
+        tip=shaft,
+        tip_links=round(devices.STEERABLE_5F.tip_length / link),
+        steering_angle=0.0,
+    )
+    environment = in_tube(TUBE, device=uniform, shaft_link=link, friction=0.0)
+    task, action = environment.task, np.array([0.5])
+    for _ in range(_MOST):
+        environment.step(action)
+        if task.readings.push_force >= force:
+            break
+    else:
+        raise RuntimeError(f"the push force stays below {force} N")
+    for _ in range(_REST):
+        environment.step(0.0 * action)
+    push, line = float(task.readings.push_force), task.readings.centreline
+    environment.close()
+    low, high = (int(np.argmax(line[:, 2] > share * TUBE[0])) for share in _MIDDLE)
+    way = line[high, 2] - line[low, 2]
+    cosine = way / np.linalg.norm(np.diff(line[low : high + 1], axis=0), axis=-1).sum()
+    radius = np.linalg.norm(
+        line[low : high + 1, :2], axis=1
+    ).mean()  # of the joints, on the rod
+    theory = 2 * shaft.bending_stiffness * (1 - cosine**2) * cosine / radius**2
+    return push, float(theory), float(np.arccos(cosine))
+
+
+def checks() -> Iterator[Check]:
+    """The helix of short links."""
+    push, theory, angle = helix(LINK)
+    name = f"helix of {np.degrees(angle):.0f}° in a straight tube, links of "
+    name += f"{1e3 * LINK:g} mm: push"
+    yield Check.deviation(name, push, theory, HELIX_BOUND, "N")
+
+
+def long_links() -> float:
+    """Deviation (%) of the push that a helix of the links of the tasks needs."""
+    push, theory, _ = helix(NavigationConfig().shaft_link)
+    return 100 * (push / theory - 1)

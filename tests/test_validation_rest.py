@@ -1,0 +1,66 @@
+"""Devices at rest, first modes, a helix, and the judged force in shorter steps."""
+
+import numpy as np
+import pytest
+
+from cathsim_dmc.entities import armature
+from cathsim_dmc.entities.devices import DEVICES
+from cathsim_dmc.validation import convergence, helix, modes, rest
+
+
+def test_the_reference_is_the_beam():
+    """3.516 √(EI/λ) / L² of a uniform cantilever in two sections."""
+    lengths, bending = np.array([0.03, 0.09]), np.full(2, 5e-5)
+    expected = 1.875104**2 * np.sqrt(5e-5 / 4e-3) / 0.12**2 / (2 * np.pi)
+    assert modes.beam_frequency(lengths, bending, 4e-3) == pytest.approx(expected, 1e-4)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_first_mode_of_a_free_end(device):
+    mine, beam = modes.frequencies(device)
+    assert 0.9 * beam < mine < beam
+
+
+def test_the_check_of_modes_sees_one_armature_for_all(monkeypatch):
+    """It ruled light tips: 1.7 Hz for 4.3 Hz."""
+    monkeypatch.setattr(armature, "_SLOWED", np.inf)
+    passed = {check.name.split()[-1]: check.passed for check in modes.checks()}
+    assert not passed["wire_014_micro"] and not passed["wire_035_glide"]
+    assert passed["steerable_5f"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "device, anatomy, depth",
+    [
+        ("wire_035_glide", "type2", 0.05),
+        ("steerable_5f", "type1", 0.09),
+        ("wire_014_micro", "type1", 0.11),
+    ],
+)
+def test_what_swung_at_rest_stands_still(device, anatomy, depth):
+    """They moved by 0.23, 0.05 and 0.10 mm; a force fluctuated by 13 %."""
+    one = rest.compared(rest.DEVICES[device], (anatomy,), (depth,))
+    assert all(check.passed for check in one.checks(device)), one
+
+
+def test_the_checks_of_rest_see_a_swing():
+    swing = 1e-3 * np.sin(np.arange(200.0))[:, None, None] * np.eye(3)[:1]
+    one = rest.Rest(swing, 1.0 + 50 * swing[..., 0])
+    assert one.wobble == pytest.approx(1 / np.sqrt(2), rel=0.01)
+    assert one.fluctuation == pytest.approx(5 / np.sqrt(2), rel=0.02)
+    found = rest.Compared(one.wobble, one.fluctuation, np.array([4.0]), np.zeros(1))
+    assert [check.passed for check in found.checks("one")] == [False] * 3
+
+
+@pytest.mark.slow
+def test_a_helix_bears_what_theory_says():
+    assert all(check.passed for check in helix.checks())
+
+
+@pytest.mark.slow
+def test_the_judged_force_is_converged(monkeypatch):
+    monkeypatch.setattr(convergence, "TASKS", ("type1_lcca",))
+    monkeypatch.setattr(convergence, "PUSH", 3.0)
+    (check,) = convergence.judged_checks()
+    assert check.passed, check
