@@ -24,8 +24,7 @@ tags: [endovascular-navigation, reinforcement-learning, robotics, mujoco, dm_con
 {what}
 
 ```sh
-pip install huggingface-hub   # beside cathsim_dmc
-{command}
+{command}   # needs its extra `hub`
 ```
 """
 
