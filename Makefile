@@ -10,7 +10,7 @@ LABMAZE := './tools/labmaze ; python_version >= "3.13"'
 # MuJoCo looks for OpenGL at import; nothing here draws with it.
 export MUJOCO_GL ?= disable
 
-.PHONY: demo test test-slow nightly lint audit compatibility dist docs site clean
+.PHONY: demo test test-slow nightly lint lock audit compatibility dist docs site clean
 
 demo: $(VENV)/.installed
 	$(BIN)/cathsim train type1_lcca --algo dagger --preset demo --frames 12288 --out runs/demo $$(test ! -e runs/demo/config.json || echo --resume)
@@ -44,6 +44,10 @@ audit: $(VENV)/.installed
 # Pythons and versions of the main dependencies, each in a fresh environment.
 compatibility:
 	$(PYTHON) tools/compatibility.py
+
+# requirements.lock, by uv, which it needs on the path.
+lock:
+	$(PYTHON) tools/lock.py
 
 # The wheel, proved in an empty environment away from the checkout.
 dist: $(VENV)/.installed

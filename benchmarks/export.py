@@ -3,8 +3,6 @@
 python benchmarks/export.py RUN NAME [--out DIRECTORY]
 """
 
-import hashlib
-import json
 import re
 import sys
 from pathlib import Path
@@ -13,7 +11,6 @@ from typing import Annotated, Any
 import judgement
 import torch
 import tyro
-from safetensors.torch import save
 
 from cathsim_dmc import files, suite
 from cathsim_dmc.agents import pretrained
@@ -91,7 +88,7 @@ def export(
             k: v.half() if v.dtype == torch.float32 and v.ndim > 1 else v
             for k, v in state.items()
         }
-        policy = write(Path(out), name, state, card)
+        policy = pretrained.write(Path(out), name, state, card)
     found, _ = judgement.judge(policy, config.task, options, episodes, label)
     figures = judgement.episode_figures(found)
     card["evaluation"] = {
@@ -99,24 +96,8 @@ def export(
         "summary": found.summary(),
         "episodes": {name: figures[name] for name in _FIGURES},
     }
-    weights = write(Path(out), name, state, card)
+    weights = pretrained.write(Path(out), name, state, card)
     write_list(weights.parent)
-    return weights
-
-
-def write(directory: Path, name: str, state, card) -> Path:
-    """Write weights and card; the card last, which makes them a policy."""
-    directory.mkdir(parents=True, exist_ok=True)
-    data = save({key: value.cpu().contiguous() for key, value in state.items()})
-    weights = files.write_bytes(directory / f"{name}{pretrained.SUFFIX}", data)
-    sum_ = hashlib.sha256(data).hexdigest()
-    values = {"format": pretrained.FORMAT, "name": name, **card, "sha256": sum_}
-    text = json.dumps(values, indent=1, allow_nan=False) + "\n"
-    # Lists of numbers on one line.
-    text = re.sub(
-        r"\[[^\[\]{}\"]*\]", lambda found: re.sub(r"\s+", " ", found[0]), text
-    )
-    files.write_text(weights.with_suffix(".json"), text)
     return weights
 
 

@@ -17,12 +17,18 @@ class _Compiled:
         functools.update_wrapper(self, function)
         self._function, self._cache, self._options = function, cache, options
 
-    def _made(self, **options: Any) -> Any:
+    def _made(self, part: bool = False) -> Any:
         import numba
 
+        from cathsim_dmc import compiled_parts
+
         # Wrappers that nothing calls would take a fifth more time to compile.
-        options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-        return numba.njit(self._function, **options, **self._options)
+        options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+        own: Any = compiled_parts.PackageCompiler
+        if part:
+            own, options["no_cpython_wrapper"] = compiled_parts.PartCompiler, True
+        options |= self._options
+        return numba.njit(self._function, pipeline_class=own, **options)
 
     @functools.cached_property
     def _compiled(self) -> Any:
@@ -37,7 +43,7 @@ class _Compiled:
     @functools.cached_property
     def _inner(self) -> Any:
         """What compiled code calls, which is kept with the caller."""
-        return self._made(no_cpython_wrapper=True)
+        return self._made(part=True)
 
     def __call__(self, *arguments: Any) -> Any:
         return self._compiled(*arguments)

@@ -1,13 +1,14 @@
 """Where compiled loops are kept on disk, and what happens when they cannot be.
 
 A damaged file of the cache is compiled anew and replaced. Where nothing can be written,
-each process compiles for itself. Both take one line of warning and stop nothing.
+each process compiles for itself. Both take one line of warning and stop nothing. One
+line on standard error says that something is being compiled.
 """
 
-import contextlib
 import functools
 import hashlib
 import logging
+import sys
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,12 @@ class _Cache(caching.FunctionCache):
         base, stamp = self._impl.filename_base, self._impl.locator.get_source_stamp()
         self._cache_file = _Files(self._cache_path, base, stamp)
 
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = super().load_overload(sig, target_context)
+        if found is None:
+            _tell_of_compiling()
+        return found
+
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
             super().save_overload(sig, data)
@@ -112,12 +119,28 @@ def keep(made: Any, function: Any) -> None:
         function: The Python function that it is made of.
     """
     keep_together()
-    # RuntimeError: neither the folder of the source nor the user's can be written to.
-    with contextlib.suppress(RuntimeError):
+    try:
         made._cache = _Cache(function)  # noqa: SLF001
+    except RuntimeError:  # neither the folder of the source nor the user's is writable
+        _tell_of_compiling()
+
+
+def has_compiled() -> bool:
+    """Whether this process has compiled a loop that was not kept on disk."""
+    return "compiling" in _told
 
 
 _told: set[str] = set()  # a warning for each of dozens of functions would hide the rest
+
+
+def _tell_of_compiling() -> None:
+    if "compiling" not in _told:
+        _told.add("compiling")
+        print(
+            "compiling for this machine, once: the physics takes about 15 s, of "
+            "coaxial devices 30 s",
+            file=sys.stderr,
+        )
 
 
 def _warn_of_damage(path: str, why: str) -> None:

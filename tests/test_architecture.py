@@ -23,6 +23,7 @@ BELOW = {
     "extras",
     "compiled",
     "compiled_cache",
+    "compiled_parts",
     "cluster",
 }
 _TASK = {"anatomy", "laws", "collision", "imaging", "entities", "physics", "tasks"}
@@ -38,8 +39,9 @@ ALLOWED = {
     "bounds": set(),
     "style": set(),
     "extras": set(),
-    "compiled": {"compiled_cache"},
+    "compiled": {"compiled_cache", "compiled_parts"},
     "compiled_cache": set(),
+    "compiled_parts": set(),
     "cluster": set(),
     # Laws know no engine and no task.
     "laws": set(),
@@ -72,12 +74,20 @@ CONFINED = {
     "torchrl": {*_TORCHRL_FACE, "agents/"},
     "tensordict": {*_TORCHRL_FACE, "agents/"},
     "safetensors": {"agents/pretrained.py"},
+    "huggingface_hub": {"agents/hub.py"},
+    "onnx": {"agents/onnx_export.py"},
+    "onnxruntime": {"agents/onnx_selftest.py"},
+    "pygame": {"play/hands.py"},
+    "pyspacemouse": {"play/hands.py"},
     "ray": {"cluster.py", "agents/ray_source.py"},
     "rerun": {"recording/"},
     "igl": {"anatomy/"},
     "llvmlite": {"collision/"},
     "fast_simplification": {"anatomy/scan/topology.py"},
-    "numba": {"compiled.py", "compiled_cache.py", "collision/", "simulation/warp/"},
+    "numba": {
+        *("compiled.py", "compiled_cache.py", "compiled_parts.py"),
+        *("collision/", "simulation/warp/"),
+    },
     "gymnasium": {"simulation/gymnasium.py", "gym.py"},
     "tyro": {"cli/"},
 }

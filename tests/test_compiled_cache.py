@@ -3,6 +3,9 @@
 import ctypes
 import errno
 import logging
+import os
+import subprocess
+import sys
 
 import numba
 import pytest
@@ -28,7 +31,7 @@ def loop():
 def call_by_c():
     made = native.callback("int64(int64)")(double)
     answer = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(made.address)(21)
-    return answer, made.cache_hits
+    return answer, made.made.cache_hits
 
 
 KINDS = pytest.mark.parametrize("run", [loop, call_by_c])
@@ -140,5 +143,78 @@ def test_a_warning_is_one_line_on_standard_error(folder, capfd, monkeypatch):
     files(folder, "nbi")[0].write_bytes(b"")
     monkeypatch.setattr(logger, "handlers", [logging.lastResort])
     monkeypatch.setattr(logger, "propagate", False)
+    capfd.readouterr()
     loop()
     assert len(capfd.readouterr().err.splitlines()) == 1
+
+
+EMPTY = """
+import numpy as np
+from numba.core import event
+from cathsim_dmc import suite
+from cathsim_dmc.physics import adapters
+from cathsim_dmc.simulation.batch import BatchSimulation
+
+class Listener(event.Listener):
+    def on_start(self, event):
+        compiled.append(event.data["dispatcher"])
+
+    def on_end(self, event):
+        pass
+
+compiled = []
+event.register("numba:compile", Listener())
+for task, options in (
+    ("type1_lcca", {}),
+    ("type1_lcca_pair", {}),
+    ("type1_lcca", {"device": "wire_035_glide"}),
+    ("type1_lcca", {"vessel": "living"}),
+):
+    environment = suite.load("cathsim", task, options)
+    assert compiled
+    if not options:
+        assert "made" not in vars(adapters.motion)  # no vessel moves
+    compiled.clear()
+    environment.reset()
+    environment.step(np.ones(environment.action_spec().shape))
+    assert not compiled, (task, options, compiled)
+    batch = BatchSimulation(suite.make_task(task, **options), 3)
+    compiled.clear()
+    batch.reset()
+    batch.step(np.ones((3, batch.num_actions)))
+    assert not compiled, (task, options, compiled)
+"""
+
+
+@pytest.mark.slow
+def test_nothing_compiles_after_a_task_is_loaded(tmp_path):
+    own = {"NUMBA_CACHE_DIR": str(tmp_path), "MUJOCO_GL": "disable"}
+    run = [sys.executable, "-c", EMPTY]
+    done = subprocess.run(run, env=os.environ | own, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("compiling for this machine") == 1
+
+
+@KINDS
+def test_one_line_tells_of_compiling_and_none_of_loading(run, folder, capsys):
+    run()
+    run()
+    assert capsys.readouterr().err.count("compiling for this machine, once") == 1
+    compiled_cache._told.clear()
+    run()
+    assert not capsys.readouterr().err
+    assert not compiled_cache.has_compiled()
+
+
+def test_a_part_is_compiled_with_its_caller_alone():
+    made = compiled(double)
+    made._inner.compile((numba.float64,))
+    (part,) = made._inner.overloads.values()
+    engine = part.library._codegen._engine
+    assert not engine.is_symbol_defined(part.fndesc.mangled_name)
+
+    @compiled
+    def call(number):
+        return made(number) + 1.0
+
+    assert call(20.5) == 42.0

@@ -8,7 +8,7 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.biplane import TRACE_SPACING, Biplane
 from cathsim_dmc.imaging.device import Shadow
-from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.imaging.options import FluoroscopyOptions, RoadmapErrors
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +81,70 @@ def test_the_route_through_the_roadmaps_is_near_that_of_the_tree(
     assert apart.min(axis=1).max() < 20e-3
     np.testing.assert_allclose(found[0], line.points[20], atol=1e-5)
     assert np.linalg.norm(found[-1] - anatomy.goals[goal].position) < 2e-3
+
+
+def farthest(anatomy, machine, goal="lcca"):
+    """Largest distance of the found route from that of the tree, m."""
+    line = anatomy.route(goal).resampled(1e-3)
+    found = machine.route(line.points[20], anatomy.goals[goal].position)
+    apart = np.linalg.norm(found[:, None] - line.points, axis=-1)
+    return apart.min(axis=1).max()
+
+
+def test_a_third_roadmap_tells_branches_apart(anatomy, planes, machine):
+    """Those that lie side by side in two."""
+    options = FluoroscopyOptions(view=(60, 0), biplane=(-30, 0), third="AP")
+    third = Angiograph(anatomy.surface, options).third()
+    assert farthest(anatomy, machine) > 10e-3
+    assert farthest(anatomy, Biplane(planes, third)) < 4e-3
+    mild = RoadmapErrors(noise=0.5, erosion=0.5, calibration=2.0)
+    assert farthest(anatomy, Biplane(planes, third, mild, 1)) < 8e-3
+
+
+def test_roadmaps_have_the_errors_that_are_asked_for(planes, machine):
+    eroded = Biplane(planes, errors=RoadmapErrors(erosion=0.5))
+    np.testing.assert_allclose(eroded._walls, machine._walls - 0.5, atol=1e-5)
+    noisy = Biplane(planes, errors=RoadmapErrors(noise=0.5))
+    deviation = (noisy._walls - machine._walls).std()
+    assert deviation == pytest.approx(0.5, rel=0.2)
+    gaps = Biplane(planes, errors=RoadmapErrors(gaps=2))
+    assert (gaps._walls <= machine._walls).all()
+    missing = (gaps._walls < 0) & (machine._walls > 0)
+    assert missing.any(axis=(1, 2)).all()
+    wrong = [
+        Biplane(planes, errors=RoadmapErrors(calibration=2.0), seed=n) for n in (0, 1)
+    ]
+    assert not np.array_equal(wrong[0].matrices, wrong[1].matrices)
+    for one in wrong:
+        for plane in planes:
+            arm, believed = plane.carm, one._believed(plane.carm)
+            angles = np.subtract(
+                [believed.primary, believed.secondary], [arm.primary, arm.secondary]
+            )
+            assert 0.0 < np.abs(np.rad2deg(angles)).max() <= 2.0
+    with pytest.raises(ValueError, match="roadmap_errors: calibration is -1"):
+        FluoroscopyOptions(roadmap_errors={"calibration": -1.0})
+
+
+def test_the_anatomy_chooses_the_views(anatomy):
+    options = FluoroscopyOptions(view="best", biplane="best", third="best")
+    machine = Angiograph(anatomy.surface, options)
+    angles = machine.options.view, machine.options.biplane, machine.options.third
+    assert len(machine.planes()) == 2 and len(set(angles)) == 3
+    two = Biplane(machine.planes())
+    assert farthest(anatomy, two) < 8e-3  # 15 mm in those of the fixture
+    with pytest.raises(ValueError, match="view is 'best' and .*give 'best' for"):
+        FluoroscopyOptions(view="best", biplane=(90, 0))
+
+
+def test_a_device_ends_where_it_leaves_an_image(anatomy):
+    options = FluoroscopyOptions(
+        view=(60, 0), biplane=(-30, 0), magnification=2.0, contrast=False
+    )
+    planes = Angiograph(anatomy.surface, options).planes()
+    machine, middle = Biplane(planes), planes[0].carm.isocentre
+    line = np.array(middle) + np.outer(np.linspace(0, 0.2, 60), [0.0, 0.0, -1.0])
+    found = machine.device(images(planes, line[::-1])[0])
+    pixels, _ = planes[0].carm.project(found)
+    assert 6 <= len(found) < 20
+    assert (pixels > -1.0).all() and (pixels < planes[0].carm.resolution[0]).all()

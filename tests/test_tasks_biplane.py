@@ -47,6 +47,27 @@ def test_the_planes_show_what_the_route_measures(both_paths):
         np.testing.assert_array_equal(seen["biplane_action"], seen["route_action"])
 
 
+def test_every_episode_has_errors_of_its_own_which_a_snapshot_keeps():
+    errors = {"noise": 0.5, "gaps": 1, "calibration": 2.0}
+    seen = {**OPTIONS["fluoroscopy"], "third": "AP", "roadmap_errors": errors}
+    observed = ["biplane", "biplane_retry"]
+    options = {**OPTIONS, "observation": observed, "fluoroscopy": seen}
+    task = suite.make_task(TASK, **options)
+    batch = BatchSimulation(task, 2, seeds=5, num_threads=1)
+    first = batch.reset().observation["biplane_radii"].copy()
+    assert not np.array_equal(first[0], first[1])
+    action = np.full((2, 21), 0.3)
+    batch.step(action)
+    kept = batch.snapshot()
+    expected = [batch.step(action).observation for _ in range(2)]
+    batch.reset()
+    batch.restore(kept)
+    for one in expected:
+        found = batch.step(action).observation
+        for key, value in one.items():
+            np.testing.assert_array_equal(found[key], value, key)
+
+
 def test_one_plane_is_not_enough():
     with pytest.raises(ValueError, match="needs two planes"):
         suite.load("cathsim", TASK, {"observation": "biplane"}).reset()

@@ -187,7 +187,7 @@ def test_forty_configurations_go_on_in_another_process(first, tmp_path):
 # beginning of a control step. Fields and parameters lie in MuJoCo.
 DERIVED = {
     "Rollout": {"objectives", "resting_goal", "resting", "_open"},
-    "ImageSensors": {"planes"},
+    "ImageSensors": {"planes", "thirds"},
     "BiplaneSight": {"_machines"},
     "Moving": {"_motions", "_surfaces", "_inlets"},
     "Flow": {"_circulations"},

@@ -1,10 +1,16 @@
 """Tools beside the package: the matrix of versions."""
 
+import importlib
 import json
+import shutil
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
+
+import nbformat
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 TOOLS = Path(__file__).parents[1] / "tools"
 
@@ -40,3 +46,65 @@ def test_what_stands_for_labmaze_is_the_version_that_is_pinned():
         if "--editable ." in line or "*.whl" in line
     ]
     assert all("$(LABMAZE)" in line for line in installing)
+
+
+def test_the_lock_has_all_requirements_at_the_pinned_versions():
+    """And neither labmaze nor CUDA; `make lock` writes it."""
+    root = TOOLS.parent
+    lines = (root / "requirements.lock").read_text().splitlines()
+    locked = [x for x in lines if not x.startswith("#")]
+    versions = dict(x.partition(" ;")[0].split("==") for x in locked)
+    names = {canonicalize_name(name) for name in versions}
+    assert not [x for x in names if x.startswith(("nvidia-", "cuda-", "triton"))]
+    assert "labmaze" not in names
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    wanted = [*project["dependencies"], *extras["test"]]
+    for extra in extras:
+        if f"cathsim-dmc[{extra}]" in extras["test"]:
+            wanted += extras[extra]
+    for text in wanted:
+        one = Requirement(text)
+        if one.name != "cathsim-dmc":
+            found = versions[canonicalize_name(one.name)]
+            assert one.specifier.contains(found), f"{text}, locked {found}: make lock"
+    pins = (root / "constraints.txt").read_text().splitlines()
+    for line in pins:
+        if "==" in line and not line.startswith("#"):
+            name, version = line.split("==")
+            assert versions.get(canonicalize_name(name), version) == version, line
+
+
+def test_the_container_installs_the_lock_and_runs_the_tests():
+    text = (TOOLS.parent / "Dockerfile").read_text()
+    assert len(text.splitlines()) <= 12
+    for word in ("requirements.lock", "--no-deps", 'CMD ["make", "test"]'):
+        assert word in text
+    # The stamps that keep make from installing again.
+    made = (TOOLS.parent / "Makefile").read_text()
+    for stamp in (".created", ".installed", ".installed-test"):
+        assert f"touch .venv/{stamp}" in text and f"$(VENV)/{stamp}:" in made
+
+
+def test_notebooks_install_in_colab_and_get_a_badge(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(TOOLS.parent / "docs" / "scripts"))
+    notebooks = importlib.import_module("notebooks")
+    monkeypatch.setattr(notebooks, "TUTORIALS", tmp_path)
+    source = TOOLS.parent / "docs" / "tutorials"
+    for path in source.glob("*.ipynb"):
+        shutil.copy(path, tmp_path)
+        first, second, *_ = nbformat.read(path, as_version=4).cells
+        assert second.id == "colab" and first.source.startswith("# ")
+        exec(second.source, {})  # does nothing here
+    for _ in range(2):  # the second time changes nothing
+        monkeypatch.setattr(sys, "argv", ["", "--repository", "someone/cathsim"])
+        notebooks.main()
+        seen = {p.name: p.read_text() for p in tmp_path.iterdir()}
+    for name, text in seen.items():
+        link = f"github/someone/cathsim/blob/main/docs/tutorials/{name}"
+        assert text.count(link) == 1 and text.count("badge.svg") == 1
+        assert 'REPOSITORY = \\"someone/cathsim\\"' in text
+    monkeypatch.setattr(sys, "argv", ["", "--repository", ""])
+    notebooks.main()
+    for path in source.glob("*.ipynb"):
+        assert (tmp_path / path.name).read_text() == path.read_text()

@@ -13,6 +13,7 @@ from dm_env import specs
 from tensordict import TensorDict, TensorDictBase
 
 from cathsim_dmc import bounds, extras, suite
+from cathsim_dmc.agents import hub
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import View
 from cathsim_dmc.policies.expert import ExpertPolicy
@@ -203,7 +204,7 @@ def load_transitions(
 
     Args:
         path: Directory of a dataset, or of episodes as `cathsim play --out` writes
-            them, which are repeated.
+            them, which are repeated; or "hf:OWNER/NAME@COMMIT".
         observation: Name or names of the observations that the networks read; the
             dataset may hold others beside them.
         **options: As for `read_episodes`.
@@ -219,6 +220,8 @@ def load_transitions(
         ModuleNotFoundError: minari is not installed.
     """
     names = observations.resolve(observation)
+    if hub.is_reference(path):
+        path = hub.dataset(str(path))
     if recordings_in(path):
         read = repeat_episodes(path, names, **options)
     else:

@@ -1,15 +1,18 @@
 """Policies that ship with the package: weights in safetensors, and a card."""
 
+import hashlib
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load
+from safetensors.torch import load, save
 from tensordict.nn import TensorDictSequential
 
 from cathsim_dmc import files
+from cathsim_dmc.agents import hub
 from cathsim_dmc.agents.checkpoint import CheckpointError, policy_of, read_bytes
 from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.learners import config_from_dict
@@ -31,11 +34,14 @@ def pretrained_names(directory: str | Path = DIRECTORY) -> list[str]:
 
 
 def pretrained_path(policy: str | Path) -> Path | None:
-    """Weights of "pretrained:NAME" or of a `.safetensors` file, None for others.
+    """Weights of "pretrained:NAME", of "hf:…" or of a `.safetensors` file, else None.
 
     Raises:
         CheckpointError: none ships under that name; lists those that do.
+        ValueError: the hub has none under that name, see `hub.policy`.
     """
+    if hub.is_reference(policy):
+        return hub.policy(str(policy))
     if not str(policy).startswith(PREFIX):
         return Path(policy) if Path(policy).suffix == SUFFIX else None
     name, names = str(policy).removeprefix(PREFIX), pretrained_names()
@@ -85,3 +91,29 @@ def read_card(path: str | Path) -> dict[str, Any]:
     if wrong or card.get("format") != FORMAT:
         raise CheckpointError(f"{path}: no card of format {FORMAT}; wrong is {wrong}.")
     return card
+
+
+def write(
+    directory: Path, name: str, state: Mapping[str, Any], card: Mapping[str, Any]
+) -> Path:
+    """Write weights and card of a policy; the card last, which makes them a policy.
+
+    Args:
+        state: Tensors by name.
+        card: What `read_card` returns, without "format", "name" and "sha256".
+
+    Returns:
+        Path of the weights.
+    """
+    files.require_folder(directory, make=True)
+    data = save({key: value.cpu().contiguous() for key, value in state.items()})
+    weights = files.write_bytes(directory / f"{name}{SUFFIX}", data)
+    digest = hashlib.sha256(data).hexdigest()
+    values = {"format": FORMAT, "name": name, **card, "sha256": digest}
+    text = json.dumps(values, indent=1, allow_nan=False) + "\n"
+    # Lists of numbers on one line.
+    text = re.sub(
+        r"\[[^\[\]{}\"]*\]", lambda found: re.sub(r"\s+", " ", found[0]), text
+    )
+    files.write_text(weights.with_suffix(".json"), text)
+    return weights

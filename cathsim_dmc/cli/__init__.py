@@ -32,6 +32,7 @@ COMMANDS = {
         "Do the control step of a physics error again.",
     ),
     "play": ("agents:play", "Cannulate by hand, with the forces on the screen."),
+    "upload": ("sharing:upload", "Upload a policy or a data set to a hub."),
     "serve": ("bridging:serve", "Serve a task as a device over TCP."),
     "drive": ("bridging:drive", "Drive a device over TCP with a trained policy."),
     "doctor": ("checks:doctor", "Check what is installed; say what to do."),

@@ -122,9 +122,9 @@ class _Table:
         self._collide_by(moving)
 
     def _collide_by(self, module: types.ModuleType) -> None:
-        # The functions of `moving` handle walls at rest, too.
-        self._functions[_CAPSULE * _TYPES + _BOX] = module.of_capsule.address
-        self._functions[_SPHERE * _TYPES + _BOX] = module.of_sphere.address
+        # The function of `moving` handles walls at rest, too.
+        for kind in (_CAPSULE, _SPHERE):
+            self._functions[kind * _TYPES + _BOX] = module.of_link.address
 
 
 _get_table = functools.cache(_Table)

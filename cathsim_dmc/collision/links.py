@@ -2,12 +2,16 @@
 
 import math
 
+import mujoco
+
 from cathsim_dmc.collision.native import data_field, model_field, numbers, word
 from cathsim_dmc.collision.table import MIDDLE
 from cathsim_dmc.compiled import compiled, inlined
 from cathsim_dmc.laws.contact import contact_law, end_caps, looks_ahead, sweep_of
 from cathsim_dmc.laws.places import Capsule
 from cathsim_dmc.laws.vectors import into
+
+_CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 
 
 @inlined
@@ -31,7 +35,13 @@ def _caps(model, data, geom, half_length):
 
 
 @inlined
-def capsule_of(model, data, entry, geoms, half_length):
+def is_capsule(model, geom):
+    """Whether a link is a capsule, not a sphere."""
+    return model_field(model, "geom_type")[geom] == _CAPSULE
+
+
+@inlined
+def capsule_of(model, data, entry, geoms):
     """A link in the frame of the field of a carrier.
 
     Args:
@@ -39,9 +49,10 @@ def capsule_of(model, data, entry, geoms, half_length):
         data: Address of `mjData`.
         entry: Address of the field's entry.
         geoms: Link and carrier.
-        half_length: Of the link, m.
     """
     link, carrier = geoms
+    size = model_field(model, "geom_size")[link]
+    half_length = size[1] if is_capsule(model, link) else 0.0
     turns, middle = data_field(data, "geom_xmat"), numbers(word(entry + MIDDLE))
     apart = seen_from(data, carrier, data_field(data, "geom_xpos")[link])
     local = (middle[0] + apart[0], middle[1] + apart[1], middle[2] + apart[2])

@@ -1,20 +1,25 @@
 """Capsules and spheres against walls at rest, in MuJoCo's collision table.
 
-The law is `laws.contact`. MuJoCo calls `of_capsule` and `of_sphere`; they read the link
-and the wall from its structs and write the contacts of the law where it takes them.
-`moving` has those of walls that move, which take a second more to compile.
+The law is `laws.contact`. MuJoCo calls `of_link`, which reads the link and the
+wall from its structs and writes the contacts of the law where it takes them. `moving`
+has that of walls that move, which takes longer to compile.
 """
 
 import numpy as np
 
-from cathsim_dmc.collision.links import capsule_of, is_finite, law_of, sweep
+from cathsim_dmc.collision.links import (
+    capsule_of,
+    is_capsule,
+    is_finite,
+    law_of,
+    sweep,
+)
 from cathsim_dmc.collision.native import (
     address_of,
     call_collision,
     call_error,
     callback,
     data_field,
-    model_field,
     numbers,
     stacked,
     wholes,
@@ -67,10 +72,10 @@ def write(data, geoms, law, found, count, raw):
 
 
 @compiled
-def at_rest(model, data, raw, geoms, half_length, margin, entry):
+def at_rest(model, data, raw, geoms, margin, entry):
     """Number of contacts, written, of a link and a wall at rest."""
     wall = wall_of(entry)
-    capsule = capsule_of(model, data, entry, geoms, half_length)
+    capsule = capsule_of(model, data, entry, geoms)
     # What is no number has no place in a lattice; MuJoCo's checks of the state tell.
     if not is_finite(capsule):
         return np.int32(0)
@@ -83,40 +88,22 @@ def at_rest(model, data, raw, geoms, half_length, margin, entry):
 
 
 @compiled
-def collide(model, data, raw, geoms, margin, before):
-    """Contacts of a capsule or a sphere with a box, which may carry a field.
-
-    `before` is the place in the table of the function for boxes that do not; a constant
-    would be compiled once for each.
-    """
+def collide(model, data, raw, geoms, margin):
+    """Contacts of a capsule or a sphere with a box, which may carry a field."""
     table, (link, box) = address_of(SYMBOL), geoms
     key = key_of(model, box)
     if key == 0:
-        old = word(table + before)
+        place = OF_CAPSULE if is_capsule(model, link) else OF_SPHERE
+        old = word(table + place)
         return call_collision(old, model, data, raw, link, box, margin)
     entry = entry_of(table, key)
     if entry == 0:
         call_error(word(table + ERROR), word(table + MESSAGE), box)
         return np.int32(0)
-    half = half_length_of(model, link, before)
-    return at_rest(model, data, raw, geoms, half, margin, entry)
-
-
-@inlined
-def half_length_of(model, link, before):
-    """Half the length of a link, m: 0 of a sphere."""
-    return model_field(model, "geom_size")[link, 1] if before == OF_CAPSULE else 0.0
+    return at_rest(model, data, raw, geoms, margin, entry)
 
 
 @callback("int32(int64, int64, int64, int32, int32, float64)")
-def of_capsule(model, data, contacts, geom1, geom2, margin):
-    """Entry of MuJoCo's collision table for a capsule and a box."""
-    place = np.int64(OF_CAPSULE)
-    return collide(model, data, contacts, (geom1, geom2), margin, place)
-
-
-@callback("int32(int64, int64, int64, int32, int32, float64)")
-def of_sphere(model, data, contacts, geom1, geom2, margin):
-    """Entry of MuJoCo's collision table for a sphere and a box."""
-    place = np.int64(OF_SPHERE)
-    return collide(model, data, contacts, (geom1, geom2), margin, place)
+def of_link(model, data, contacts, geom1, geom2, margin):
+    """Entry of MuJoCo's collision table for a capsule or a sphere and a box."""
+    return collide(model, data, contacts, (geom1, geom2), margin)

@@ -9,7 +9,7 @@ from cathsim_dmc.collision.links import (
     law_of,
     sweep,
 )
-from cathsim_dmc.collision.loops import collide, half_length_of, write
+from cathsim_dmc.collision.loops import collide, write
 from cathsim_dmc.collision.native import (
     address_of,
     callback,
@@ -22,8 +22,6 @@ from cathsim_dmc.collision.own import BORE, MOTION, motion_of
 from cathsim_dmc.collision.parameters import unpacked
 from cathsim_dmc.collision.table import (
     MOTION_ENTRY,
-    OF_CAPSULE,
-    OF_SPHERE,
     SYMBOL,
     entry_of,
     key_of,
@@ -40,10 +38,10 @@ from cathsim_dmc.laws.wall import clearance_along
 
 
 @compiled
-def in_motion(model, data, raw, geoms, half_length, margin, entry):
+def in_motion(model, data, raw, geoms, margin, entry):
     """Number of contacts, written, of a link and a wall that moves."""
     wall = wall_of(entry)
-    capsule = capsule_of(model, data, entry, geoms, half_length)
+    capsule = capsule_of(model, data, entry, geoms)
     if not is_finite(capsule):
         return np.int32(0)
     layout = motion_of(model, data)
@@ -66,25 +64,16 @@ def in_motion(model, data, raw, geoms, half_length, margin, entry):
 
 
 @compiled
-def collide_moving(model, data, raw, geoms, margin, before):
+def collide_moving(model, data, raw, geoms, margin):
     """As `loops.collide`, of fields that move in this simulation, too."""
     key = key_of(model, geoms[1])
     entry = entry_of(address_of(SYMBOL), key) if key != 0 else 0
     if entry == 0 or word(entry + MOTION_ENTRY) == 0 or motion_of(model, data) == 0:
-        return collide(model, data, raw, geoms, margin, before)
-    half = half_length_of(model, geoms[0], before)
-    return in_motion(model, data, raw, geoms, half, margin, entry)
+        return collide(model, data, raw, geoms, margin)
+    return in_motion(model, data, raw, geoms, margin, entry)
 
 
 @callback("int32(int64, int64, int64, int32, int32, float64)")
-def of_capsule(model, data, contacts, geom1, geom2, margin):
-    """Entry of MuJoCo's collision table for a capsule and a box."""
-    place = np.int64(OF_CAPSULE)
-    return collide_moving(model, data, contacts, (geom1, geom2), margin, place)
-
-
-@callback("int32(int64, int64, int64, int32, int32, float64)")
-def of_sphere(model, data, contacts, geom1, geom2, margin):
-    """Entry of MuJoCo's collision table for a sphere and a box."""
-    place = np.int64(OF_SPHERE)
-    return collide_moving(model, data, contacts, (geom1, geom2), margin, place)
+def of_link(model, data, contacts, geom1, geom2, margin):
+    """Entry of MuJoCo's collision table for a capsule or a sphere and a box."""
+    return collide_moving(model, data, contacts, (geom1, geom2), margin)

@@ -27,7 +27,7 @@ from numba.extending import intrinsic, overload, register_jitable
 from numba.np.arrayobj import populate_array
 from numba.np.numpy_support import from_dtype
 
-from cathsim_dmc import compiled_cache
+from cathsim_dmc import compiled_cache, compiled_parts
 
 # Compiled code calls intrinsics without their first argument.
 _intrinsic: Any = intrinsic
@@ -334,21 +334,40 @@ def call_before(table, model, data):
         call_callback(before, model, data)
 
 
-def callback(signature: str, cache: bool = True) -> Callable:
+class Callback:
+    """A function that C calls, compiled when its address is first asked for."""
+
+    def __init__(self, function: Callable, signature: str, cache: bool):
+        self._function, self._signature, self._cache = function, signature, cache
+
+    @functools.cached_property
+    def made(self) -> CFunc:
+        """What numba has made of it."""
+        options = {"nopython": True, "error_model": "numpy"}
+        kinds = sigutils.normalize_signature(self._signature)
+        own = compiled_parts.PackageCompiler
+        made = CFunc(self._function, kinds, {}, options, pipeline_class=own)
+        if self._cache:
+            compiled_cache.keep(made, self._function)
+        made.compile()
+        return made
+
+    @property
+    def address(self) -> int:
+        """Where it stands in memory."""
+        return int(self.made.address or 0)
+
+    @property
+    def ctypes(self) -> Any:
+        """The function for ctypes."""
+        return self.made.ctypes
+
+
+def callback(signature: str, cache: bool = True) -> Callable[[Callable], Callback]:
     """Compiles a function that C calls, once on each machine as `compiled` does.
 
     Args:
         signature: numba's, such as "void(int64, int64)"; a pointer is an int64.
         cache: Whether it is kept on disk.
     """
-
-    def decorate(function: Callable) -> Any:
-        options = {"nopython": True, "error_model": "numpy"}
-        kinds = sigutils.normalize_signature(signature)
-        made = CFunc(function, kinds, locals={}, options=options)
-        if cache:
-            compiled_cache.keep(made, function)
-        made.compile()
-        return made
-
-    return decorate
+    return lambda function: Callback(function, signature, cache)

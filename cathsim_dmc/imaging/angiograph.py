@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.imaging import views
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.options import FluoroscopyOptions
@@ -41,9 +42,22 @@ class Angiograph:
 
     def __init__(self, surface: Surface, options: FluoroscopyOptions | None = None):
         """Computes the path lengths through a lumen (world frame, m) for its angles."""
-        self._surface, self.options = surface, options or FluoroscopyOptions()
+        self._surface = surface
+        self.options = views.settled(surface, options or FluoroscopyOptions())
         self._views: dict[tuple[int, int], Planes] = {}
+        self._thirds: dict[tuple[int, int], Planes] = {}
         self.planes()
+
+    def third(self, deviation: Deviation = Deviation()) -> Planes:
+        """The view of a third roadmap; empty where there is none."""
+        if self.options.third is None:
+            return ()
+        angles = deviation.primary, deviation.secondary
+        if angles not in self._thirds:
+            vertices = self._surface.vertices
+            (arm,) = self.options.carms(vertices, angles, ("third",))
+            self._thirds[angles] = (Fluoroscope.from_surface(self._surface, arm),)
+        return self._thirds[angles]
 
     def planes(self, deviation: Deviation = Deviation()) -> Planes:
         """Fluoroscopes of every plane, frontal first."""

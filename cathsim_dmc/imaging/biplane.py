@@ -5,6 +5,7 @@ and the mask images do not (digital subtraction). The vessel is the visual hull 
 outlines in both roadmaps; the route to the goal marker keeps to the middle of the hull.
 """
 
+from dataclasses import replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -14,7 +15,9 @@ from cathsim_dmc.anatomy.centreline import arc_lengths, interpolate
 from cathsim_dmc.anatomy.geodesic import nearest_cell, search
 from cathsim_dmc.imaging import biplane_loops as loops
 from cathsim_dmc.imaging import materials
+from cathsim_dmc.imaging.carm import CArm
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
+from cathsim_dmc.imaging.options import NO_ERRORS, RoadmapErrors
 
 # Distance of the points along the device, m, and their number: 0.2 m of it.
 TRACE_SPACING = 5e-3
@@ -28,6 +31,14 @@ MARKER_TO_HEAD = 0.5 * materials.MARKER_LENGTH
 HULL_SPACING = 3e-3
 _OUTSIDE = -0.5 * HULL_SPACING  # m; a point so deep still counts as inside
 ROUTE_SPACING = 1e-3
+# So far outside the outlines, m, a way may lead through a gap of a roadmap, at so many
+# times the cost of a way along an outline.
+_THROUGH, _DEAR = -12e-3, 10.0
+# Errors of roadmaps, px: length along which outlines err alike, radius of a gap.
+_ALONG, _GAP = 4.0, 3.0
+# Rays of the same place miss each other by less, px; where calibration matters most is
+# this far from the isocentre, m.
+_WIDEST, _FAR = 2.0, 0.1
 # The route is smoothed by a Gaussian of this deviation, m: three points of the hull.
 _SMOOTHING = 4e-3
 # Farther than this from its outlines, m, no place of a vessel is better than another.
@@ -45,15 +56,44 @@ class Biplane:
         isocentre: point (3,) about which the arms turn, m.
     """
 
-    def __init__(self, planes: tuple[Fluoroscope, Fluoroscope]):
-        """Takes the roadmap and the mask image of each plane."""
-        self._planes = planes
+    def __init__(
+        self,
+        planes: tuple[Fluoroscope, ...],
+        third: tuple[Fluoroscope, ...] = (),
+        errors: RoadmapErrors = NO_ERRORS,
+        seed: int = 0,
+    ):
+        """Takes the roadmap and the mask image of each plane.
+
+        Args:
+            planes: The two planes.
+            third: Further views of the vessel alone.
+            errors: Of the roadmaps and of what is known of the planes.
+            seed: Of these errors.
+        """
+        self._planes, self._roadmaps = planes, (*planes, *third)
+        self._errors, self._random = errors, np.random.RandomState(seed)
         self.isocentre = np.asarray(planes[0].carm.isocentre)
-        self.matrices = np.array([plane.carm.matrix for plane in planes])
-        self._focal = np.array([plane.carm.focal_length for plane in planes])
+        arms = [self._believed(plane.carm) for plane in self._roadmaps]
+        self._views = np.array([arm.matrix for arm in arms])
+        self.matrices = self._views[:2]
+        self._focal = np.array([plane.carm.focal_length for plane in self._roadmaps])
+        # By how much rays of both planes may miss each other, px: what the angles are
+        # off by, at a place some way from the isocentre.
+        off = np.deg2rad(errors.calibration) * _FAR * planes[0].carm.focal_length
+        self._widest = _WIDEST + float(off) / planes[0].carm.source_isocentre
         # Grey levels without a device, (2, rows, columns).
         self._masks = np.stack([plane.empty for plane in planes]).astype(np.float32)
         self._goal: tuple[np.ndarray, np.ndarray] | None = None
+
+    def _believed(self, arm: CArm) -> CArm:
+        """A C-arm whose angles are not quite those that it has."""
+        most = np.deg2rad(self._errors.calibration)
+        if not most:
+            return arm
+        primary, secondary = self._random.uniform(-most, most, 2).tolist()
+        primary, secondary = arm.primary + primary, arm.secondary + secondary
+        return replace(arm, primary=primary, secondary=secondary)
 
     def device(self, image: np.ndarray) -> np.ndarray:
         """Follows the device from its tip.
@@ -76,7 +116,7 @@ class Biplane:
         line = np.empty((TRACE_POINTS, 3))
         count = loops.trace(
             depth, self.matrices, _directions(),
-            TRACE_SPACING, float(full), TRACE_ENOUGH, line,
+            TRACE_SPACING, float(full), TRACE_ENOUGH, line, self._widest,
         )  # fmt: skip
         return line[:count]
 
@@ -90,20 +130,42 @@ class Biplane:
         """Signed distance (...), m, of points (..., 3) from the outlines, + inside."""
         points = np.asarray(points, dtype=np.float64)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
-        found = loops.depths(flat, self.matrices, self._walls, self._focal)
+        found = loops.depths(flat, self._views, self._walls, self._focal)
         return found.reshape(points.shape[:-1])
 
     @cached_property
     def _walls(self) -> np.ndarray:
-        """Signed distances of pixels from the outlines, px, (2, rows, columns)."""
+        """Signed distances of pixels from the outlines, px, (P, rows, columns)."""
         from scipy.ndimage import distance_transform_edt as distances
 
         walls = []
-        for plane in self._planes:
+        for plane in self._roadmaps:
             inside = plane.vessel_mask
             out, within = _EDGE - distances(~inside), distances(inside) - _EDGE
-            walls.append(np.where(inside, within, out).astype(np.float32))
+            wall = np.where(inside, within, out)
+            walls.append(self._spoiled(wall).astype(np.float32))
         return np.stack(walls)
+
+    def _spoiled(self, wall: np.ndarray) -> np.ndarray:
+        """Signed distances (rows, columns) with the errors of a roadmap, px."""
+        from scipy.ndimage import gaussian_filter
+
+        errors, random = self._errors, self._random
+        if not errors.any:
+            return wall
+        inside = np.argwhere(wall > 0.0)
+        wall = wall - errors.erosion
+        if errors.noise:
+            white = random.normal(size=wall.shape)
+            smooth = gaussian_filter(white, _ALONG, mode="wrap")
+            # Of white noise the filter leaves 1 / (2 sqrt(pi) sigma).
+            wall = wall + errors.noise * smooth * 2.0 * np.sqrt(np.pi) * _ALONG
+        if len(inside):
+            rows, columns = np.indices(wall.shape)
+            for row, column in inside[random.randint(len(inside), size=errors.gaps)]:
+                away = np.hypot(rows - row, columns - column)
+                wall = np.minimum(wall, away - _GAP)
+        return wall
 
     @cached_property
     def _hull(self) -> tuple[np.ndarray, np.ndarray]:
@@ -148,13 +210,19 @@ class Biplane:
         if self._goal is None or not np.array_equal(self._goal[0], goal):
             margin = 0.4 * HULL_SPACING
             cost = (_WIDE / np.clip(depth, margin, _WIDE)) ** 2
-            cost = np.where(depth > _OUTSIDE, cost, -1.0)
+            cost = np.where(depth > _OUTSIDE, cost, _DEAR * cost)
+            cost = np.where(depth > self._limit, cost, -1.0)
             end = nearest_cell(np.argwhere(cost > 0.0), (goal - low) / HULL_SPACING)
-            self._graph, reached = search(cost, end)
-            self._goal = goal, np.argwhere(np.isfinite(reached))
+            self._graph, way = search(cost, end)
+            self._goal = goal, np.argwhere(np.isfinite(way))
         begin = nearest_cell(self._goal[1], (start - low) / HULL_SPACING)
         path = np.array(self._graph.traceback(begin))[::-1]
         return low + path * HULL_SPACING
+
+    @property
+    def _limit(self) -> float:
+        """Depth, m, from which on places are part of ways."""
+        return _THROUGH if self._errors.gaps else _OUTSIDE
 
 
 @cache

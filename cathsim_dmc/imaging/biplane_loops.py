@@ -34,16 +34,16 @@ def _place(matrix, x, y, z):
 
 @compiled
 def depths(points, matrices, walls, focal):
-    """Signed distances (n,) to the outline of the vessel, the lesser of both planes, m.
+    """Signed distances (n,) to the outlines of the vessel, the least of all planes, m.
 
-    Walls (2, rows, columns) are those of pixels, > 0 inside, and focal lengths (2,)
+    Walls (P, rows, columns) are those of pixels, > 0 inside, and focal lengths (P,)
     in px.
     """
     found = np.empty(len(points))
     for n in range(len(points)):
         x, y, z = points[n]
         found[n] = math.inf
-        for plane in range(2):
+        for plane in range(len(walls)):
             row, column, depth = _place(matrices[plane], x, y, z)
             wall = _sampled(walls[plane], row, column) * depth / focal[plane]
             found[n] = min(found[n], wall)
@@ -168,7 +168,14 @@ def _next(images, matrices, directions, way, full, point, last, tried):
 
 
 @compiled
-def _follow(images, matrices, directions, way, full, tried, line):
+def _outside(image, row, column):
+    """Whether a place lies outside an image."""
+    rows, columns = image.shape
+    return not (-0.5 <= row <= rows - 0.5 and -0.5 <= column <= columns - 0.5)
+
+
+@compiled
+def _follow(images, matrices, directions, way, full, tried, line, widest):
     """Writes points behind the first; returns their number. Marks what it has tried."""
     last, places, there = np.zeros(3), np.empty((2, 2)), np.empty(3)
     none = np.zeros(len(directions), dtype=np.bool_)
@@ -186,9 +193,11 @@ def _follow(images, matrices, directions, way, full, tried, line):
         ahead = before + way * direction
         for plane in range(2):
             row, column, _ = _place(matrices[plane], ahead[0], ahead[1], ahead[2])
+            if _outside(images[plane], row, column):
+                return number
             places[plane] = _centred(images[plane], row, column, 0.1 * full)
         # Where the device covers several pixels, only the part across counts.
-        if triangulated(matrices, places, there) < 2.0:
+        if triangulated(matrices, places, there) < widest:
             shift = there - ahead
             ahead = there - (shift * direction).sum() * direction
         last = ahead - before
@@ -198,7 +207,7 @@ def _follow(images, matrices, directions, way, full, tried, line):
 
 
 @compiled
-def trace(images, matrices, directions, way, full, enough, line):
+def trace(images, matrices, directions, way, full, enough, line, widest):
     """Follows a device from the marker at its tip back to where it is lost.
 
     Args:
@@ -207,16 +216,17 @@ def trace(images, matrices, directions, way, full, enough, line):
         directions: (D, 3), unit vectors all around.
         enough: number of points with which no other first direction is tried.
         line: (P, 3), written: the marker, then points every `way` (m) behind it, m.
+        widest: px, by which rays of both planes may miss each other.
 
     Returns:
         Number of points found, 0 without a marker.
     """
-    if _marker(images, matrices, 1.3 * full, 2.0, line[0]) == 0.0:
+    if _marker(images, matrices, 1.3 * full, widest, line[0]) == 0.0:
         return 0
     best, tried = 1, np.zeros(len(directions), dtype=np.bool_)
     other = line.copy()
     for _ in range(5):
-        count = _follow(images, matrices, directions, way, full, tried, other)
+        count = _follow(images, matrices, directions, way, full, tried, other, widest)
         if count > best:
             best = count
             line[:count] = other[:count]

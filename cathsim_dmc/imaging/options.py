@@ -29,6 +29,44 @@ _MOST_IODINE = 10_000.0  # kg/m³, twice the density of solid iodine
 
 # Name in `carm.VIEWS`, or primary and secondary angle in degrees.
 View = str | Sequence[float]
+# Name of the views with the fewest ambiguous places, see `imaging.views`, and of what
+# stands for them where no anatomy is known.
+BEST = "best"
+_ANY = {"view": (0.0, 0.0), "biplane": (90.0, 0.0), "third": (45.0, 0.0)}
+
+
+@dataclass(frozen=True)
+class RoadmapErrors:
+    """Errors of the roadmaps, from which the observation `biplane` takes the route.
+
+    Each episode draws its own.
+
+    Attributes:
+        noise: standard deviation of the place of the outlines, pixels; smooth along
+            them.
+        erosion: by how much the outlines lie inside those of the vessel, pixels.
+        gaps: missing segments of each roadmap.
+        calibration: largest error of the angles of each plane, degrees.
+    """
+
+    noise: float = 0.0
+    erosion: float = 0.0
+    gaps: int = 0
+    calibration: float = 0.0
+
+    def __post_init__(self) -> None:
+        bounds.number("noise", self.noise, 0.0, 20.0, "pixels")
+        bounds.number("erosion", self.erosion, -20.0, 20.0, "pixels")
+        bounds.whole("gaps", self.gaps, 0, 100)
+        bounds.number("calibration", self.calibration, 0.0, 20.0, "degrees")
+
+    @property
+    def any(self) -> bool:
+        """Whether there are errors."""
+        return self != NO_ERRORS
+
+
+NO_ERRORS = RoadmapErrors()
 
 
 @dataclass(frozen=True)
@@ -36,8 +74,12 @@ class FluoroscopyOptions:
     """Set-up of the angiography suite.
 
     Attributes:
-        view: name of a view, or (primary, secondary) angle in degrees.
+        view: name of a view, or (primary, secondary) angle in degrees; "best" for
+            those that tell most about the anatomy, then of `biplane`, too.
         biplane: the same for a second C-arm, or None for a single plane.
+        third: the same for a third roadmap, which the route of the observation
+            `biplane` is found in, too; None for two.
+        roadmap_errors: `RoadmapErrors`, or a mapping of its fields.
         size: pixels along a side of the image, or (rows, columns).
         magnification: electronic zoom.
         centre: isocentre (3,), world frame, m; None for the middle of the lumen, or, of
@@ -58,6 +100,7 @@ class FluoroscopyOptions:
 
     view: View = "AP"
     biplane: View | None = None
+    third: View | None = None
     size: int | Sequence[int] = carm.RESOLUTION
     magnification: float = 1.0
     centre: Sequence[float] | None = None
@@ -70,8 +113,17 @@ class FluoroscopyOptions:
     source_detector: float = carm.SOURCE_DETECTOR
     source_isocentre: float = carm.SOURCE_ISOCENTRE
     detector_size: float = DETECTOR_SIZE
+    # What makes an object is given; the object is here after validation.
+    roadmap_errors: Any = NO_ERRORS
 
     def __post_init__(self) -> None:
+        errors = bounds.made("roadmap_errors", self.roadmap_errors, RoadmapErrors)
+        object.__setattr__(self, "roadmap_errors", errors)
+        if is_best(self.view) != is_best(self.biplane):
+            raise ValueError(
+                f"view is {self.view!r} and biplane {self.biplane!r}; give {BEST!r} "
+                "for both, or for none"
+            )
         bounds.fields(self, _BOUNDS, positive=("kerma", "gain"))
         bounds.switch("noise", self.noise)
         if not isinstance(self.contrast, bool):
@@ -79,8 +131,10 @@ class FluoroscopyOptions:
         if self.centre is not None:
             bounds.vector("centre", self.centre, 3, -bounds.FAR, bounds.FAR, "m")
         # Built here, so that a wrong option is refused before any simulation.
-        self.carms(np.zeros((1, 3)))
-        for name in ("view", "biplane", "size", "centre"):
+        third = () if self.third is None else ("third",)
+        for names in ((), third):
+            self.carms(np.zeros((1, 3)), names=names)
+        for name in ("view", "biplane", "third", "size", "centre"):
             if isinstance(given := getattr(self, name), list | np.ndarray):
                 object.__setattr__(self, name, tuple(given))  # hashable
 
@@ -102,13 +156,17 @@ class FluoroscopyOptions:
         return 1 if self.biplane is None else 2
 
     def carms(
-        self, points: np.ndarray, deviation: tuple[float, float] = (0.0, 0.0)
+        self,
+        points: np.ndarray,
+        deviation: tuple[float, float] = (0.0, 0.0),
+        names: Sequence[str] = (),
     ) -> tuple[CArm, ...]:
         """The C-arms, frontal first.
 
         Args:
             points: (..., 3) whose middle is the isocentre unless `centre` is given, m.
             deviation: added to primary and secondary angle of every plane, degrees.
+            names: of the fields with their views; those of the planes by default.
 
         Raises:
             ValueError: if a view or a distance is not possible.
@@ -118,7 +176,7 @@ class FluoroscopyOptions:
         if self.centre is not None:
             fields["isocentre"] = self.centre
         arms = []
-        for name in ("view", "biplane")[: self.planes]:
+        for name in names or ("view", "biplane")[: self.planes]:
             angles = np.deg2rad(np.add(_angles(name, getattr(self, name)), deviation))
             arm = CArm(angles[0], angles[1], resolution=self.resolution, **fields)
             arms.append(arm.centred_on(points) if self.centre is None else arm)
@@ -138,7 +196,14 @@ class FluoroscopyOptions:
         return replace(self, centre=self.carms(places)[0].isocentre)
 
 
+def is_best(view: View | None) -> bool:
+    """Whether the anatomy decides about a view."""
+    return isinstance(view, str) and view == BEST
+
+
 def _angles(name: str, view: View) -> tuple[float, float]:
+    if is_best(view):
+        return _ANY[name]
     if isinstance(view, str):
         return VIEWS[bounds.choice(name, view, VIEWS)]
     primary, secondary = bounds.vector(name, view, 2, -360.0, 360.0, "degrees")

@@ -312,6 +312,11 @@ class SingleStepper(Stepper):
         self._advance(self._rows[self._substep])
         self._substep += 1
 
+    def run(self) -> None:
+        """Does all physics steps of a control step."""
+        for _ in range(self.substeps):
+            self.step()
+
     def _advance(self, row: np.ndarray) -> None:
         """Does a physics step; none after a warning, where a batch stops, too."""
         if not self._stopped:

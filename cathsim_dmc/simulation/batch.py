@@ -19,6 +19,7 @@ from mujoco import batch as mujoco_batch
 from cathsim_dmc import bounds
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.stepper import Stepper
+from cathsim_dmc.tasks import rehearsal
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
@@ -101,7 +102,14 @@ class BatchSimulation:
 
     def _made_stepper(self, num_simulations: int, num_threads: int) -> Any:
         kind = _PoolStepper if self.task.num_anatomies > 1 else _BatchStepper
-        return kind(self.task, self._model, num_simulations, num_threads)
+        task, model = self.task, self._model
+        if rehearsal.is_due(task.config):
+            # Arrays of several simulations are not of the type of those of one.
+            own = copy.copy(model)
+            stepper = kind(task, own, min(num_simulations, 2), 1)
+            rollout = task.make_rollout(own, stepper)
+            rehearsal.rehearse(rollout, stepper, task.num_actions)
+        return kind(task, model, num_simulations, num_threads)
 
     @property
     def batch(self) -> mujoco_batch.Batch:

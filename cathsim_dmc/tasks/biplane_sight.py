@@ -5,13 +5,17 @@ them, the frame of the tip needs the orientation of the handle, which its drive 
 """
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.random import RandomState
 
 from cathsim_dmc.anatomy.centreline import arc_lengths, interpolate
 from cathsim_dmc.imaging import biplane
 from cathsim_dmc.imaging import biplane_loops as loops
+from cathsim_dmc.imaging.angiograph import Planes
 from cathsim_dmc.imaging.biplane import Biplane
+from cathsim_dmc.imaging.options import NO_ERRORS, RoadmapErrors
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
 from cathsim_dmc.tasks.route import Route, into_frame, locate, look_ahead
 
@@ -28,8 +32,16 @@ class BiplaneSight:
 
     state = ("_routes", "_lines")  # see `snapshot`
 
-    def __init__(self, num_simulations: int):
-        """Begins with nothing seen of N simulations."""
+    def __init__(self, num_simulations: int, errors: RoadmapErrors = NO_ERRORS):
+        """Begins with nothing seen of N simulations.
+
+        Args:
+            errors: Of the roadmaps; each episode draws its own.
+        """
+        self._errors = errors
+        if errors.any:
+            self.state += ("_seeds",)
+        self._seeds = np.zeros(num_simulations, np.int64)
         self._routes: list[Route | None] = [None] * num_simulations
         self._lines = [np.zeros((0, 3))] * num_simulations
         self._machines: dict[int, Biplane] = {}
@@ -39,9 +51,15 @@ class BiplaneSight:
         for number in numbers.tolist():
             self._machines.pop(number, None)
 
+    def draw(self, numbers: np.ndarray, random_states: Sequence[RandomState]) -> None:
+        """Draws the errors of new episodes of some simulations (K,)."""
+        if self._errors.any:
+            for number in numbers.tolist():
+                self._seeds[number] = random_states[number].randint(2**31)
+
     def see(
         self,
-        planes: list[tuple],
+        planes: list[tuple[Planes, Planes]],
         images: np.ndarray,
         pixels: np.ndarray,
         handles: np.ndarray,
@@ -54,7 +72,8 @@ class BiplaneSight:
         "place" (K, 1) is the arc length of the heads' places on their routes, m.
 
         Args:
-            planes: The two planes before each of the K simulations.
+            planes: Of each of the K simulations: the two planes, and views of further
+                roadmaps.
             images: (K, rows, columns, 2) uint8, live images.
             pixels: (K, 2, 2), goal marker in each plane, (column, row).
             handles: (K, 3, 3), orientation of the handle, its axes in columns.
@@ -65,7 +84,9 @@ class BiplaneSight:
         rows = []
         for k, number in enumerate(numbers.tolist()):
             if fresh or number not in self._machines:
-                self._machines[number] = _machine(planes[k])
+                seed = int(self._seeds[number])
+                two, third = planes[k]
+                self._machines[number] = _machine(two, third, self._errors, seed)
             machine = self._machines[number]
             line = machine.device(images[k])
             if len(line) >= _FEWEST or not len(self._lines[number]) or fresh:

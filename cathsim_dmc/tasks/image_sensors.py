@@ -18,6 +18,7 @@ class ImageSensors:
 
     Attributes:
         planes: Of the machine before each simulation; none without fluoroscopy.
+        thirds: Views of a third roadmap of each, empty without one.
         images: The last images (N, ...) by name; "past_1" is the one before "past_0".
         sight: What two planes show, over an episode.
     """
@@ -30,10 +31,13 @@ class ImageSensors:
         """Prepares the sensors for observations of these names, before any episode."""
         self._names, self._chain, self._count = names, chain, num_simulations
         self.planes: list[angiographs.Planes] = []
+        self.thirds: list[angiographs.Planes] = []
         self.sight, self._noise = BiplaneSight(num_simulations), False
         if observations.needs(names, FLUOROSCOPY, BIPLANE):
             options = case.angiograph.options
             self.planes = [case.angiograph.planes()] * num_simulations
+            self.thirds = [case.angiograph.third()] * num_simulations
+            self.sight = BiplaneSight(num_simulations, options.roadmap_errors)
             self._noise = options.noise
             if observations.needs(names, BIPLANE):
                 if options.planes < 2:
@@ -87,9 +91,12 @@ class ImageSensors:
                 # The roadmaps show the vessel at rest.
                 resting = [self.planes[index] for index in rows]
                 marked = angiographs.pixels(resting, points[-1][rows, None])[:, :, 0]
+                if begins and random_states is not None:
+                    self.sight.draw(rows, random_states)
                 seen = self.sight.see(
-                    resting, image, marked, handles[rows], rows, begins, last[rows]
-                )
+                    [(self.planes[index], self.thirds[index]) for index in rows],
+                    image, marked, handles[rows], rows, begins, last[rows],
+                )  # fmt: skip
                 for key, value in seen.items():
                     if key != "place" or self._wants("biplane_retry"):
                         self.hold(f"biplane_{key}", value, rows)

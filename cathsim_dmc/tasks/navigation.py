@@ -1,5 +1,6 @@
 """Navigation of a catheter through an anatomy, as a composer task."""
 
+import copy
 import dataclasses
 import functools
 import itertools
@@ -17,7 +18,7 @@ from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.readings import CoaxialReadings, part
 from cathsim_dmc.physics.stepper import SingleStepper, Stepper
-from cathsim_dmc.tasks import cases, observations
+from cathsim_dmc.tasks import cases, observations, rehearsal
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective, Shiftable
@@ -204,6 +205,11 @@ class Navigation(composer.Task):
         del random_state
         model = physics.model.ptr
         data, fields = physics.data.ptr, self.data_fields
+        if rehearsal.is_due(self.config):
+            own = copy.copy(model)
+            stepper = SingleStepper(own, mujoco.MjData(own), fields, self.substeps)
+            rollout = self.make_rollout(own, stepper)
+            rehearsal.rehearse(rollout, stepper, self.num_actions)
         self.stepper = SingleStepper(model, data, fields, self.substeps)
         self.rollout = self.make_rollout(model, self.stepper)
         self._compiled, self._step = True, None

@@ -161,6 +161,7 @@ class Restorable:
         if self._sensors.planes:
             machine = self.case(index).angiograph
             self._sensors.planes[index] = machine.planes(self.deviations[index])
+            self._sensors.thirds[index] = machine.third(self.deviations[index])
 
     def case(self, index: int = 0) -> Case:
         """Anatomy and objective of the episode of one simulation."""

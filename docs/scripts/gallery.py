@@ -2,9 +2,9 @@
 
     python docs/scripts/gallery.py [NAME …]
 
-Writes docs/images/gallery/NAME.webp, all of them or those that are named, and the page;
-"cannulation" is the film above the README, docs/images/cannulation.webp. Needs no
-OpenGL; the same seeds give the same clips.
+Writes docs/images/gallery/NAME.webp, all of them or those that are named, and prints
+the grid of the page; "cannulation" is the film above the README,
+docs/images/cannulation.webp. Needs no OpenGL; the same seeds give the same clips.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 from cathsim_dmc.agents import load_policy  # before anything of dm_control
 
 import cathsim_dmc  # isort: skip
+from cathsim_dmc.agents.policies import task_and_options  # isort: skip
 from cathsim_dmc import suite  # isort: skip
 from cathsim_dmc.pictures.animation import animate  # isort: skip
 
@@ -39,13 +40,13 @@ class Clip:
     seed: int
     steps: int | None = None
     own_task: bool = False  # the policy's own, which the command need not name
-    vessel: str = "rigid"
+    options: dict[str, object] = dataclasses.field(default_factory=dict)
 
     @property
     def command(self) -> str:
         parts = ["cathsim record", self.policy]
         parts += [] if self.own_task else [f"--task {self.task}"]
-        parts += [f"--vessel {self.vessel}"] if self.vessel != "rigid" else []
+        parts += [f"--{name} {value}" for name, value in self.options.items()]
         parts += [f"--seed {self.seed}"] if self.seed != EVALUATION else []
         parts += [f"--max-steps {self.steps}"] if self.steps else []
         return " ".join([*parts, f"--gif {self.name}.webp"])
@@ -70,7 +71,34 @@ CLIPS = (
         "expert",
         "femoral_type1_lcca",
         1,
-        vessel="living",
+        options={"vessel": "living"},
+    ),
+    Clip(
+        "arch",
+        "Navigator, random arch that it has not seen",
+        "pretrained:navigator",
+        "arch_any",
+        EVALUATION,
+        own_task=True,
+        options={"first": 7, "pool": 1},
+    ),
+    Clip("simple", "Expert, drawn arch", "expert", "simple1_lcca", 1),
+    Clip("wire", "Expert, guidewire alone", "expert", "femoral_type1_bca_wire", 1),
+    Clip(
+        "pair",
+        "Clone of the expert, guidewire in catheter",
+        "pretrained:femoral_type1_lcca_pair",
+        "femoral_type1_lcca_pair",
+        EVALUATION,
+        own_task=True,
+    ),
+    Clip(
+        "navigate",
+        "Expert in any anatomy: your scan by its folder",
+        "expert",
+        "navigate",
+        1,
+        options={"anatomy": "type2", "goal": "bca", "access": "descending"},
     ),
 )
 
@@ -84,9 +112,9 @@ def main() -> None:
         if len(sys.argv) > 1 and clip.name not in sys.argv[1:]:
             continue
         policy = load_policy(clip.policy, clip.seed)
-        kwargs = {"observation": policy.observation or "tracking"}
-        kwargs["vessel"] = clip.vessel
-        env = suite.load("cathsim", clip.task, kwargs)
+        task, kwargs = task_and_options(policy, clip.task, clip.options)
+        kwargs["observation"] = policy.observation or "tracking"
+        env = suite.load("cathsim", task, kwargs)
         episode = cathsim_dmc.record(
             env, policy, seed=clip.seed, max_steps=clip.steps, task_name=clip.task
         )

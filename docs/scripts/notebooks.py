@@ -2,11 +2,16 @@
 
 `python docs/scripts/notebooks.py [NAME …]` runs all, or those whose file names contain
 a name. Cells run in an empty folder; nothing of this machine gets into the outputs.
+
+`python docs/scripts/notebooks.py --repository OWNER/NAME` runs nothing: it writes the
+address of the public repository into the cells for Colab, with a badge that opens the
+notebook there.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import sys
 import tempfile
 import time
@@ -17,6 +22,24 @@ from nbclient import NotebookClient
 
 TUTORIALS = Path(__file__).parents[1] / "tutorials"
 TIMEOUT = 3600  # seconds a cell
+COLAB = "colab"  # id of the cell
+_BADGE = (
+    "[![Colab](https://colab.research.google.com/assets/colab-badge.svg)]"
+    "(https://colab.research.google.com/github/{repository}/blob/main/"
+    "docs/tutorials/{name})"
+)
+_INSTALL = """\
+# Installs the package in Colab, beside the torch that is there; nothing elsewhere.
+import sys
+
+# OWNER/NAME on GitHub, or a wheel of `make dist` that you upload.
+REPOSITORY = "{repository}"
+if "google.colab" in sys.modules:
+    from IPython import get_ipython
+
+    wheel = REPOSITORY.endswith(".whl")
+    place = REPOSITORY if wheel else f"git+https://github.com/{{REPOSITORY}}"
+    get_ipython().run_line_magic("pip", f"install -q {{place}}")"""
 
 
 def notebooks() -> list[Path]:
@@ -44,6 +67,25 @@ def executed(path: Path) -> nbformat.NotebookNode:
     return notebook
 
 
+def for_colab(notebook: nbformat.NotebookNode, name: str, repository: str) -> None:
+    """Puts the cell that installs in Colab, and the badge, behind the title.
+
+    Args:
+        name: File name of the notebook.
+        repository: OWNER/NAME of the public repository, empty where there is none.
+    """
+    notebook.cells = [one for one in notebook.cells if one.id != COLAB]
+    title = notebook.cells[0]
+    lines = [one for one in title.source.split("\n") if not one.startswith("[![Colab]")]
+    source = _INSTALL.format(repository=repository)
+    if repository:
+        lines[1:1] = ["", _BADGE.format(repository=repository, name=name)]
+    title.source = re.sub(r"\n{3,}", "\n\n", "\n".join(lines))
+    cell = nbformat.v4.new_code_cell(source, id=COLAB, execution_count=None)
+    cell.metadata["tags"] = ["colab"]
+    notebook.cells.insert(1, cell)
+
+
 def _processor_seconds() -> float:
     """Of the kernels that have ended: a busy machine does not count."""
     times = os.times()
@@ -52,6 +94,14 @@ def _processor_seconds() -> float:
 
 def main() -> None:
     chosen = sys.argv[1:]
+    if chosen[:1] == ["--repository"]:
+        if len(chosen) != 2 or not re.fullmatch(r"[\w.-]+/[\w.-]+|", chosen[1]):
+            raise SystemExit("give --repository OWNER/NAME")
+        for path in notebooks():
+            notebook = nbformat.read(path, as_version=4)
+            for_colab(notebook, path.name, chosen[1])
+            nbformat.write(notebook, path)
+        return
     for path in notebooks():
         if chosen and not any(name in path.name for name in chosen):
             continue

@@ -83,7 +83,10 @@ the live images and the roadmaps of two planes with known geometry, and the goal
 in both (`cathsim_dmc/imaging/biplane.py`). The device is what a live image shows and
 the mask image of the empty vessel does not: the marker at its tip is dark in both
 planes, and the shaft is followed from there. The vessel is the set of points that both
-roadmaps show inside. The route through it is found when an episode begins. From the
+roadmaps show inside, of two planes or also of a `third` view without live images. The
+route through it is found when an episode begins. `roadmap_errors` has the fields
+`noise`, `erosion` and `gaps` (missing segments), in pixels and number, and
+`calibration`, the largest error of the angles in degrees. From the
 drive come the last action and the roll of the handle, by which the frame of the tip is
 known.
 

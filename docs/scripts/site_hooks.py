@@ -149,6 +149,8 @@ def _examples() -> str:
 def _notebook(path: Path) -> dict[str, str | bytes]:
     """The page of a notebook and its pictures, by their place on the site."""
     notebook = nbformat.read(path, as_version=4)
+    # What installs in Colab tells a reader nothing.
+    notebook.cells = [cell for cell in notebook.cells if cell.get("id") != "colab"]
     exporter = MarkdownExporter()
     text, resources = exporter.from_notebook_node(notebook)
     text = re.sub(r"<style.*?</style>", "", text, flags=re.DOTALL)

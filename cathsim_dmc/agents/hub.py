@@ -1,0 +1,134 @@
+"""Policies and data sets on the Hugging Face Hub: `hf:OWNER/NAME@COMMIT`.
+
+Policies are safetensors with a card in JSON, data sets HDF5 or .npz: no file that can
+run code is fetched. What is fetched is pinned to a commit, kept in the hub's cache, and
+found there without a network.
+"""
+
+import contextlib
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cathsim_dmc import extras, files
+
+PREFIX = "hf:"
+_FORM = re.compile(
+    r"hf:(?P<repository>[\w.-]+/[\w.-]+)(@(?P<commit>[0-9a-f]{40}))?(#(?P<name>[\w-]+))?"
+)
+# What of a data set is fetched, by its place in the repository.
+_DATASET = ("data/*.hdf5", "data/metadata.json", "*.npz")
+
+
+class Reference(NamedTuple):
+    """What a text such as hf:OWNER/NAME@COMMIT#POLICY names.
+
+    Attributes:
+        repository: "OWNER/NAME".
+        commit: 40 hexadecimal digits; None where none is given.
+        name: Name of the policy in it; that of the repository by default.
+    """
+
+    repository: str
+    commit: str | None
+    name: str
+
+
+def is_reference(text: str | Path) -> bool:
+    """Whether a text names something on the hub."""
+    return str(text).startswith(PREFIX)
+
+
+def parse(text: str, pinned: bool = True) -> Reference:
+    """A reference; ValueError for another form, or where no commit is pinned."""
+    found = _FORM.fullmatch(text)
+    if found is None:
+        raise ValueError(
+            f"{text} is no place on the hub; give hf:OWNER/NAME@COMMIT, with 40 "
+            "hexadecimal digits, and #POLICY where the repository holds several"
+        )
+    parts = found.groupdict()
+    if pinned and parts["commit"] is None:
+        raise ValueError(
+            f"{text} names no commit, so it could be another thing tomorrow; give "
+            f"{text.partition('#')[0]}@ and the 40 digits that `cathsim upload` "
+            "printed, or that its page shows under Files, History"
+        )
+    name = parts["name"] or parts["repository"].partition("/")[2]
+    return Reference(parts["repository"], parts["commit"], name)
+
+
+def policy(text: str) -> Path:
+    """Weights of a policy on the hub, with its card beside them.
+
+    Raises:
+        ValueError: the text is no reference, or the hub has no such policy.
+        ModuleNotFoundError: the extra `hub` is not installed.
+    """
+    place = parse(text)
+    extras.require("hub", "huggingface_hub")
+    from huggingface_hub import hf_hub_download
+
+    def fetch(suffix: str) -> Path:
+        file = f"{place.name}{suffix}"
+        with _named(text, file):
+            return Path(hf_hub_download(place.repository, file, revision=place.commit))
+
+    card = fetch(".json")
+    weights = fetch(".safetensors")
+    if card.parent != weights.parent:
+        raise ValueError(f"{text}: weights and card are not of one commit")
+    return weights
+
+
+def dataset(text: str) -> Path:
+    """Directory of a data set on the hub; raises as `policy`."""
+    place = parse(text)
+    extras.require("hub", "huggingface_hub")
+    from huggingface_hub import snapshot_download
+
+    with _named(text, "data"):
+        folder = snapshot_download(
+            place.repository,
+            repo_type="dataset",
+            revision=place.commit,
+            allow_patterns=list(_DATASET),
+        )
+    return Path(folder)
+
+
+def upload(folder: Path, text: str, kind: str, private: bool = True) -> str:
+    """Upload a folder.
+
+    Args:
+        folder: Files to upload; others in the repository stay.
+        text: "hf:OWNER/NAME"; the repository is made where there is none.
+        kind: "model" or "dataset".
+        private: Whether a repository that is made is private.
+
+    Returns:
+        The reference of what was uploaded, with its commit.
+
+    Raises:
+        ValueError: the text is no reference, or the hub refuses.
+        ModuleNotFoundError: the extra `hub` is not installed.
+    """
+    place = parse(text, pinned=False)
+    if place.commit is not None:
+        raise ValueError(f"{text}: an upload makes a commit of its own; leave @… out")
+    extras.require("hub", "huggingface_hub")
+    from huggingface_hub import HfApi
+
+    api = HfApi()
+    where: Any = {"repo_id": place.repository, "repo_type": kind}
+    with _named(text, "upload"):
+        api.create_repo(**where, private=private, exist_ok=True)
+        done = api.upload_folder(
+            **where, folder_path=str(folder), commit_message="Upload by cathsim_dmc"
+        )
+    return f"{PREFIX}{place.repository}@{done.oid}"
+
+
+def _named(text: str, what: str) -> contextlib.AbstractContextManager[None]:
+    """Errors of the hub's client, which are of many kinds, as one line."""
+    return files.refused(ValueError, f"{text}, {what}", Exception)
