@@ -30,6 +30,7 @@ TASK = {
     "max_steps": whole(1),
     "friction": number(0, 2),
     "shaft_link": number(2e-3, 0.1),
+    "sheath_clearance": number(0.1e-3, 2e-3, optional=True),
     "working_length": number(0.02, 3, optional=True),
     "physics_timestep": number(4e-5, 0.005),
     "outside_range": flag(),

@@ -5,7 +5,7 @@ import pytest
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import MAX_ROTATION_SPEED
-from cathsim_dmc.validation import platforms, rod
+from cathsim_dmc.validation import platforms, rod, sheath
 from cathsim_dmc.validation.rig import Rig
 
 
@@ -99,3 +99,17 @@ def test_platforms_start_stop_and_reverse_smoothly():
     """The base ran at 3.5 times its largest speed, and was pulled back by 0.5 mm."""
     found = list(platforms.checks())
     assert len(found) == 9 and all(one.passed for one in found), found
+
+
+def test_the_sheath_clamps_a_device_at_its_mouth_and_passes_axial_forces_on():
+    """A bore with play doubled the compliance; a bent one takes part of the force."""
+    found = list(sheath.checks())
+    assert len(found) == 11 and all(one.passed for one in found), found
+    bore = np.array([[0.0, 0.0, -0.301], [0.0, 0.0, 0.0]])
+    moved, expected = sheath.deflection(0.06, bore)
+    assert moved > 1.5 * expected
+    turn = np.linspace(0.0, np.pi / 2, 40)
+    arc = 0.05 * np.stack([1 - np.cos(turn), 0 * turn, np.sin(turn)], axis=-1)
+    straight = 0.3 - 0.05 * np.pi / 2
+    line = np.vstack([[[0.0, 0.0, -straight]], arc]) + (0.0, 0.0, straight - 0.3)
+    assert abs(sheath.base_force(0.0, line)) < 0.98 * sheath.PULL

@@ -9,7 +9,7 @@ from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.armature import hinge_armatures
 from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
-from cathsim_dmc.entities.coaxial import carried_mass
+from cathsim_dmc.entities.coaxial import carried_mass, weight_density
 from cathsim_dmc.entities.contact import device_contact
 
 
@@ -46,10 +46,7 @@ class Catheter(Chain):
         compliances = half[:-1] + half[1:]
         # Mass per length that moves with the device across its axis, kg/m.
         moved = device.linear_density + carried_mass(self.devices)
-        # The whole disc, as if no blood filled the lumen (docs/limits.md).
-        displaced = BLOOD_DENSITY * np.pi * device.outer_radius**2
-        weight = max(0.0, device.linear_density - displaced)
-        self.density = BLOOD_DENSITY / (1 - weight / moved)
+        self.density = BLOOD_DENSITY / (1 - weight_density(device) / moved)
         # These torques bend free joints by the steering angle.
         torques = device.steering_angle / compliances
         steered = range(first, len(lengths) if device.steerable else first)
@@ -71,6 +68,7 @@ class Catheter(Chain):
             rotation=rotation,
             timestep=timestep,
         )
+        self.distal_shares = half[1:] / compliances
 
 
 def _half_compliances(device: devices.Device, lengths: np.ndarray, of: str):

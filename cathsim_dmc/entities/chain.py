@@ -107,6 +107,8 @@ class Chain(composer.ModelWrapperEntity):
         timestep: Physics step with which the chain is simulated, s.
         stroke: Longest insertion, m.
         link_lengths: (n,), of the links from proximal to distal, m.
+        distal_shares: (n - 1,), fraction of the compliance of each joint that is that
+            of the half link beyond it; of coaxial devices, of uniform ones.
         links: Bodies from proximal to distal.
         link_geoms: Their capsules.
         head: Site at the distal end.
@@ -142,6 +144,9 @@ class Chain(composer.ModelWrapperEntity):
         bounds.number("stroke", stroke, unit="m", positive=True)
         self.device = self.devices[-1]
         self.stroke, self.timestep, self.link_lengths = stroke, timestep, links.lengths
+        self.distal_shares = links.lengths[1:] / (
+            links.lengths[1:] + links.lengths[:-1]
+        )
         root = mjcf.RootElement(model="catheter")
         root.compiler.angle = "radian"
         super()._build(root)

@@ -9,7 +9,8 @@ from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.contact import DRAWN, sheath_contact
 
-CLEARANCE = 0.35e-3  # m between the device and the bore all round
+# Between the device and the bore all round, m: assumed, for lack of a source.
+CLEARANCE = 0.35e-3
 _LEAST_CURVE_RADIUS, _SPACING = 0.01, 0.5e-3  # m
 _VISIBLE_WALL = 0.4e-3  # m, as drawn
 _COLOUR = (0.35, 0.45, 0.6, 0.35)
@@ -25,7 +26,8 @@ class Sheath(composer.ModelWrapperEntity):
 
     Real followers grip the device just outside the sheath and support it up to there.
     The bore reaches back over the whole chain and represents both. Friction of clamps
-    and valve is not modelled ("perfect motion"), so the bore has none.
+    and valve is not modelled ("perfect motion"), so the bore has none. In the tasks
+    the bore is there to be seen, and hinges hold the device on its axis.
 
     The bore is round: one geom that carries it as a field (`collision.fields`), which
     touches capsules from inside, with no edge at which a link could catch.
@@ -33,12 +35,18 @@ class Sheath(composer.ModelWrapperEntity):
     Attributes:
         bore: The geom that carries the bore.
         bore_radius: Radius of the bore where it is straight, m.
+        touches: Whether the bore holds the device.
         vertices: Points (n, 3) of the axis, m, entity's frame.
         length: Length of the bore along its axis, m.
     """
 
     def _build(
-        self, centreline: np.ndarray, device_radius: float, link_length: float = 0.0
+        self,
+        centreline: np.ndarray,
+        device_radius: float,
+        link_length: float = 0.0,
+        *,
+        clearance: float | None = CLEARANCE,
     ):
         """Builds the bore.
 
@@ -50,6 +58,8 @@ class Sheath(composer.ModelWrapperEntity):
             link_length: longest link of the device, m. Links are straight, so in a bend
                 their middles lie inside the line; the inner side of the bend is wider
                 by that distance. No effect where the line is straight.
+            clearance: between the device and the bore all round, m; None for a bore
+                that touches nothing, where hinges hold the device (`physics.held`).
 
         Raises:
             ValueError: if the line has fewer than two points, repeats a point or bends
@@ -57,7 +67,10 @@ class Sheath(composer.ModelWrapperEntity):
         """
         if not device_radius > 0:
             raise ValueError(f"device_radius is {device_radius} m; it must be positive")
-        self.bore_radius = device_radius + CLEARANCE
+        self.touches = clearance is not None
+        self.bore_radius = device_radius + (
+            CLEARANCE if clearance is None else clearance
+        )
         line = Centreline(centreline, np.full(len(centreline), self.bore_radius))
         _refuse_sharp_bends(line)
         self.vertices, self.length = line.points, line.length
@@ -67,7 +80,10 @@ class Sheath(composer.ModelWrapperEntity):
         inwards = _sagitta(line, link_length) / 2
         widths = self.bore_radius + np.linalg.norm(inwards, axis=-1)
         carrier = fields.carrier(fields.Bore(line.points + inwards, widths))
-        self.bore = body.add("geom", name="bore", **carrier, **sheath_contact())
+        contact = sheath_contact()
+        if not self.touches:
+            contact["contype"] = 0
+        self.bore = body.add("geom", name="bore", **carrier, **contact)
         for index, ends in enumerate(itertools.pairwise(line.points)):
             body.add(
                 "geom",

@@ -23,6 +23,7 @@ called `index` or `count`: on CUDA the tuple's method hides such a field.
     springs, hinges  springs of devices with a shape
     compliance       contact with a compliant wall
     drive            servos that slip
+    sheath           hinges of the links in a sheath
     device           state that the laws of effects read
     parameters       how the parameters of an effect's law are declared
 

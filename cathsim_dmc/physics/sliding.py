@@ -17,6 +17,7 @@ from cathsim_dmc.entities.chain import (
     MAX_ROTATION_SPEED,
     MAX_TORQUE,
     Chain,
+    hinge_time,
 )
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
@@ -25,7 +26,7 @@ from cathsim_dmc.laws import hinges, sliding
 from cathsim_dmc.laws.hinges import Bends
 from cathsim_dmc.laws.parameters import Array
 from cathsim_dmc.laws.springs import Springs
-from cathsim_dmc.physics import chain_fields
+from cathsim_dmc.physics import chain_fields, held
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.physics.effects import Draw, Effect, World
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
@@ -52,12 +53,17 @@ class SingleDevice(Effect):
     """
 
     data_fields: tuple[str, ...] = ("act",)
-    model_fields: tuple[str, ...] = ()
-    state = ("slipped", "told")
+    model_fields: tuple[str, ...] = held.FIELDS
+    state = ("slipped", "told", "_free")
 
-    def __init__(self, chain: Chain):
-        """Takes the entity of the device."""
-        self._device = chain.device
+    def __init__(self, chain: Chain, holds: bool = True):
+        """Takes the entity of the device.
+
+        Args:
+            holds: Whether the hinges hold the links that are in the sheath, which then
+                has no bore that does.
+        """
+        self._device, self._holds = chain.device, holds
         self._behind = BEHIND / float(chain.link_lengths[0])  # links
         if self._device.tip_shape:
             self.parameters = Springs
@@ -75,6 +81,10 @@ class SingleDevice(Effect):
         # The shape lies in the plane of x and z.
         rest = model.qpos_spring[places[:, 1]]
         self._springs = Springs(rest, 1 / model.jnt_stiffness[hinges_x])
+        self._held = held.Held(model, world.chain, places, world.start_depth)
+        # Stiffness, damping and rest angles of the joints without a sheath.
+        self._free = np.stack([self._held.nominal] * world.num_simulations)
+        self._sheathed: list[Any] = [None] * world.num_simulations
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Holds the base of one simulation where it stands."""
@@ -82,6 +92,32 @@ class SingleDevice(Effect):
         if self.parameters is Springs:
             self.world.parameters.rest[index] = self._springs.rest
             self.world.parameters.compliance[index] = self._springs.compliance
+        if not self._holds:
+            return
+        factor, loss = (
+            1.0 if value is None else value
+            for value in (episode.stiffness, episode.loss)
+        )
+        material = self._device.relaxation_time * loss
+        stiffness, damping, _ = self._free[index]
+        stiffness[:] = self._held.nominal[0] * factor
+        damping[:] = hinge_time(material, self.world.chain.timestep) * stiffness
+        self._find_hinges(index)
+        self._hold(index)
+
+    def _find_hinges(self, index: int) -> None:
+        fields = held.fields_of(lambda name: self.world.field(index, name))
+        self._sheathed[index] = fields
+
+    def _hold(self, index: int) -> None:
+        """Holds the links of one simulation that are in the sheath."""
+        insertion = self.world.arrays.qpos[index, self.world.index.insertion_qpos]
+        fields, out = self._sheathed[index], self._held.out
+        self._held.write(fields, self._free[index], insertion)
+        if self.parameters is Springs:
+            self.world.parameters.rest[index] = self._springs.rest * out
+            stiffness = fields.stiffness[self._held.joints.joint[:, 0]]
+            self.world.parameters.compliance[index] = 1 / stiffness
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Lets clamps slip; turns motors against the twist of the links."""
@@ -89,6 +125,9 @@ class SingleDevice(Effect):
         load = np.stack([state.push_force, state.push_torque], axis=1)
         command = action[:, motors:]
         self._drives.follow(command, load[:, : command.shape[1]])
+        if self._holds:
+            for index in range(len(action)):
+                self._hold(index)
         if not motors:
             return action
         angles = self.world.arrays.qpos[:, self._bends_qpos]
@@ -136,12 +175,21 @@ class SlidingDevices(SingleDevice):
 
     data_fields = ("cfrc_int", "act", "qfrc_applied")
     model_fields = chain_fields.FIELDS
-    state = ("slipped", "told", "_friction", "_factors", "_ways", "_drag", "_axial")
+    state = (
+        "slipped",
+        "told",
+        "_free",
+        "_friction",
+        "_factors",
+        "_ways",
+        "_drag",
+        "_axial",
+    )
     parameters = Positions
 
-    def __init__(self, stack: DeviceStack):
-        """Takes the entity of the devices."""
-        self._entity, self._stack = stack, stack.stack
+    def __init__(self, stack: DeviceStack, holds: bool = True):
+        """Takes the entity of the devices; see `SingleDevice`."""
+        self._entity, self._stack, self._holds = stack, stack.stack, holds
 
     def bind(self, world: World) -> None:
         """Finds the places in the model."""
@@ -173,7 +221,7 @@ class SlidingDevices(SingleDevice):
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Puts the devices of one simulation to the start of the chain."""
-        super().restart(index, episode, random_state)
+        self._drives.hold(index)
         gaps = self._entity.start_gaps
         self._insertion[index] = self._qpos[index, self._index.insertion_qpos] - gaps
         for each in (self._angles, self.slipped, self._ways, self._drag):
@@ -191,6 +239,7 @@ class SlidingDevices(SingleDevice):
         state = self._state(index, gaps, np.zeros((len(gaps), len(self._stack.spans))))
         friction = self._friction[index]
         sliding.lay(self._devices, state, friction, self._memory, self._chain)
+        self._find_hinges(index)
         self._write(index)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
@@ -253,6 +302,9 @@ class SlidingDevices(SingleDevice):
         """Writes the chain that a law has left into the model of one simulation."""
         factors, fields = self._factors[index].tolist(), self._fields[index]
         chain_fields.write(fields, self._places, self._chain, factors[0], factors[1])
+        if self._holds:
+            self._free[index] = self._held.read(self._sheathed[index])
+            self._hold(index)
 
     def _settle(self, rate: np.ndarray, lead: np.ndarray, state: Readings) -> None:
         """Turns the devices, writes the chains, computes the forces of the drives."""
@@ -381,8 +433,8 @@ def devices_at(entity: DeviceStack) -> sliding.Devices:
     )
 
 
-def devices_of(chain: Chain) -> SingleDevice:
-    """The effect by which actions move the devices of a chain."""
-    return (
-        SlidingDevices(chain) if isinstance(chain, DeviceStack) else SingleDevice(chain)
-    )
+def devices_of(chain: Chain, holds: bool = True) -> SingleDevice:
+    """The effect by which actions move the devices of a chain; see `SingleDevice`."""
+    if isinstance(chain, DeviceStack):
+        return SlidingDevices(chain, holds)
+    return SingleDevice(chain, holds)

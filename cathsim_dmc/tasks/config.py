@@ -36,6 +36,7 @@ _NUMBERS = {
     "friction": _FRICTION,
     "shaft_link": (2e-3, 0.1, "m"),
     "working_length": (*WORKING_LENGTHS, "m"),
+    "sheath_clearance": (0.1e-3, 2e-3, "m"),
 }
 # Range in which the physics holds (docs/physics.md); the library stays within it.
 _LONGEST_TIMESTEP = 5e-3  # s
@@ -66,6 +67,8 @@ class NavigationConfig:
         shaft_link: Length of the longest link of the shaft, m.
         working_length: Simulated length of the device, m; None for what the goal needs.
             Observations have one shape whatever it is.
+        sheath_clearance: Play of the device in the bore of the sheath all round, m;
+            None for a sheath that holds it on its axis (docs/physics.md).
         physics_timestep: Length of a physics step, s; it divides the control step.
         outside_range: Whether a physics step longer than 5 ms and a device stiffer than
             5000 N·mm², with which the physics does not hold, are warned of and not
@@ -94,6 +97,7 @@ class NavigationConfig:
     friction: float = FRICTION
     shaft_link: float = 0.0175
     working_length: float | None = None
+    sheath_clearance: float | None = None
     physics_timestep: float = PHYSICS_TIMESTEP
     outside_range: bool = False
     # What makes an object is given; the object is here after validation.
@@ -134,7 +138,8 @@ class NavigationConfig:
         delay = ActionDelay(self.randomisation.longest_delay)
         model = RandomisedModel(self.randomisation)
         blood, walls = self.vessel.effects()
-        return [blood, model, delay, *walls, *own, devices_of(chain)]
+        devices = devices_of(chain, holds=self.sheath_clearance is None)
+        return [blood, model, delay, *walls, *own, devices]
 
     def _check_devices(self):
         if self.devices is None:

@@ -94,7 +94,7 @@ class Scene:
             arena=AngiographyArena(device_density=catheter.density),
             phantom=Phantom(anatomy, friction, goal_radius, drawn),
             catheter=catheter,
-            sheath=Sheath(bore, device_radius=radius),
+            sheath=Sheath(bore, radius, clearance=config.sheath_clearance),
             robot=Robot(device_radius=radius),
         )
         moving = config.vessel.motion is not None

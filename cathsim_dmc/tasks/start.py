@@ -14,6 +14,7 @@ from cathsim_dmc.laws.field import FREE
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.effects import Draw
+from cathsim_dmc.physics.held import Held
 from cathsim_dmc.physics.randomisation import START_JITTER, start_displacement
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
@@ -298,8 +299,13 @@ def _settle(
         scene.catheter.link_lengths, scene.placement.line, at
     )
     hold(model, data)
-    for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
-        mujoco.mj_step(model, data)
+    depth = scene.placement.start_depth
+    with contextlib.ExitStack() as stack:
+        if not scene.sheath.touches:
+            held = Held(model, scene.catheter, index.bends_qpos, depth)
+            stack.enter_context(held.at(model, at))
+        for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
+            mujoco.mj_step(model, data)
     _refuse_outside(scene, model, index, data)
     return _Posture(scene, model, index, shape, data, advance)
 

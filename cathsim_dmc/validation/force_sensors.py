@@ -9,6 +9,7 @@ import numpy as np
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
+from cathsim_dmc.entities.sheath import CLEARANCE
 from cathsim_dmc.physics import forces
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
@@ -77,7 +78,8 @@ def dead_end(command: float, size: tuple[float, float] = GUIDING_TUBE) -> DeadEn
         command: of the translation, in (0, 1].
         size: length and radius of the tube, m.
     """
-    environment = in_tube(size)
+    # Bare physics steps do not hold the device in the sheath.
+    environment = in_tube(size, sheath_clearance=CLEARANCE)
     task = environment.task
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
     motor = model.actuator(f"{task.scene.catheter.mjcf_model.model}/insertion").id

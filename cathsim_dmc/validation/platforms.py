@@ -86,6 +86,6 @@ def checks() -> Iterator[Check]:
         unit, scale = ("mm", 1e3) if joint == "insertion" else ("rad", 1.0)
         over, bound = scale * one.overshoot, scale * OVERSHOOT_BOUND[joint]
         yield Check.at_most(f"{name}speed over the largest", one.speed, SPEED_BOUND)
-        each = one.acceleration, ACCELERATION_BOUND
-        yield Check.at_most(f"{name}acceleration over the largest", *each)
+        what, most = f"{name}acceleration over the largest", ACCELERATION_BOUND
+        yield Check.at_most(what, one.acceleration, most)
         yield Check.at_most(f"{name}overshoot", over, bound, unit)

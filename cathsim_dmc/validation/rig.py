@@ -94,8 +94,7 @@ def slider(spec: mujoco.MjSpec, axes: Any, pos: Any = (0, 0, 0), **geom: Any):
 class Rig:
     """A device, or coaxial ones, alone in the arena of the tasks, with their settings.
 
-    It lies along +z, its base at insertion 0. Gravity is off; the default device, whose
-    buoyancy counts its lumen, has no weight in blood.
+    It lies along +z, its base at insertion 0. Gravity is off.
 
     Attributes:
         arena: to which a test adds its own fixtures before `compile`.

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from cathsim_dmc.entities import chain, devices
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
-from cathsim_dmc.validation import damping, helix, modes, platforms, theory
+from cathsim_dmc.validation import damping, helix, modes, platforms, sheath, theory
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import RESTING_TIME, Rig
 
@@ -316,6 +316,7 @@ def _checks(data: dict[str, Any]) -> Iterator[Check]:
     name = "drive, force at which the clamp slips"
     yield Check.deviation(name, slip_force(), chain.MAX_PUSH_FORCE, SLIP_BOUND, "N")
     yield from platforms.checks()
+    yield from sheath.checks()
     yield from damping.checks()
     yield from modes.checks()
     yield from helix.checks()

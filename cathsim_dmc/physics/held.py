@@ -1,0 +1,84 @@
+"""Links in the sheath, held along its axis by the stiffness of their hinges.
+
+`laws.sheath` has the law.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterator
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.entities.chain import Chain
+from cathsim_dmc.laws import sheath
+
+FIELDS = ("jnt_stiffness", "dof_damping", "qpos_spring")
+
+
+class Held:
+    """The hinges of a chain in a sheath.
+
+    Attributes:
+        joints: `laws.sheath.Joints`.
+        nominal: (3, J, 2), stiffness, damping and rest angles without a sheath.
+        out: (J,), fraction of the compliance of each joint that was out of the sheath
+            when last written.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        chain: Chain,
+        bends_qpos: np.ndarray,
+        start_depth: float,
+    ):
+        """Finds the hinges in a model whose fields are those without a sheath.
+
+        Args:
+            model: Without a sheath.
+            chain: The entity.
+            bends_qpos: (J, 2), see `readings.ModelIndex`.
+            start_depth: Way of the chain's end past the mouth at insertion 0, m.
+        """
+        lengths = chain.link_lengths
+        places = np.cumsum(lengths)[:-1] - np.sum(lengths) + start_depth
+        joint = np.searchsorted(model.jnt_qposadr, bends_qpos)
+        dofs, qpos = model.jnt_dofadr[joint].astype(np.int64), bends_qpos
+        self.joints = sheath.Joints(
+            joint=joint,
+            dof=dofs,
+            qpos=qpos.astype(np.int64),
+            place=places,
+            behind=lengths[:-1] / 2,
+            ahead=lengths[1:] / 2,
+            distal=chain.distal_shares,
+        )
+        self.nominal = self.read(fields_of(lambda name: getattr(model, name)))
+        self.out = np.ones(len(places))
+
+    def read(self, fields: sheath.Hinges) -> np.ndarray:
+        """Values (3, J, 2) of the hinges in the fields of a model."""
+        pairs = zip(fields, self.joints[:3], strict=True)
+        return np.array([field[places] for field, places in pairs])
+
+    def write(self, fields: sheath.Hinges, free: np.ndarray, insertion: float) -> None:
+        """Writes the fields of hinges whose values are (3, J, 2) without a sheath."""
+        values = sheath.Hinges._make(free)
+        sheath.hold(self.joints, float(insertion), values, fields, self.out)
+
+    @contextlib.contextmanager
+    def at(self, model: mujoco.MjModel, insertion: float) -> Iterator[None]:
+        """Holds the links in a model at an insertion, m, within a `with` block."""
+        fields = fields_of(lambda name: getattr(model, name))
+        before = [field.copy() for field in fields]
+        self.write(fields, self.nominal, insertion)
+        try:
+            yield
+        finally:
+            for field, values in zip(fields, before, strict=True):
+                field[:] = values
+
+
+def fields_of(field: Callable[[str], np.ndarray]) -> sheath.Hinges:
+    """Live fields of a model, by a function that gives one by its name."""
+    return sheath.Hinges._make(map(field, FIELDS))
