@@ -109,4 +109,4 @@ def wall_force(rows: np.ndarray) -> tuple[WallForce, np.ndarray]:
     from cathsim_dmc.physics import forces_loops  # late, as numba takes long
 
     found = forces_loops.summed(rows, CONTACT_SIZE)
-    return WallForce._make(found[:4]), found[4]
+    return WallForce._make(found[:6]), found[6]
