@@ -231,6 +231,8 @@ def test_what_lies_outside_the_range_is_taken_with_a_warning():
         (lambda e, p: animate(e, None, p, width=True), "width is True"),
         (lambda e, p: animate(e, None, p, quality=1e9), "quality is 1000000000.0"),
         (lambda e, p: write_rrd("x", None, p), "episode is 'x'"),
+        (lambda e, p: write_rrd(e, (1, 2), p), "surface is"),
+        (lambda e, p: animate(e, (1, 2), p), "surface is"),
         (lambda e, p: write_rrd(e, None, p, fluoroscopy=[1]), "fluoroscopy is int64"),
         (lambda e, p: compare_forces(e.task), "episode is 'type1_bca'"),
         (lambda e, p: wall_pieces("type1"), "anatomy is 'type1'"),

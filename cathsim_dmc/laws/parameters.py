@@ -30,11 +30,31 @@ class Array:
 def shapes(kind: Any, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
     """Shape of each field of a NamedTuple of parameters, () for a scalar.
 
-    Args:
-        kind: NamedTuple class.
-        sizes: Sizes of the chain by name.
+        Args:
+    <<<<<<< HEAD
+            kind: NamedTuple class.
+            sizes: Sizes of the chain by name.
+    =======
+            kind: The class.
+            sizes: The named sizes.
+
+        Raises:
+            ValueError: if it is another class, a field has another default than an
+                `Array`, or the shape of one names no size.
+    >>>>>>> 57af447 (A law that numba cannot compile, parameters that are none, and surfaces of another kind are named)
     """
-    declared = kind._field_defaults
+    declared = getattr(kind, "_field_defaults", None)
+    if declared is None or not all(isinstance(a, Array) for a in declared.values()):
+        raise ValueError(
+            f"the parameters of a law are {kind!r}; give a NamedTuple, whose fields "
+            "have no default or an Array of cathsim_dmc.laws.parameters"
+        )
+    named = {each for array in declared.values() for each in array.shape}
+    if odd := [one for one in named if isinstance(one, str) and one not in sizes]:
+        raise ValueError(
+            f"{kind.__name__} has arrays of {', '.join(sorted(odd))}; sizes are "
+            f"numbers or of {', '.join(sizes)}"
+        )
     return {
         name: _shape(declared[name].shape, sizes) if name in declared else ()
         for name in kind._fields

@@ -9,11 +9,13 @@ where somebody has removed them; what replaces them without calling them is foll
 import ctypes
 import functools
 import hashlib
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from numba.core.errors import NumbaError
 
 from cathsim_dmc import bounds
 from cathsim_dmc.collision import native, own
@@ -185,14 +187,22 @@ def laws(effect: Any, kind: Any, start: int) -> list[Law]:
         start: Their place in `userdata`.
 
     Raises:
-        ValueError: if the effect does not say where its law acts.
+        ValueError: if the effect does not say where its law acts, or the law cannot be
+            compiled.
     """
     name, adapter = type(effect).__qualname__, None
     if effect.adapter is not None:
         adapter = getattr(adapters, effect.adapter)
     elif effect.law is not None:
         bounds.choice(f"{name}.acts_in", effect.acts_in, ACTS_IN)
-        adapter = adapters.made(effect.law, kind, effect.acts_in)
+        try:
+            adapter = adapters.made(effect.law, kind, effect.acts_in)
+        except NumbaError as error:
+            text = " ".join(re.sub(r"\x1b\[[0-9;]*m", "", str(error)).split())
+            raise ValueError(
+                f"numba cannot compile {name}.law, a function of parameters, time and "
+                f"what it acts on, numbers and arrays alone (CONTRIBUTING.md): {text}"
+            ) from error
     return [] if adapter is None else [Law(name, effect.acts_in, adapter, start)]
 
 

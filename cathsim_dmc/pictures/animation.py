@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from cathsim_dmc import bounds
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.files import atomic_path, require_file
 from cathsim_dmc.pictures import figure as drawing
 from cathsim_dmc.pictures.films import MP4, check_film, write_mp4
@@ -62,6 +63,7 @@ def animate(
     bounds.whole("frames", frames, 1, bounds.MOST_STEPS)
     bounds.whole("width", width, _NARROWEST, bounds.MOST_PIXELS)
     bounds.whole("quality", quality, 0, 100)
+    bounds.instance("surface", surface, Surface)
     path = Path(path)
     check_film(path)
     require_file(path)

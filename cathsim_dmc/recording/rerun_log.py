@@ -70,6 +70,7 @@ def write_rrd(
     if fluoroscopy is not None:
         shape = (episode.steps + 1, -1, -1, -1)
         fluoroscopy = bounds.array("fluoroscopy", fluoroscopy, "u", shape)
+    bounds.instance("surface", surface, Surface)
     planes = 0 if fluoroscopy is None else fluoroscopy.shape[-1]
     robot_geoms = tuple(robot_geoms)
     with atomic_path(path, ".rrd") as temporary:
