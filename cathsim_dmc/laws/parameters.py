@@ -30,18 +30,13 @@ class Array:
 def shapes(kind: Any, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
     """Shape of each field of a NamedTuple of parameters, () for a scalar.
 
-        Args:
-    <<<<<<< HEAD
-            kind: NamedTuple class.
-            sizes: Sizes of the chain by name.
-    =======
-            kind: The class.
-            sizes: The named sizes.
+    Args:
+        kind: NamedTuple class.
+        sizes: Sizes of the chain by name.
 
-        Raises:
-            ValueError: if it is another class, a field has another default than an
-                `Array`, or the shape of one names no size.
-    >>>>>>> 57af447 (A law that numba cannot compile, parameters that are none, and surfaces of another kind are named)
+    Raises:
+        ValueError: if it is another class, a field has another default than an
+            `Array`, or the shape of one names no size.
     """
     declared = getattr(kind, "_field_defaults", None)
     if declared is None or not all(isinstance(a, Array) for a in declared.values()):

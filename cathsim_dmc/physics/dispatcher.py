@@ -83,6 +83,19 @@ class Law(NamedTuple):
     adapter: Any
     start: int
 
+    @property
+    def address(self) -> int:
+        """Address of the adapter, compiled; ValueError if that cannot be."""
+        try:
+            return self.adapter.address
+        except NumbaError as error:
+            text = " ".join(re.sub(r"\x1b\[[0-9;]*m", "", str(error)).split())
+            raise ValueError(
+                f"numba cannot compile {self.name}.law, a function of parameters, time "
+                "and what it acts on, with numbers and arrays alone (CONTRIBUTING.md): "
+                f"{text}"
+            ) from error
+
 
 class Places(NamedTuple):
     """Where laws find a device and its vessel in a model.
@@ -161,7 +174,7 @@ class Layout:
     def _list(self, *callbacks: str) -> np.ndarray:
         """Number of the laws of a callback, then adapter and parameters of each."""
         found = [law for name in callbacks for law in self._laws if law.acts_in == name]
-        rows = [(law.adapter.address, law.start) for law in found]
+        rows = [(law.address, law.start) for law in found]
         return np.array([len(rows), *np.ravel(rows)], np.int64)
 
     def raise_fault(self) -> None:
@@ -187,22 +200,14 @@ def laws(effect: Any, kind: Any, start: int) -> list[Law]:
         start: Their place in `userdata`.
 
     Raises:
-        ValueError: if the effect does not say where its law acts, or the law cannot be
-            compiled.
+        ValueError: if the effect does not say where its law acts.
     """
     name, adapter = type(effect).__qualname__, None
     if effect.adapter is not None:
         adapter = getattr(adapters, effect.adapter)
     elif effect.law is not None:
         bounds.choice(f"{name}.acts_in", effect.acts_in, ACTS_IN)
-        try:
-            adapter = adapters.made(effect.law, kind, effect.acts_in)
-        except NumbaError as error:
-            text = " ".join(re.sub(r"\x1b\[[0-9;]*m", "", str(error)).split())
-            raise ValueError(
-                f"numba cannot compile {name}.law, a function of parameters, time and "
-                f"what it acts on, numbers and arrays alone (CONTRIBUTING.md): {text}"
-            ) from error
+        adapter = adapters.made(effect.law, kind, effect.acts_in)
     return [] if adapter is None else [Law(name, effect.acts_in, adapter, start)]
 
 
