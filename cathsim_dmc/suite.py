@@ -91,6 +91,8 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
     Raises:
         ValueError: if the name is taken.
     """
+    bounds.text("name", name)
+    bounds.instance("definition", definition, TaskDefinition)
     if name in TASKS:
         raise ValueError(f"there is a task {name!r} already; choose another name")
     TASKS[name] = definition

@@ -8,15 +8,23 @@ import numpy as np
 import pytest
 from conftest import OBSERVATIONS, TASKS
 from dm_control.composer.variation import distributions
+from recording_samples import make_episode
 
 from cathsim_dmc import suite
+from cathsim_dmc.agents import evaluate, record_demonstrations
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.export import wall_pieces
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.physics.randomisation import Randomisation
+from cathsim_dmc.pictures.animation import animate
+from cathsim_dmc.play import play
+from cathsim_dmc.recording.rerun_log import write_rrd
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.simulation.mjcf import write_mjcf
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.validation.force_sensors import compare_forces
 
 STIFF = dataclasses.replace(
     devices.get("steerable_5f"), name="stiff", shaft=devices.Section(6e-3, 5e-3)
@@ -213,3 +221,30 @@ def test_a_distribution_of_ones_own_is_held_to_the_bounds_when_it_is_drawn():
 def test_what_lies_outside_the_range_is_taken_with_a_warning():
     with pytest.warns(UserWarning, match=r"0.02 s, but the physics holds up to 0.005"):
         NavigationConfig(physics_timestep=0.02, outside_range=True)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda e, p: animate(3, None, p), "episode is 3; it must be a Episode"),
+        (lambda e, p: animate(e, None, p, frames=0), "frames is 0.*from 1"),
+        (lambda e, p: animate(e, None, p, width=True), "width is True"),
+        (lambda e, p: animate(e, None, p, quality=1e9), "quality is 1000000000.0"),
+        (lambda e, p: write_rrd("x", None, p), "episode is 'x'"),
+        (lambda e, p: write_rrd(e, (1, 2), p), "surface is"),
+        (lambda e, p: animate(e, (1, 2), p), "surface is"),
+        (lambda e, p: write_rrd(e, None, p, fluoroscopy=[1]), "fluoroscopy is int64"),
+        (lambda e, p: compare_forces(e.task), "episode is 'type1_bca'"),
+        (lambda e, p: wall_pieces("type1"), "anatomy is 'type1'"),
+        (lambda e, p: suite.register("own", None), "definition is None"),
+        (lambda e, p: suite.register(7, suite.TASKS["type1_bca"]), "name is 7"),
+        (lambda e, p: write_mjcf("type1_bca", p, task_kwargs=[1]), "task_kwargs is "),
+        (lambda e, p: play("type1_bca", task_kwargs="x"), "task_kwargs is 'x'"),
+        (lambda e, p: record_demonstrations("type1_bca", p, task_kwargs=1), "task_kw"),
+        (lambda e, p: evaluate("push", "type1_bca", task_kwargs=[[1]]), "task_kwargs"),
+    ],
+)
+def test_arguments_of_another_kind_are_named_before_any_work(call, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        call(make_episode(), tmp_path / "new.gif")
+    assert not list(tmp_path.iterdir())

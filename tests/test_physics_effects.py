@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -264,6 +265,12 @@ def test_what_stood_in_mujoco_before_is_still_called(kind):
         assert "compiled functions cannot call" in done.stderr
 
 
+class _Vague(NamedTuple):
+    """Parameters with another default than an array."""
+
+    force: float = 1.0
+
+
 def test_what_is_no_effect_is_refused(windy):
     with pytest.raises(ValueError, match=r"effects.*physics\.effects\.Effect"):
         suite.make_task("simple1_bca", effects=[3])
@@ -271,6 +278,14 @@ def test_what_is_no_effect_is_refused(windy):
     lost.acts_in = "actuators"
     with pytest.raises(ValueError, match="SideWind.acts_in.*passive, control, contact"):
         suite.load("cathsim", "simple1_bca", {"effects": [lost]})
+    short = SideWind(WIND)
+    short.law = lambda wind: None
+    with pytest.raises(ValueError, match="compile SideWind.law, a function of param"):
+        suite.load("cathsim", "simple1_bca", {"effects": [short]})
+    for kind, words in ((dict, "a NamedTuple"), (_Vague, "a NamedTuple")):
+        short.parameters = kind
+        with pytest.raises(ValueError, match=words):
+            suite.make_task("simple1_bca", effects=[short])
     silent = suite.environment(windy("simple1_bca"))
     silent.reset()
     silent.task.rollout.effects[-2].act = lambda action, state: None

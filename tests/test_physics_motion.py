@@ -7,6 +7,7 @@ import pytest
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.collision import fields
+from cathsim_dmc.laws import blood, heart
 from cathsim_dmc.physics.vessel import VesselOptions
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import motion, rig
@@ -132,3 +133,16 @@ def test_fluoroscopy_shows_the_vessel_where_it_is():
     there = plane.around(task.rollout.moving.surface(0))
     np.testing.assert_array_equal(vessel_now, there.vessel_mask)
     assert (vessel_now != plane.vessel_mask).mean() > 0.02
+
+
+def test_numbers_that_are_none_reach_no_place_of_an_array(shared_environment):
+    """Where they did, a physics step ended the process."""
+    assert np.isnan(heart.pulse(np.nan)[0]) and np.isnan(blood.beat(np.nan))
+    env = shared_environment("simple1_bca", vessel="living")
+    for place in range(2, 11):  # the parameters of the motion, from the last on
+        env.reset()
+        env.physics.data.userdata[-place] = np.nan
+        try:
+            assert np.isfinite(env.step(np.zeros(21)).reward)
+        except ValueError as error:  # of the objective: its reward is no number
+            assert "finite" in str(error) or "nan" in str(error)

@@ -62,6 +62,8 @@ def test_what_cannot_be_repeated_is_refused(episodes, tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             export(given, tmp_path / "x", task_kwargs=options)
+    with pytest.raises(ValueError, match="an episode is 3"):
+        export([3], tmp_path / "x")
     with pytest.raises(FileExistsError):
         export(episodes, tmp_path)
     assert not (tmp_path / "x").exists()

@@ -98,7 +98,7 @@ def record_demonstrations(
     from cathsim_dmc.simulation import gymnasium
 
     names = observation if isinstance(observation, str) else list(observation)
-    options = {**(task_kwargs or {}), "observation": names}
+    options = bounds.options("task_kwargs", task_kwargs) | {"observation": names}
     count = min(episodes, _SIMULATIONS)
     made = suite.make_task(task, **options)
     simulation = BatchSimulation(made, count, num_threads=num_threads or 0)

@@ -89,6 +89,7 @@ def evaluate(
             `start` does not fit, or the cluster has too few processors.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
+    bounds.options("task_kwargs", task_kwargs)
     plan = _Plan.of(
         policy, task, episodes, seed, protocol, observation, task_kwargs, start
     )

@@ -73,7 +73,7 @@ def wall_pieces(anatomy: Anatomy, wall: str = "merged") -> tuple[np.ndarray, ...
         ModuleNotFoundError: if CoACD is asked for and not installed.
     """
     check_wall(wall)
-    shell = _shell(anatomy)
+    shell = _shell(bounds.instance("anatomy", anatomy, Anatomy))
     return (*WALLS[wall](anatomy, shell), *shell.cap)
 
 

@@ -82,7 +82,7 @@ def _kernels() -> Finding:
 def _opengl() -> Finding:
     command = [sys.executable, "-c", _OPENGL]
     works = not subprocess.run(command, capture_output=True, check=False).returncode
-    advice = "" if works else "physics.render and viewers need it: try MUJOCO_GL=egl"
+    advice = "" if works else "rgb, depth and viewers need it: try MUJOCO_GL=egl"
     setting = os.environ.get("MUJOCO_GL", "not set")
     found = f"{'works' if works else 'none'} (MUJOCO_GL {setting})"
     return Finding("OpenGL", found, note=advice)

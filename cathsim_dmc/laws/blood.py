@@ -11,7 +11,7 @@ import math
 from typing import Any, NamedTuple
 
 from cathsim_dmc.compiled import compiled
-from cathsim_dmc.laws.heart import BEAT
+from cathsim_dmc.laws.heart import BEAT, place_in
 from cathsim_dmc.laws.parameters import Array
 
 
@@ -44,9 +44,7 @@ class Blood(NamedTuple):
 @compiled
 def beat(phase):
     """Inflow of the aorta over that at its peak, at a phase in beats."""
-    place = (phase - math.floor(phase)) * (len(BEAT) - 1)
-    first = min(int(place), len(BEAT) - 2)
-    share = place - first
+    first, share = place_in(phase, len(BEAT))
     return (1.0 - share) * BEAT[first] + share * BEAT[first + 1]
 
 

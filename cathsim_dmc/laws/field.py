@@ -84,9 +84,10 @@ def depth_at(field, point):
     edge = head[EDGE]
     a, b, c = int(head[SHAPE]), int(head[SHAPE + 1]), int(head[SHAPE + 2])
     u, v, w = (x - head[0]) / edge, (y - head[1]) / edge, (z - head[2]) / edge
-    uu = min(max(u, 0.0), a - 1e-9)
-    vv = min(max(v, 0.0), b - 1e-9)
-    ww = min(max(w, 0.0), c - 1e-9)
+    # NaN is in the first cell: `max` would leave it, and no cell has that number.
+    uu = min(u if u > 0.0 else 0.0, a - 1e-9)
+    vv = min(v if v > 0.0 else 0.0, b - 1e-9)
+    ww = min(w if w > 0.0 else 0.0, c - 1e-9)
     i, j, k = int(uu), int(vv), int(ww)
     beyond = 0.0
     if u != uu or v != vv or w != ww:

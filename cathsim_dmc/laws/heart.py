@@ -34,9 +34,16 @@ PULSE = _pulse()
 
 
 @law
+def place_in(phase, count):
+    """Row of a course of a beat in so many rows, and share of the way to the next."""
+    place = (phase - math.floor(phase)) * (count - 1)
+    first = min(int(place), count - 2) if place >= 0.0 else 0  # NaN is in no row
+    return first, place - first
+
+
+@law
 def pulse(phase):
     """Share (0 to 1) of the pulse's growth at a phase in beats, and its derivative."""
-    place = (phase - math.floor(phase)) * (len(PULSE) - 1)
-    first = min(int(place), len(PULSE) - 2)
+    first, share = place_in(phase, len(PULSE))
     slope = PULSE[first + 1] - PULSE[first]
-    return PULSE[first] + (place - first) * slope, slope * (len(PULSE) - 1)
+    return PULSE[first] + share * slope, slope * (len(PULSE) - 1)

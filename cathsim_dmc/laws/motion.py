@@ -116,7 +116,8 @@ def _cell(place, count):
     """Cell of a lattice, share of it, and 0 outside, where nothing changes, else 1."""
     last = count - 1.0
     inside = 1.0 if 0.0 <= place <= last else 0.0
-    place = min(max(place, 0.0), last - 1e-9)
+    # NaN, which `max` would leave, is in the first cell.
+    place = min(place if place > 0.0 else 0.0, last - 1e-9)
     return int(place), place - int(place), inside
 
 

@@ -33,8 +33,23 @@ def shapes(kind: Any, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
     Args:
         kind: NamedTuple class.
         sizes: Sizes of the chain by name.
+
+    Raises:
+        ValueError: if it is another class, a field has another default than an
+            `Array`, or the shape of one names no size.
     """
-    declared = kind._field_defaults
+    declared = getattr(kind, "_field_defaults", None)
+    if declared is None or not all(isinstance(a, Array) for a in declared.values()):
+        raise ValueError(
+            f"the parameters of a law are {kind!r}; give a NamedTuple, whose fields "
+            "have no default or an Array of cathsim_dmc.laws.parameters"
+        )
+    named = {each for array in declared.values() for each in array.shape}
+    if odd := [one for one in named if isinstance(one, str) and one not in sizes]:
+        raise ValueError(
+            f"{kind.__name__} has arrays of {', '.join(sorted(odd))}; sizes are "
+            f"numbers or of {', '.join(sizes)}"
+        )
     return {
         name: _shape(declared[name].shape, sizes) if name in declared else ()
         for name in kind._fields

@@ -9,11 +9,13 @@ where somebody has removed them; what replaces them without calling them is foll
 import ctypes
 import functools
 import hashlib
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from numba.core.errors import NumbaError
 
 from cathsim_dmc import bounds
 from cathsim_dmc.collision import native, own
@@ -80,6 +82,19 @@ class Law(NamedTuple):
     acts_in: str
     adapter: Any
     start: int
+
+    @property
+    def address(self) -> int:
+        """Address of the adapter, compiled; ValueError if that cannot be."""
+        try:
+            return self.adapter.address
+        except NumbaError as error:
+            text = " ".join(re.sub(r"\x1b\[[0-9;]*m", "", str(error)).split())
+            raise ValueError(
+                f"numba cannot compile {self.name}.law, a function of parameters, time "
+                "and what it acts on, with numbers and arrays alone (CONTRIBUTING.md): "
+                f"{text}"
+            ) from error
 
 
 class Places(NamedTuple):
@@ -159,7 +174,7 @@ class Layout:
     def _list(self, *callbacks: str) -> np.ndarray:
         """Number of the laws of a callback, then adapter and parameters of each."""
         found = [law for name in callbacks for law in self._laws if law.acts_in == name]
-        rows = [(law.adapter.address, law.start) for law in found]
+        rows = [(law.address, law.start) for law in found]
         return np.array([len(rows), *np.ravel(rows)], np.int64)
 
     def raise_fault(self) -> None:

@@ -215,7 +215,7 @@ def velocities(points, growth, segments, out):
     ends, radii, shares, ways, vessel = segments
     count = len(vessel)
     nearest = np.empty(vessel[-1] + 1)
-    segment = np.empty(vessel[-1] + 1, np.int64)
+    segment = np.zeros(vessel[-1] + 1, np.int64)  # of a place that is none, the first
     for p in range(len(points)):
         nearest[:] = np.inf
         k = 0

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from cathsim_dmc import bounds
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.files import atomic_path, require_file
 from cathsim_dmc.pictures import figure as drawing
 from cathsim_dmc.pictures.films import MP4, check_film, write_mp4
@@ -21,7 +23,7 @@ _SHORTEST, _LONGEST = 2.0, 12.0  # s of a film, without its last pause
 # The last frame stays for so long before it begins again, ms.
 _HOLD_MS = 1500
 _TICK_MS = 20  # browsers do not show frames that are shorter
-_DPI = 100
+_DPI, _NARROWEST = 100, 64  # px
 _MARGIN = 8e-3  # around the vessel, m
 _FORCE_COLOUR = "#b3202c"
 # A film shows the noise of fluoroscopy, at a multiple of the usual dose.
@@ -57,6 +59,11 @@ def animate(
         FileNotFoundError: if the folder does not exist.
         ImportError: if an MP4 is asked for and cannot be encoded.
     """
+    bounds.instance("episode", episode, Episode)
+    bounds.whole("frames", frames, 1, bounds.MOST_STEPS)
+    bounds.whole("width", width, _NARROWEST, bounds.MOST_PIXELS)
+    bounds.whole("quality", quality, 0, 100)
+    bounds.instance("surface", surface, Surface)
     path = Path(path)
     check_film(path)
     require_file(path)

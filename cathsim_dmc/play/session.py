@@ -57,6 +57,7 @@ def play(
     if episodes is not None:
         bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
     bounds.choice("hands", hands, HANDS)
+    options = bounds.options("task_kwargs", task_kwargs)
     if out is not None:
         files.require_folder(out, make=True)
     held = hand(hands)
@@ -64,7 +65,7 @@ def play(
         seeds = (
             itertools.count(seed) if episodes is None else range(seed, seed + episodes)
         )
-        return _play(task, out, seeds, speed, dict(task_kwargs or {}), policy, held)
+        return _play(task, out, seeds, speed, options, policy, held)
 
 
 def _play(

@@ -201,7 +201,7 @@ def export(
     extras.require("gym", "gymnasium", "minari", "h5py")
     from cathsim_dmc.simulation import gymnasium
 
-    episodes = list(episodes)
+    episodes = [bounds.instance("an episode", each, Episode) for each in episodes]
     task, options = _common(episodes)
     options |= bounds.options("task_kwargs", task_kwargs)
     if observation is not None:

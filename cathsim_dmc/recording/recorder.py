@@ -80,7 +80,7 @@ class EpisodeRecorder:
     ) -> None:
         self._env, self._task = env, navigation_of(env)
         self._task_name = task_name or type(env.task).__name__
-        self._task_kwargs = dict(task_kwargs or {})
+        self._task_kwargs = bounds.options("task_kwargs", task_kwargs)
 
     def record_episode(
         self, policy: Policy, seed: int | None = None, max_steps: int | None = None

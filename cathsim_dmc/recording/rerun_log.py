@@ -14,6 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.error_utils import catch_and_log_exceptions
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.recording import rerun_scene, rerun_text
@@ -65,6 +66,11 @@ def write_rrd(
     Returns:
         The path.
     """
+    bounds.instance("episode", episode, Episode)
+    if fluoroscopy is not None:
+        shape = (episode.steps + 1, -1, -1, -1)
+        fluoroscopy = bounds.array("fluoroscopy", fluoroscopy, "u", shape)
+    bounds.instance("surface", surface, Surface)
     planes = 0 if fluoroscopy is None else fluoroscopy.shape[-1]
     robot_geoms = tuple(robot_geoms)
     with atomic_path(path, ".rrd") as temporary:

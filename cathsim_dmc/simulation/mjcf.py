@@ -66,7 +66,8 @@ def write_mjcf(
         raise FileExistsError(f"{directory} exists; give a directory that does not")
     bounds.choice("task", task, suite.SUITE)
     check_wall(wall)
-    options = {**(task_kwargs or {}), "random": bounds.seed("seed", seed)}
+    options = bounds.options("task_kwargs", task_kwargs)
+    options["random"] = bounds.seed("seed", seed)
     env = suite.load(suite.DOMAIN, task, options)
     if env.task.num_anatomies > 1:
         raise ValueError(

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from cathsim_dmc import policies, suite
+from cathsim_dmc import bounds, policies, suite
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.sheath import CLEARANCE
 from cathsim_dmc.physics import forces
@@ -179,7 +179,9 @@ def compare_forces(
     Raises:
         ValueError: if the episode has too few contacts, or a number is not positive.
     """
-    episode = expert_cannulation() if episode is None else episode
+    if episode is None:
+        episode = expert_cannulation()
+    bounds.instance("episode", episode, Episode)
     samples = protocol.load_cell_samples(episode)
     found = protocol.compare(samples, mean, sd, margin)
     about = {"task": episode.task, "termination": episode.termination, **found}

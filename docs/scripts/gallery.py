@@ -56,6 +56,7 @@ def _shipped(task: str, caption: str) -> Clip:
     return Clip(task, caption, f"pretrained:{task}", task, EVALUATION, own_task=True)
 
 
+# A row for each family of tasks: as published, from the groin, any arch, coaxial ones.
 CLIPS = (
     _shipped("type1_bca", "PPO, Type I, brachiocephalic artery"),
     _shipped("type1_lcca", "PPO, Type I, left common carotid"),
@@ -64,7 +65,6 @@ CLIPS = (
         "femoral", "Expert from the groin, Type III", "expert", "femoral_type3_lcca", 1
     ),
     Clip("bovine", "Expert, bovine arch", "expert", "femoral_bovine_lcca", 1),
-    Clip("jam", "A straight push passes and jams", "push", "type1_lcca", 0, 120),
     Clip(
         "living",
         "Expert, living vessel",
@@ -82,24 +82,32 @@ CLIPS = (
         own_task=True,
         options={"first": 7, "pool": 1},
     ),
+    Clip(
+        "navigate",
+        "Expert in any anatomy, such as your scan's folder",
+        "expert",
+        "navigate",
+        1,
+        options={"anatomy": "type2", "goal": "bca", "access": "descending"},
+    ),
     Clip("simple", "Expert, drawn arch", "expert", "simple1_lcca", 1),
-    Clip("wire", "Expert, guidewire alone", "expert", "femoral_type1_bca_wire", 1),
     Clip(
         "pair",
-        "Clone of the expert, guidewire in catheter",
+        "Learnt from the expert, guidewire in catheter",
         "pretrained:femoral_type1_lcca_pair",
         "femoral_type1_lcca_pair",
         EVALUATION,
         own_task=True,
     ),
     Clip(
-        "navigate",
-        "Expert in any anatomy: your scan by its folder",
+        "wire",
+        "Expert, guidewire alone: it does not reach",
         "expert",
-        "navigate",
+        "femoral_type1_bca_wire",
         1,
-        options={"anatomy": "type2", "goal": "bca", "access": "descending"},
+        200,
     ),
+    Clip("jam", "A straight push passes and jams", "push", "type1_lcca", 0, 120),
 )
 
 
