@@ -11,10 +11,10 @@ from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End, Inlet, Surface
-from cathsim_dmc.anatomy.scan import importer, units
+from cathsim_dmc.anatomy.scan import units
 from cathsim_dmc.anatomy.scan.curves import read_curve, vessel_name
 from cathsim_dmc.anatomy.scan.importer import import_scan
-from cathsim_dmc.anatomy.scan.places import cut_open, describe
+from cathsim_dmc.anatomy.scan.places import cut_open, describe, opened_at_inlet
 from cathsim_dmc.anatomy.scan.tree import name_trunk
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
@@ -177,7 +177,7 @@ def test_less_is_cut_off_where_the_inlet_would_meet_a_branch():
     root = Vessel("aorta", tube_line((0, 0, 0), (0, 0, 60), 8.0))
     branch = Vessel("lsa", tube_line((0, 0, 8), (40, 0, 2), 3.0), "aorta", 8e-3)
     tree = VesselTree({"aorta": root, "lsa": branch})
-    opened, inlet, surface = importer._opened(tree, True, lumen_surface(tree, 1e-3))
+    opened, inlet, surface = opened_at_inlet(tree, True, lumen_surface(tree, 1e-3))
     assert 1e-3 < inlet.position[2] < 5e-3
     assert SurfaceDepth(surface)(branch.centreline.points[-2:-1]) > 1e-3
     assert list(opened.vessels) == ["aorta", "lsa"]

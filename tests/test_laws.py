@@ -172,7 +172,7 @@ def test_steered_commands_are_turned_back_by_the_twist():
 
 
 def test_a_servo_holds_its_place_and_slips_at_its_limit():
-    ones = np.ones(1)
+    ones, way = np.ones(1), np.empty((1, 1))
     servos = drive.Servos(
         *(np.zeros(1, int) for _ in range(3)),
         gain=2.0 * ones,
@@ -180,19 +180,23 @@ def test_a_servo_holds_its_place_and_slips_at_its_limit():
         damping=0.0 * ones,
         limit=0.5 * ones,
         reach=1e-3 * ones,
+        rise=ones,
     )
     state = drive.State(np.array([[0.01]]), np.zeros((1, 1)), np.array([[0.6]]))
-    told = drive.Told(np.array([[0.012]]), np.zeros((1, 1)), np.zeros((1, 1)))
-    drive.follow(servos, state, ones[None], told)
-    # It pulls with 0.2 N at 0.01 m: nothing slips, and the next way begins at 0.012 m.
-    assert told.slip[0, 0] == told.slipped[0, 0] == 0.0
-    assert told.place[0, 0] == pytest.approx(0.013)
-    assert state.act[0, 0] == pytest.approx((100 * 0.012 + 0.2) / 2)
-    state.act[0, 0] = 1.0  # 1 N, more than the clamp holds
-    drive.follow(servos, state, ones[None], told)
-    assert told.slip[0, 0] == told.slipped[0, 0] == pytest.approx(0.003)
-    assert told.place[0, 0] == pytest.approx(0.011)
-    assert state.act[0, 0] == pytest.approx((100 * 0.01 + 0.5) / 2)
+    told = drive.Told(np.array([[0.012]]), np.zeros((1, 1)))
+
+    def follow(command, load):
+        drive.follow(servos, state, [[command]] * ones, [[load]] * ones, told, way)
+        return told.place[0, 0], told.slipped[0, 0], state.act[0, 0]
+
+    # It pulls with 0.2 N at 0.01 m: nothing slips, and that load is made up for.
+    assert follow(0.0, 0.2) == pytest.approx((0.012, 0.0, (100 * 0.012 + 0.2) / 2))
+    # In motion at full command it makes up for a tenth of `rise` at most.
+    assert follow(1.0, 0.5) == pytest.approx((0.013, 0.0, (100 * 0.012 + 0.3) / 2))
+    state.act[0, 0] = 1.0  # 1 N, 0.5 N more than the clamp holds: 5 mm of the spring
+    # Of it, 0.7 N had been borne for the load, which falls to 0.5 N.
+    assert follow(1.0, 0.5) == pytest.approx((0.009, 0.005, (100 * 0.008 + 0.6) / 2))
+    assert way[0, 0] == pytest.approx(0.005)
 
 
 def test_a_shared_spring_is_halved_and_a_stiff_wall_stays_rigid():

@@ -190,8 +190,10 @@ def test_the_expert_follows_the_arch_of_each_simulation(plain_pair):
         action = policy.act(None)
         for i, plan in enumerate(plans):
             row = np.array([i])
-            seen = part(rollout.readings, row), part(rollout.wall_force, row)
-            own, states[i] = plan.decide(plan.settings, states[i], *seen)
+            seen = rollout.memory, rollout.readings, rollout.wall_force
+            own, states[i] = plan.decide(
+                plan.settings, states[i], *(part(each, row) for each in seen)
+            )
             np.testing.assert_array_equal(action[i], own[0])
         simulation.step(action)
 
@@ -230,7 +232,7 @@ def test_anatomies_with_other_goals_are_refused():
         suite.make_task("navigate", anatomy=anatomy, goal="lcca")
         for anatomy in ("simple1", arch.build_seed(arch.arch_set("test_variants")[3]))
     ]
-    with pytest.raises(ValueError, match="take turns"):
+    with pytest.raises(ValueError, match="cannot share a model"):
         cases.compile_together([(t.scene, t.objective) for t in tasks], tasks[0].config)
 
 

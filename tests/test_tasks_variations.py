@@ -59,6 +59,13 @@ def snapshot(environment):
     return {field: getattr(model, field).copy() for field in fields}
 
 
+def usual_snapshot(make):
+    """Of an episode with nothing drawn: the sheath holds the same hinges."""
+    plain = make({"start_radius": 0.0})
+    plain.reset()
+    return snapshot(plain)
+
+
 def test_nothing_is_drawn_but_the_displacement_by_default():
     drawn, plain = np.random.RandomState(3), np.random.RandomState(3)
     episode = Randomisation().draw(drawn)
@@ -123,8 +130,9 @@ def test_a_single_device_has_its_own_coating_and_absorption():
 
 
 def test_the_model_takes_what_was_drawn_and_gives_it_back(make):
-    env = make({"friction": (0.1, 0.12), "stiffness": (2.0, 3.0), "roll": (0.5, 1.0)})
-    usual, at = snapshot(env), elements(env)  # before anything is drawn
+    drawn = {"friction": (0.1, 0.12), "stiffness": (2.0, 3.0), "roll": (0.5, 1.0)}
+    env = make({**drawn, "start_radius": 0.0})
+    usual, at = usual_snapshot(make), elements(env)
     env.reset()
     model = env.physics.model.ptr
     ratios = []
@@ -158,8 +166,9 @@ def test_the_model_takes_what_was_drawn_and_gives_it_back(make):
 
 
 def test_the_loss_of_the_material_is_randomised_and_follows_stiffness(make):
-    env = make({"loss": (2.0, 2.0), "stiffness": (3.0, 3.0)})
-    usual, at = snapshot(env), elements(env)
+    drawn = {"loss": (2.0, 2.0), "stiffness": (3.0, 3.0), "start_radius": 0.0}
+    env = make(drawn)
+    usual, at = usual_snapshot(make), elements(env)
     env.reset()
     model = env.physics.model.ptr
     dofs, stiffness = model.jnt_dofadr[at["hinges"]], usual["jnt_stiffness"]
