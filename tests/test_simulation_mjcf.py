@@ -1,15 +1,15 @@
 """A task as files: another program that steps the scene gets what the task gets."""
 
 import json
-import types
 
 import mujoco
 import numpy as np
 import pytest
 
 from cathsim_dmc import suite
+from cathsim_dmc.entities.sheath import CLEARANCE
 from cathsim_dmc.physics import forces
-from cathsim_dmc.physics.drives import Drives
+from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.simulation.mjcf import write_mjcf
 
 TASK, SEED, STEPS = "type1_lcca", 3, 30
@@ -39,12 +39,11 @@ def test_the_scene_moves_nearly_as_the_task(exported):
     mujoco.mj_forward(model, data)
     # The device stands clear of the wall, which it does not at qpos0.
     assert all(contact.dist > -0.1e-3 for contact in data.contact)
-    views = {name: getattr(data, name)[None] for name in ("qpos", "qvel", "act")}
-    drives = Drives(model, types.SimpleNamespace(**views))
     held = data.act.copy()
-    drives.hold(0)
+    drives = hold(model, data)
     np.testing.assert_array_equal(data.act, held)
-    env = suite.load("cathsim", TASK, task_kwargs={"random": SEED})
+    bore = {"random": SEED, "sheath_clearance": CLEARANCE}  # as the scene has
+    env = suite.load("cathsim", TASK, task_kwargs=bore)
     env.reset()
     order = [model.actuator(name).id for name in task["actuators"]]
     contacts = model.sensor(task["sensors"]["wall_contacts"])
@@ -84,7 +83,8 @@ def test_a_pair_is_written_as_its_chain_stands(tmp_path, cathsim):
     code, told, _ = cathsim("export", task, "--out", out, "--seed", "2")
     assert not code and told.strip() == str(out)
     model = mujoco.MjModel.from_xml_path(str(out / "scene.xml"))
-    env = suite.load("cathsim", task, {"random": 2})
+    bore = {"random": 2, "sheath_clearance": CLEARANCE}
+    env = suite.load("cathsim", task, bore)
     env.reset()
     own, chain = env.physics.model.ptr, env.task.scene.catheter
     close = dict(rtol=1e-9, atol=1e-15)

@@ -18,7 +18,7 @@ from lxml import etree
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.anatomy.export import check_wall, wall_pieces
-from cathsim_dmc.entities.sheath import Sheath
+from cathsim_dmc.entities.sheath import CLEARANCE, Sheath
 from cathsim_dmc.files import atomic_directory
 from cathsim_dmc.physics.forces import CONTACT_SIZE
 from cathsim_dmc.tasks.navigation import Navigation
@@ -68,6 +68,9 @@ def write_mjcf(
     check_wall(wall)
     options = bounds.options("task_kwargs", task_kwargs)
     options["random"] = bounds.seed("seed", seed)
+    if options.get("sheath_clearance") is None:
+        # A bare `mj_step` does not write the hinges that hold a device in the sheath.
+        options["sheath_clearance"] = CLEARANCE
     env = suite.load(suite.DOMAIN, task, options)
     if env.task.num_anatomies > 1:
         raise ValueError(
