@@ -23,8 +23,8 @@ import tyro
 from cathsim_dmc.agents import evaluation, protocols  # isort: skip
 
 from cathsim_dmc import cluster, files
-from cathsim_dmc.agents.evaluation import SAFE_FORCES
 from cathsim_dmc.agents.policies import load_policy
+from cathsim_dmc.agents.results import SAFE_FORCES
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.tasks.anatomies import load_anatomy
 

@@ -28,6 +28,7 @@ TASK = {
     "device": word(),
     "rotation": flag(),
     "max_steps": whole(1),
+    "give_up": flag(),
     "friction": number(0, 2),
     "shaft_link": number(2e-3, 0.1),
     "sheath_clearance": number(0.1e-3, 2e-3, optional=True),
@@ -36,6 +37,7 @@ TASK = {
     "outside_range": flag(),
     "fluoroscopy": options() | NONE,
     "endoluminal_size": pixels(),
+    "cameras": options() | NONE,
     "randomisation": options() | NONE,
     "vessel": options() | NONE,
     "goal_radius": number(positive=True, optional=True),  # None: the usual one
@@ -57,6 +59,9 @@ FLUOROSCOPY = {
     | st.tuples(number(-360, 360), st.just(0)),
     "biplane": word(optional=True).filter(lambda value: value != (1, 2))
     | st.tuples(st.just(0), number(-89, 89)),
+    "third": word(optional=True).filter(lambda value: value != (1, 2))
+    | st.tuples(st.just(0), number(-89, 89)),
+    "roadmap_errors": options() | NONE,
     "size": pixels(),
     "magnification": number(0.01, 1000),
     "centre": st.tuples(st.just(0), number(-10, 10), st.just(0)),

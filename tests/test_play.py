@@ -88,7 +88,7 @@ def test_a_bar_shows_the_largest_contact(
     env.reset()
     shown = window.FluoroscopyWindow(env.task, Controls(10))
     monkeypatch.setattr(
-        type(env.task), "wall_force", property(lambda _: WallForce(*4 * [force]))
+        type(env.task), "wall_force", property(lambda _: WallForce(*6 * [force]))
     )
     shown.show(env.task)
     length, drawn = screen.bars[-1]

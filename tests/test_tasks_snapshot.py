@@ -191,8 +191,9 @@ DERIVED = {
     "BiplaneSight": {"_machines"},
     "Moving": {"_motions", "_surfaces", "_inlets"},
     "Flow": {"_circulations"},
-    "SingleDevice": {"_bends"},  # scratch
-    "SlidingDevices": {"_fields", "_memory", "_chain"},  # scratch, too
+    # Scratch, and views of the model.
+    "SingleDevice": {"_bends", "_held", "_sheathed"},
+    "SlidingDevices": {"_fields", "_memory", "_chain", "_held", "_sheathed"},
 }
 _CONSTANT = (World, Layout, Stepper, Case, NavigationConfig, mjcf.Element)
 

@@ -14,6 +14,7 @@ import ctypes
 import functools
 import math
 import operator
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -23,6 +24,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, sigutils, types
 from numba.core.ccallback import CFunc
+from numba.core.errors import NumbaError
 from numba.extending import intrinsic, overload, register_jitable
 from numba.np.arrayobj import populate_array
 from numba.np.numpy_support import from_dtype
@@ -334,6 +336,10 @@ def call_before(table, model, data):
         call_callback(before, model, data)
 
 
+class NotCompiledError(ValueError):
+    """What numba says of a function that it cannot compile, in one line."""
+
+
 class Callback:
     """A function that C calls, compiled when its address is first asked for."""
 
@@ -349,7 +355,11 @@ class Callback:
         made = CFunc(self._function, kinds, {}, options, pipeline_class=own)
         if self._cache:
             compiled_cache.keep(made, self._function)
-        made.compile()
+        try:
+            made.compile()
+        except NumbaError as error:
+            text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+            raise NotCompiledError(" ".join(text.split())) from error
         return made
 
     @property

@@ -9,13 +9,11 @@ where somebody has removed them; what replaces them without calling them is foll
 import ctypes
 import functools
 import hashlib
-import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numba.core.errors import NumbaError
 
 from cathsim_dmc import bounds
 from cathsim_dmc.collision import native, own
@@ -88,12 +86,11 @@ class Law(NamedTuple):
         """Address of the adapter, compiled; ValueError if that cannot be."""
         try:
             return self.adapter.address
-        except NumbaError as error:
-            text = " ".join(re.sub(r"\x1b\[[0-9;]*m", "", str(error)).split())
+        except native.NotCompiledError as error:
             raise ValueError(
                 f"numba cannot compile {self.name}.law, a function of parameters, time "
                 "and what it acts on, with numbers and arrays alone (CONTRIBUTING.md): "
-                f"{text}"
+                f"{error}"
             ) from error
 
 

@@ -212,8 +212,8 @@ def in_half_circle(names, gaps, rotation, beyond: float) -> tuple[Rods, Rods, fl
 def checks() -> Iterator[Check]:
     """Pairs held in half a circle, and the axial force of a bend."""
     for case in CASES:
-        names, _, rotation, _ = case
-        found, expected, length = in_half_circle(*case)
+        names, gaps, rotation, beyond = case
+        found, expected, length = in_half_circle(names, gaps, rotation, beyond)
         name = f"two rods in half a circle, {' in '.join(names)}"
         off = 100 * float(np.linalg.norm(found.end - expected.end)) / length
         yield Check.at_most(f"{name}, tip", off, TIP_BOUND, "% of its length")

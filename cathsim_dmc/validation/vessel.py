@@ -174,7 +174,8 @@ def _checks() -> Iterator[Check]:
         yield Check.deviation(name, 1e3 * bent, 1e3 * elastica, FLOW_BOUND, "mm")
     for force in FORCES:
         name = f"terminal velocity of a free link under {1e3 * force:g} mN"
-        yield Check.deviation(name, *terminal_velocity(force), FLOW_BOUND, "m/s")
+        speed, expected = terminal_velocity(force)
+        yield Check.deviation(name, speed, expected, FLOW_BOUND, "m/s")
     for name in ANATOMIES:
         lost, name = volume_defect(phantoms.load(name)), f"the junctions of {name}"
         yield Check.at_most(f"volume lost at {name}", lost, VOLUME_BOUND)
