@@ -7,6 +7,7 @@ from dm_control import mjcf
 
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY, AngiographyArena
+from cathsim_dmc.physics import held
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +35,12 @@ def pressed(environment, reseed):
     # A tip that shakes soon gets stuck on the wall, and is pushed on at full force.
     shake = np.random.RandomState(0).choice([-1.0, 1.0], 21)
     data.ctrl[20] = 1.0
-    steps = []
+    device, steps = environment.task.rollout._devices, []
+    hinges = held.fields_of(lambda name: getattr(model, name))
     for control in range(130):
+        # The links that leave the sheath are free.
+        insertion = data.qpos[environment.task.rollout.index.insertion_qpos]
+        device._held.write(hinges, device._free[0], insertion)
         data.ctrl[:20] = shake[:20] * (-1) ** control
         for _ in range(task.substeps):
             mujoco.mj_step(model, data)

@@ -256,9 +256,9 @@ def test_nodes_follow_from_bends():
     )
 
 
-# Seeds whose first displacement lays the device into the rim of the hole by which the
-# sheath comes in, or past the vessel's wall, and seeds whose displacement fits.
-FAULTY, GOOD = (9023, 9059, 9245, 9224, 9035, 9276), (9000, 9001, 9002, 9003)
+# Seeds whose first displacement lays the device into the vessel's wall or past it, and
+# seeds whose displacement fits.
+FAULTY, GOOD = (9027, 9035, 9166, 9276, 9290, 9342), (9000, 9001, 9002, 9003)
 
 
 def test_a_displaced_device_stands_in_no_wall():
@@ -319,7 +319,9 @@ def test_an_ill_conditioned_displacement_is_not_written(shared_environment):
 def test_the_depth_of_a_posture_is_that_of_its_contacts():
     """The check before an episode and MuJoCo's collision see the same walls."""
     ranges = {"start_radius": 0.01, "start_insertion": (0.0, 0.06)}
-    task = suite.make_task("femoral_type1_lcca", randomisation=ranges, random=0)
+    # With play, the bore of the sheath touches the device, too.
+    options = {"randomisation": ranges, "random": 0, "sheath_clearance": 0.35e-3}
+    task = suite.make_task("femoral_type1_lcca", **options)
     environment = suite.environment(task)
     model = environment.physics.model.ptr
     data, index = mujoco.MjData(model), task.rollout.index

@@ -37,4 +37,4 @@ def rehearse(rollout: Rollout, stepper: Any, num_actions: int) -> None:
     rollout.start(everyone)
     rollout.command(np.zeros((len(everyone), num_actions)))
     stepper.run()
-    rollout.finish()
+    rollout.finish(logs=False)  # nobody has these simulations

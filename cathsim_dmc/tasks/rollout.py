@@ -259,8 +259,12 @@ class Rollout(Restorable):
         self._open[indices] = False
         return step
 
-    def finish(self) -> Step:
-        """Measures, judges and observes after the physics steps of a control step."""
+    def finish(self, *, logs: bool = True) -> Step:
+        """Measures, judges and observes after the physics steps of a control step.
+
+        Args:
+            logs: whether physics errors are logged.
+        """
         force, warned = self._stepper.end()
         self._layout.raise_fault()
         self.steps += 1
@@ -272,7 +276,7 @@ class Rollout(Restorable):
             self.case, self.steps, nodes, warned, force.peak_max
         )
         for error, last, steps in zip(self._errors, old, self.steps, strict=True):
-            if error is not None and last is None:
+            if logs and error is not None and last is None:
                 _LOG.error("%s after %d steps", error, steps)
         step = self._step(everyone)
         self._open[:] = False

@@ -21,7 +21,6 @@ import time
 import urllib.error
 import urllib.request
 from pathlib import Path
-from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -34,7 +33,7 @@ from cathsim_dmc.imaging import materials
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics import forces
-from cathsim_dmc.physics.drives import Drives
+from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.pictures import record
 from cathsim_dmc.pictures.figure import background
 from cathsim_dmc.simulation.mjcf import write_mjcf
@@ -93,10 +92,7 @@ class ExportedScene:
         self.data = mujoco.MjData(self.model)
         self.data.qpos[:] = self._task["qpos"]
         mujoco.mj_forward(self.model, self.data)
-        names = ("qpos", "qvel", "act")
-        views = {name: getattr(self.data, name)[None] for name in names}
-        self._drives = Drives(self.model, SimpleNamespace(**views))
-        self._drives.hold(0)
+        self._drives = hold(self.model, self.data)
         self._order = [self.model.actuator(name).id for name in self._task["actuators"]]
         kinds = self.model.actuator_dyntype[self._order]
         self._driven = kinds == mujoco.mjtDyn.mjDYN_INTEGRATOR.value
