@@ -208,7 +208,7 @@ def test_an_episode_may_start_along_the_route():
     task = suite.make_task("type1_lcca", **options)
     environment = suite.environment(task)
     starts = []
-    for _ in range(12):
+    for _ in range(24):
         environment.reset()
         head = task.readings.head
         starts.append(head)

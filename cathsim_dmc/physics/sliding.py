@@ -347,13 +347,10 @@ class SlidingDevices(SingleDevice):
 
     def _pushed(self) -> np.ndarray:
         """Insertion (N, K) at which the devices come to rest, m."""
-        return self._with_leaders_at(self._drives.resting()[:, 0])
-
-    def _with_leaders_at(self, place: np.ndarray) -> np.ndarray:
-        """Insertion (N, K): of leading devices (N,), the others as commanded, m."""
+        place = np.ascontiguousarray(self._drives.resting()[:, 0])
         told = np.ascontiguousarray(self._insertion)
         where = np.empty_like(told)
-        sliding.held(told, np.ascontiguousarray(place), where)
+        sliding.held(told, place, where)
         return where
 
     def follower_posture(self) -> np.ndarray:
@@ -363,15 +360,15 @@ class SlidingDevices(SingleDevice):
         units work on the same.
         """
         reached = self._qpos[:, self._index.insertion_qpos]
-        pushed, turned = self._with_leaders_at(reached), self._angles[..., 0]
+        pushed, turned = reached[:, None] - _gaps(self._pushed()), self._angles[..., 0]
         ends = (pushed[:, -1], turned[:, -1], pushed[:, 0], turned[:, 0])
         return postures(np.array(ends))
 
     def read(self, readings: Readings) -> CoaxialReadings:
         """State of the devices at readings of the same control step."""
-        insertion, nodes = self._with_leaders_at(readings.insertion), self._stack.nodes
+        gaps, nodes = _gaps(self._pushed()), self._stack.nodes
         # In motion the chain is behind its command, with all devices in it.
-        gaps, push = _gaps(self._pushed()), self._axial.copy()
+        insertion, push = readings.insertion[:, None] - gaps, self._axial.copy()
         push[np.arange(len(gaps)), gaps.argmin(axis=1)] += readings.push_force
         line, load = readings.centreline, readings.push_force.copy()
         if gaps.shape[1] > 1:

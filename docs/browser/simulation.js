@@ -168,6 +168,9 @@ export class Simulation {
   }
 }
 
+/** Largest speed of a platform that makes up for a load, over that of the full command. */
+const FASTEST = 1.1;
+
 /** Servos of the base, see cathsim_dmc/physics/drives.py. */
 function drives(mujoco, model) {
   const found = [];
@@ -176,19 +179,38 @@ function drives(mujoco, model) {
     if (kind !== mujoco.mjtDyn.mjDYN_INTEGRATOR.value) continue;
     const joint = model.actuator_trnid[2 * actuator];
     const width = model.actuator_gainprm.length / model.nu;
+    const gain = model.actuator_gainprm[width * actuator];
+    const stiffness = -model.actuator_biasprm[width * actuator + 1];
+    const inertia = model.dof_armature[model.jnt_dofadr[joint]];
     found.push({
       actuator,
       act: model.actuator_actadr[actuator],
       qpos: model.jnt_qposadr[joint],
       dof: model.jnt_dofadr[joint],
-      gain: model.actuator_gainprm[width * actuator],
-      stiffness: -model.actuator_biasprm[width * actuator + 1],
-      damping: -model.actuator_biasprm[width * actuator + 2],
+      gain,
+      stiffness,
+      damping:
+        model.opt.timestep * stiffness - model.actuator_biasprm[width * actuator + 2],
       limit: model.actuator_forcerange[2 * actuator + 1],
+      rise: (Math.sqrt(stiffness * inertia) * gain * Math.E) / stiffness,
+      load: loadSensor(mujoco, model, joint),
       told: 0,
     });
   }
   return found;
+}
+
+/** Place among the sensors of the force or torque of a platform on its device. */
+function loadSensor(mujoco, model, joint) {
+  const slides = model.jnt_type[joint] === mujoco.mjtJoint.mjJNT_SLIDE.value;
+  const { mjSENS_FORCE, mjSENS_TORQUE } = mujoco.mjtSensor;
+  const kind = (slides ? mjSENS_FORCE : mjSENS_TORQUE).value;
+  for (let sensor = 0; sensor < model.nsensor; sensor += 1) {
+    if (model.sensor_type[sensor] !== kind) continue;
+    const body = model.site_bodyid[model.sensor_objid[sensor]];
+    if (body === model.jnt_bodyid[joint]) return model.sensor_adr[sensor] + 2;
+  }
+  throw new Error("a drive has no sensor of its load");
 }
 
 /** Sets the command of a drive to where its base stands. */
@@ -197,16 +219,26 @@ function hold(drive, data) {
   data.act[drive.act] = (drive.told * drive.stiffness) / drive.gain;
 }
 
-/** Corrects a servo for its load and its slip, before a control step of some seconds. */
+/**
+ * Lets a clamp slip and makes up for a load, before a control step of some seconds; see
+ * cathsim_dmc/laws/drive.py.
+ */
 function follow(drive, data, seconds) {
   const { gain, stiffness, limit } = drive;
-  const place = data.qpos[drive.qpos];
-  const brake = drive.damping * data.qvel[drive.dof];
-  const effort = gain * data.act[drive.act] - (stiffness * place + brake);
-  if (Math.abs(effort) >= limit) drive.told = place;
-  const borne = Math.min(Math.max(effort, -limit), limit);
-  data.act[drive.act] = (stiffness * drive.told + borne + brake) / gain;
-  drive.told += data.ctrl[drive.actuator] * (gain / stiffness) * seconds;
+  const command = data.ctrl[drive.actuator];
+  const velocity = data.qvel[drive.dof];
+  const act = gain * data.act[drive.act];
+  const pull = act - stiffness * data.qpos[drive.qpos] - drive.damping * velocity;
+  const slip = (pull - Math.min(Math.max(pull, -limit), limit)) / stiffness;
+  const speed = (stiffness / gain) * velocity;
+  const pace = Math.max(Math.abs(command), Math.abs(speed));
+  const rise = drive.rise * Math.max(FASTEST - pace, 0);
+  let borne = act - stiffness * drive.told;
+  const missing = data.sensordata[drive.load] - borne;
+  borne += Math.min(Math.max(missing, -rise), rise);
+  const place = drive.told - slip;
+  data.act[drive.act] = (stiffness * place + borne) / gain;
+  drive.told = place + command * (gain / stiffness) * seconds;
 }
 
 /** The target branch: whether a point lies in it, past its ostium. */
