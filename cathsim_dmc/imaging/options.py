@@ -207,4 +207,6 @@ def _angles(name: str, view: View) -> tuple[float, float]:
     if isinstance(view, str):
         return VIEWS[bounds.choice(name, view, VIEWS)]
     primary, secondary = bounds.vector(name, view, 2, -360.0, 360.0, "degrees")
+    tilt = f"secondary angle of {name}"
+    bounds.number(tilt, float(secondary), -89.0, 89.0, "degrees")
     return primary, secondary
