@@ -293,3 +293,18 @@ def test_what_is_no_effect_is_refused(windy):
         silent.step(np.zeros(21))
     with pytest.raises(ValueError, match="build it with the same configuration"):
         suite.environment(twin(windy("simple1_bca"), effects=()))
+
+
+class Uncompiled(SideWind):
+    """A law that asks what numba does not know."""
+
+    @staticmethod
+    def law(wind, time, links):
+        links.xfrc_applied[0, 0] += wind.no_such_parameter
+
+
+def test_a_law_that_numba_refuses_is_named_in_one_line():
+    with pytest.raises(ValueError, match=r"Uncompiled.*no_such_parameter") as found:
+        suite.load("cathsim", "simple1_bca", {"effects": [Uncompiled((0, 0, 1))]})
+    text = str(found.value)
+    assert text.startswith("numba cannot compile") and "\n" not in text
