@@ -39,6 +39,10 @@ NAMES = {"internal": "Internal", "image": "Image", "sequential": "Sequential"}
 INTRODUCTION = """\
 # Results
 
+The figures of this page were measured before version 0.3. The drive, the sheath, the
+armature, the wall and the judged force (now the mean over a control step) have changed
+since; the figures were not measured again.
+
 Success and force of trained agents beside those of the publication (Jianu et al.).
 [Results in detail](results_detail.md) has all columns, seeds, times of training and
 what is missing. `python docs/scripts/results.py` writes both pages from `results/`,
@@ -75,6 +79,10 @@ the published f_max, and depends on the physics step ([peaks](forces.md#peaks)).
 
 DETAIL = """\
 # Results in detail
+
+The figures of this page were measured before version 0.3. The drive, the sheath, the
+armature, the wall and the judged force (now the mean over a control step) have changed
+since; the figures were not measured again.
 
 All columns of [results](results.md), written by the same script.
 
