@@ -98,7 +98,8 @@ def record_demonstrations(
     from cathsim_dmc.simulation import gymnasium
 
     names = observation if isinstance(observation, str) else list(observation)
-    options = bounds.options("task_kwargs", task_kwargs) | {"observation": names}
+    options: dict[str, Any] = bounds.options("task_kwargs", task_kwargs)
+    options |= {"observation": names}
     count = min(episodes, _SIMULATIONS)
     made = suite.make_task(task, **options)
     simulation = BatchSimulation(made, count, num_threads=num_threads or 0)
