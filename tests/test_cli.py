@@ -254,7 +254,7 @@ def test_an_interrupt_leaves_one_line(arguments):
     process = started(*arguments)
     time.sleep(6.0)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=180)
     assert (process.returncode, out) == (130, "")
     assert err.splitlines()[-1] == "cathsim: interrupted"
     assert "Traceback" not in err

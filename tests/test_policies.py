@@ -26,6 +26,8 @@ def assert_same_in_composer(outcome, name, task, seed, options):
     assert outcome.length == episode.steps
     assert outcome.reward == sum(episode.reward.astype(np.float32).astype(float))
     largest = np.float32(episode.wall_force_max).max()
+    assert outcome.forces.max.maximum == largest
+    largest = np.float32(episode.meta["wall_force_mean_max"]).max()
     assert outcome.forces.max_force == largest
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import suite
+from cathsim_dmc.physics import held
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.simulation.warp import contacts, devices
 from cathsim_dmc.simulation.warp.simulation import WarpSimulation
@@ -33,6 +34,7 @@ def test_worlds_follow_the_batch():
         np.testing.assert_array_equal(there.observation[key], value)
     random = np.random.RandomState(0)
     forces, equal = [], 0
+    stiffness = two.stepper._own["jnt_stiffness"].copy()
     for _ in range(STEPS):
         action = random.uniform(-1, 1, (4, one.num_actions))
         action[:, -1] = 1.0
@@ -46,6 +48,12 @@ def test_worlds_follow_the_batch():
     totals = np.array(forces).sum(axis=(0, 2))
     assert totals[0] > 0.0
     assert totals[1] == pytest.approx(totals[0], rel=0.05)
+    # The sheath holds other links than at the beginning, on the device as well.
+    stepper = two.stepper
+    for name in held.FIELDS:
+        there, own = getattr(stepper._worlds.model, name).numpy(), stepper._own[name]
+        np.testing.assert_allclose(there, own.reshape(there.shape), rtol=1e-5)
+    assert (stepper._own["jnt_stiffness"] != stiffness).any()
     # Where a contact is between two physics steps, single precision decides.
     assert equal >= 0.9 * 4 * STEPS
     assert not two.stepper.lost.any()

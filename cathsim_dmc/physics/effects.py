@@ -103,6 +103,7 @@ class Effect:
         data_fields: Fields of `mujoco.MjData` that it reads, beside
             `ModelIndex.FIELDS`.
         model_fields: Fields of `mujoco.MjModel` that it writes.
+        step_fields: Those of `model_fields` that `act` writes.
         state: Names of its attributes, arrays with a leading axis N, that are its state
             beside parameters and fields: what an episode goes on from. A snapshot keeps
             them, and writes into them in place; what MuJoCo derives it does not keep,
@@ -121,6 +122,7 @@ class Effect:
 
     data_fields: tuple[str, ...] = ()
     model_fields: tuple[str, ...] = ()
+    step_fields: tuple[str, ...] = ()
     state: tuple[str, ...] = ()
     parameters: Any = None
     law: Callable[[Any, float, Any], None] | None = None

@@ -54,6 +54,7 @@ class SingleDevice(Effect):
 
     data_fields: tuple[str, ...] = ("act",)
     model_fields: tuple[str, ...] = held.FIELDS
+    step_fields: tuple[str, ...] = held.FIELDS
     state = ("slipped", "told", "_free")
 
     def __init__(self, chain: Chain, holds: bool = True):
@@ -174,7 +175,7 @@ class SlidingDevices(SingleDevice):
     """Coaxial devices, each moved along and about its axis by its actions."""
 
     data_fields = ("cfrc_int", "act", "qfrc_applied")
-    model_fields = chain_fields.FIELDS
+    model_fields = step_fields = chain_fields.FIELDS
     state = (
         "slipped",
         "told",

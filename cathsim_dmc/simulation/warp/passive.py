@@ -195,9 +195,15 @@ class PassiveForces:
             (law, Given(there, arrays, memory)) for law, _, there in self._laws
         ]
 
-    def write(self) -> None:
-        """Writes the parameters as they are on the host."""
-        for _, given, there in self._laws:
+    def write(self, whole: bool) -> None:
+        """Writes the parameters as they are on the host.
+
+        Args:
+            whole: Whether those have changed that stay the same in an episode, too.
+        """
+        for law, given, there in self._laws:
+            if not whole and law is add_drag:
+                continue
             for values, array in zip(given, there, strict=True):
                 self._device.write(array, values)
 

@@ -66,6 +66,7 @@ class WarpStepper(Stepper):
         fields = [name for effect in task.effects for name in effect.model_fields]
         self._expand(dict.fromkeys(fields))
         self._dirty = set(self._own)
+        self._each_step = {n for effect in task.effects for n in effect.step_fields}
         self._cases: dict[int, Case] = {}
         self._statistics: list[Any] = [None] * num_simulations
         self._threads = num_threads or os.cpu_count() or 1
@@ -172,7 +173,7 @@ class WarpStepper(Stepper):
             self._dirty.clear()
             self._stale = True
         worlds = self._worlds
-        worlds.write_model(self._own, self._dirty)
+        worlds.write_model(self._own, self._dirty | self._each_step)
         self._dirty.clear()
         worlds.write(self.arrays, self._stale)
         worlds.step()

@@ -119,8 +119,7 @@ class Worlds:
             whole: Whether velocities and accelerations have changed, too.
         """
         began = time.perf_counter()
-        if whole:
-            self._passive.write()
+        self._passive.write(whole)
         for name in _WRITTEN if whole else _ALWAYS:
             array = getattr(self.data, name)
             staged = self._stage(f"to {name}", array)
