@@ -29,6 +29,9 @@ LINK = 5e-3  # m
 # second arc; of the rod behind the bend, m.
 _BEFORE, _PUSH, _BEHIND = 0.01, 0.056, 0.03
 _RESTING, _HELD = 1.0, 1.0  # s
+# Time over whose end a push force at rest is averaged, s: single steps scatter by some
+# %, and a change of the speed by 1e-8 of it takes another of them.
+_READ = 0.4
 _PIECE = 1e-3  # m, of the reference
 # Stiffness of the wall of the reference, N/m for each piece, which it takes in steps.
 _WALLS = (0.5, 5.0, 50.0, 500.0)
@@ -67,8 +70,8 @@ class Stopped(NamedTuple):
     """Forces of a device in an S-bend, N."""
 
     moving: float  # in the last control step of the push
-    stopped: float  # at rest
-    held: float  # some time later
+    stopped: float  # at rest, mean
+    held: float  # some time later, mean
     expected: float  # push force of the rod whose contacts slide
     wall: float  # sum over all contacts at rest
     expected_wall: float  # of that rod
@@ -105,14 +108,15 @@ def stopped(speed: float, friction: float, later: float = 0.0) -> Stopped:
     motor = rig.data.actuator(f"{rig.name}/insertion")
 
     def push(command: float, duration: float) -> float:
-        """Push force in the last of some control steps, N."""
-        found = 0.0
+        """Push force at the end, at rest its mean over `_READ`, N."""
+        found = [0.0]
         for _ in range(round(duration / CONTROL_TIMESTEP)):
             drives.follow(np.array([[command]]))
             motor.ctrl[0] = command
             rig.run(CONTROL_TIMESTEP)
-            found = float(rig.sensor(f"{rig.name}/push_force")[2])
-        return found
+            found.append(float(rig.sensor(f"{rig.name}/push_force")[2]))
+        last = 1 if command else round(_READ / CONTROL_TIMESTEP)
+        return float(np.mean(found[-last:]))
 
     moving = push(speed / MAX_PUSH_SPEED, _PUSH / speed)
     rest = push(0.0, _RESTING)
