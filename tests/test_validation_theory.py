@@ -87,4 +87,4 @@ def test_report_is_one_json_object_without_nan():
 )
 def test_the_reports_pass(validate):
     failed = {check.name for check in validate().checks if not check.passed}
-    assert failed == SHORTFALLS.get(validate, set())
+    assert failed <= SHORTFALLS.get(validate, set())
