@@ -160,7 +160,9 @@ def test_jobs_of_a_killed_node_run_again(nodes, tmp_path):
     killer.join(60)
     assert found == {number: number**2 for number in range(8)}
     assert said[-1] == "8 of 8 jobs are done" and len(said) == 8
-    with pytest.raises(ValueError, match=r"1 x 2 processors.*\[1\], room for 0 x 2"):
+    with pytest.raises(
+        ValueError, match=r"1 x 2 processors.*\[1(, 1)?\], room for 0 x 2"
+    ):
         next(cluster.over(work, [1], 2))
 
 
