@@ -42,7 +42,10 @@ def _remembering(context: Any) -> Any:
     """
 
     class Context(type(context)):
+        """The context, with what was found in `known`."""
+
         def resolve_function_type(self, func: Any, args: Any, kws: Any) -> Any:
+            """Signature of a function on some types, as numba finds it."""
             if not isinstance(func, types.Function) or kws:
                 return super().resolve_function_type(func, args, kws)
             if (func, args) not in known:
