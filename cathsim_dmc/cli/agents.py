@@ -1,7 +1,8 @@
 """`cathsim eval`, `submit`, `record`, `demos` and `play`."""
 
+import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -100,21 +101,9 @@ def evaluate(
     }  # fmt: skip
 
     def play(who: Any, out_dir: Path | None = None) -> EvaluationResult:
-        name = getattr(who, "name", who)
-        if ray:
-            log = contacts if who is player else None
-            with told_of_losses():
-                return agents.evaluate(who, observer=log, out_dir=out_dir, **asked)
-        with progress_bar(name, " steps", delay=LINE_INTERVAL) as bar:
-
-            def observe(env: Any, running: np.ndarray) -> None:
-                if who is player:
-                    contacts(env, running)
-                text = f"{np.count_nonzero(running)} of {len(running)} episodes run"
-                bar.set_postfix_str(text, refresh=False)
-                bar.update()
-
-            return agents.evaluate(who, observer=observe, out_dir=out_dir, **asked)
+        log = contacts if who is player else None
+        with _observer(who, log, ray) as observer:
+            return agents.evaluate(who, observer=observer, out_dir=out_dir, **asked)
 
     results = {"policy": play(player, out)}
     if baseline and policy != "random":
@@ -126,6 +115,27 @@ def evaluate(
         contacts.draw(results["policy"], out / "heatmap.png")
     _print(results, values, report, json)
     return 0
+
+
+@contextlib.contextmanager
+def _observer(
+    who: Any, log: evaluation.ContactLog | None, on_cluster: bool
+) -> Iterator[Callable[[Any, np.ndarray], None] | None]:
+    """What observes the episodes of a policy: its log, and progress on one machine."""
+    if on_cluster:
+        with told_of_losses():
+            yield log
+        return
+    with progress_bar(getattr(who, "name", who), " steps", delay=LINE_INTERVAL) as bar:
+
+        def observe(env: Any, running: np.ndarray) -> None:
+            if log is not None:
+                log(env, running)
+            text = f"{np.count_nonzero(running)} of {len(running)} episodes run"
+            bar.set_postfix_str(text, refresh=False)
+            bar.update()
+
+        yield observe
 
 
 def _print(

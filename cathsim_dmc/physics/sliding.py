@@ -27,15 +27,18 @@ from cathsim_dmc.laws.hinges import Bends
 from cathsim_dmc.laws.parameters import Array
 from cathsim_dmc.laws.springs import Springs
 from cathsim_dmc.physics import chain_fields, held
+from cathsim_dmc.physics.device_points import (
+    BEHIND,
+    DEVICE_PLACES,
+    device_points,
+    gaps_of,
+    points_at,
+)
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.physics.effects import Draw, Effect, World
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
-# Length of the straight device behind its base that X-rays meet, m.
-BEHIND = 0.3
-# Where points of a device are tracked, m from its end.
-DEVICE_PLACES = np.arange(7, -1, -1) * 15e-3
 # Way by which a device slides before the friction in the lumen acts in full, m.
 _PRESLIDING = 40e-6
 # Way of a slipping clamp in a control step by the force beyond its largest, m/N. The
@@ -177,14 +180,8 @@ class SlidingDevices(SingleDevice):
     data_fields = ("cfrc_int", "act", "qfrc_applied")
     model_fields = step_fields = chain_fields.FIELDS
     state = (
-        "slipped",
-        "told",
-        "_free",
-        "_friction",
-        "_factors",
-        "_ways",
-        "_drag",
-        "_axial",
+        *SingleDevice.state,
+        *("_friction", "_factors", "_ways", "_drag", "_axial"),
     )
     parameters = Positions
 
@@ -310,7 +307,7 @@ class SlidingDevices(SingleDevice):
     def _settle(self, rate: np.ndarray, lead: np.ndarray, state: Readings) -> None:
         """Turns the devices, writes the chains, computes the forces of the drives."""
         nodes, turned = self._stack.nodes, MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
-        gaps = _gaps(np.ascontiguousarray(self._insertion))
+        gaps = gaps_of(np.ascontiguousarray(self._insertion))
         # The sheath is frictionless.
         depth, outside = self.world.start_depth, state.external_force
         force = np.empty(outside.shape[:2])
@@ -361,13 +358,14 @@ class SlidingDevices(SingleDevice):
         units work on the same.
         """
         reached = self._qpos[:, self._index.insertion_qpos]
-        pushed, turned = reached[:, None] - _gaps(self._pushed()), self._angles[..., 0]
+        pushed = reached[:, None] - gaps_of(self._pushed())
+        turned = self._angles[..., 0]
         ends = (pushed[:, -1], turned[:, -1], pushed[:, 0], turned[:, 0])
         return postures(np.array(ends))
 
     def read(self, readings: Readings) -> CoaxialReadings:
         """State of the devices at readings of the same control step."""
-        gaps, nodes = _gaps(self._pushed()), self._stack.nodes
+        gaps, nodes = gaps_of(self._pushed()), self._stack.nodes
         # In motion the chain is behind its command, with all devices in it.
         insertion, push = readings.insertion[:, None] - gaps, self._axial.copy()
         push[np.arange(len(gaps)), gaps.argmin(axis=1)] += readings.push_force
@@ -379,7 +377,7 @@ class SlidingDevices(SingleDevice):
             insertion=insertion,
             rotation=self._angles[..., 0].copy(),
             tip_rotation=self._angles[..., -1].copy(),
-            points=_points(line, gaps[..., None] + DEVICE_PLACES, nodes),
+            points=points_at(line, gaps[..., None] + DEVICE_PLACES, nodes),
             leading_load=load,
             lumen_friction=np.abs(self._drag).sum(axis=1),
             push=push,
@@ -387,34 +385,8 @@ class SlidingDevices(SingleDevice):
 
     def courses(self, line: np.ndarray) -> list[tuple[Device, np.ndarray]]:
         """See `SingleDevice.courses`."""
-        points = device_points(line, _gaps(self._pushed()), self._stack.nodes)
+        points = device_points(line, gaps_of(self._pushed()), self._stack.nodes)
         return [(each, points[:, k]) for k, each in enumerate(self._entity.devices)]
-
-
-def device_points(line: np.ndarray, gaps: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Points (N, K, n, 3) of devices that end at gaps (N, K) from the end of a line, m.
-
-    Nodes (L + 1,) are the distances of the points of the line (N, L + 1, 3) from it.
-    """
-    # A device has one point more than the chain: behind, its own nodes, its end.
-    beyond = (nodes < gaps[..., None]).sum(axis=-1, keepdims=True)
-    own = np.arange(len(nodes)) - np.maximum(beyond - 1, 0)
-    places = np.maximum(nodes[np.maximum(own, 0)], gaps[..., None])
-    behind = np.full((*places.shape[:2], 1), nodes[0] + BEHIND)
-    places = np.concatenate([behind, places], axis=-1)
-    return _points(line, places, nodes)
-
-
-def _points(line: np.ndarray, places: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    found = np.empty((*places.shape, 3))
-    sliding.points(line, places, nodes, found)
-    return found
-
-
-def _gaps(insertion: np.ndarray) -> np.ndarray:
-    ways = np.empty_like(insertion)
-    sliding.gaps(insertion, ways)
-    return ways
 
 
 def devices_at(entity: DeviceStack) -> sliding.Devices:

@@ -11,7 +11,7 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging.angiograph import Deviation
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.physics.sliding import device_points
+from cathsim_dmc.physics.device_points import device_points
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import along
 

@@ -8,7 +8,7 @@ from operator import attrgetter
 import numpy as np
 
 from cathsim_dmc.imaging.options import FARTHEST_WALL
-from cathsim_dmc.physics.sliding import DEVICE_PLACES
+from cathsim_dmc.physics.device_points import DEVICE_PLACES
 from cathsim_dmc.tasks import route_observations
 from cathsim_dmc.tasks.cameras import FARTHEST
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES

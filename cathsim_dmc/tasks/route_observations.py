@@ -4,7 +4,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from cathsim_dmc.physics.sliding import DEVICE_PLACES
+from cathsim_dmc.physics.device_points import DEVICE_PLACES
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
 from cathsim_dmc.tasks.observation_kind import (
     BIPLANE,
