@@ -137,8 +137,8 @@ def _tell_of_compiling() -> None:
     if "compiling" not in _told:
         _told.add("compiling")
         print(
-            "compiling for this machine, once: the physics takes about 15 s, of "
-            "coaxial devices 30 s",
+            "compiling for this machine, once, what has not been needed before: the "
+            "whole physics takes about 15 s, of coaxial devices 30 s",
             file=sys.stderr,
         )
 
