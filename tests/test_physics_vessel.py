@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
 from conftest import twin
@@ -10,6 +11,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.laws.compliance import Material, stiffness
+from cathsim_dmc.laws.contact import COMPLIANT
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY
 from cathsim_dmc.physics.vessel import VesselOptions
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -53,6 +55,28 @@ def test_flow_is_alike_in_both_paths_and_on_any_threads(living):
         np.testing.assert_array_equal(observed["blood_velocity"], velocity[k, 2])
     assert np.ptp(np.linalg.norm(velocity, axis=-1)) > 0.1
     assert environment.task.info()["indentation"] >= 0.0
+
+
+def test_contacts_that_share_a_spring_are_told_apart_by_no_bit_of_their_distance():
+    task = suite.make_task("type1_lcca", vessel={"wall": True})
+    environment = suite.environment(task)
+    environment.reset()
+    action = np.zeros(21)
+    action[[0, -1]] = 1.0
+    halved, odd = [], []
+    for _ in range(80):
+        environment.step(action)
+        model, data = (getattr(environment.physics, of).ptr for of in ("model", "data"))
+        mujoco.mj_forward(model, data)
+        for contact in data.contact:
+            if contact.solimp[0] == COMPLIANT:
+                stiff = model.geom_solref[contact.geom1, 0]
+                assert contact.solref[0] in (stiff, stiff / 2)
+                halved.append(contact.solref[0] != stiff)
+                odd.append(np.float64(contact.dist).view(np.int64) % 2 == 1)
+    assert 10 < sum(halved) < len(halved) - 10
+    agree = np.mean(np.array(halved) == odd)
+    assert 0.2 < agree < 0.8, agree
 
 
 def test_blood_drags_along_a_pair_by_the_radii_of_its_links_now():

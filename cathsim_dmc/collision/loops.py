@@ -22,9 +22,9 @@ from cathsim_dmc.collision.native import (
     data_field,
     numbers,
     stacked,
-    wholes,
     word,
 )
+from cathsim_dmc.collision.own import sharing_of
 from cathsim_dmc.collision.table import (
     ERROR,
     MESSAGE,
@@ -44,10 +44,11 @@ _RAW = 80  # bytes of a contact for MuJoCo: distance, position and frame
 
 
 @inlined
-def write(data, geoms, law, found, count, raw):
+def write(model, data, geoms, law, found, count, raw):
     """Writes contacts of a law where MuJoCo takes them; returns their number.
 
     Args:
+        model: Address of `mjModel`.
         data: Address of `mjData`.
         geoms: Link and carrier.
         law: `laws.contact.Law`.
@@ -59,13 +60,15 @@ def write(data, geoms, law, found, count, raw):
     turned = data_field(data, "geom_xmat")[geoms[0]]
     frame = data_field(data, "geom_xmat")[geoms[1]]
     axis = (turned[2], turned[5], turned[8])
+    if law.compliant:
+        first, user = sharing_of(model, data, geoms[0]), data_field(data, "userdata")
+        if first >= 0:
+            for n in range(count):
+                user[first + n] = found[n, 5]
     for n in range(count):
         distance, place, towards = world_contact(found[n], law, centre, axis, frame)
         contact = numbers(raw + _RAW * n)
         contact[0] = distance
-        if law.compliant:
-            bits = wholes(raw + _RAW * n)
-            bits[0] = (bits[0] & -2) | int(found[n, 5])
         for k in range(3):
             contact[1 + k], contact[4 + k], contact[7 + k] = place[k], towards[k], 0.0
     return np.int32(count)
@@ -84,7 +87,7 @@ def at_rest(model, data, raw, geoms, margin, entry):
     scratch = Scratch(stacked(1, SAMPLES)[0], stacked(PLANES, 4))
     found = stacked(MOST, CONTACT)
     count = contacts(wall, capsule, law, step, scratch, found)
-    return write(data, geoms, law, found, count, raw)
+    return write(model, data, geoms, law, found, count, raw)
 
 
 @compiled

@@ -60,7 +60,7 @@ def in_motion(model, data, raw, geoms, margin, entry):
     scratch = MovingScratch(samples, planes, stacked(VALUES, 4), stacked(1, WARP)[0])
     found = stacked(MOST, CONTACT)
     count = moving_contacts(wall, capsule, law, step, motion, scratch, found)
-    return write(data, geoms, law, found, count, raw)
+    return write(model, data, geoms, law, found, count, raw)
 
 
 @compiled

@@ -11,12 +11,14 @@ import numpy as np
 from cathsim_dmc.collision.native import (
     address_of,
     data_field,
+    longs,
     model_field,
     numbers,
     symbol,
     word,
 )
 from cathsim_dmc.compiled import compiled
+from cathsim_dmc.laws.planes import MOST
 
 # Words of a layout: its label, a float64 in [1, 2), then these sizes of its models:
 SIZES = ("nuserdata", "nbody", "nq", "nv", "njnt", "ngeom")
@@ -31,7 +33,9 @@ LINK, LINKS, JOINTS, PLACES = range(72, 104, 8)
 WALL, BORE, MOTION = 104, 112, 120
 # 1 + offset of the parameters of a law that has raised an error, 0 for none.
 FAULT = 128
-WORDS, CAPACITY, SPAN = 17, 1 << 12, 1 << 52
+# Place of the parameters of a compliant wall in `userdata`, -1 for none.
+SHARING = 136
+WORDS, CAPACITY, SPAN = 18, 1 << 12, 1 << 52
 SYMBOL = "cathsim_layouts"
 # Allocated before code that refers to the symbol is loaded.
 TABLE = symbol(SYMBOL, WORDS * CAPACITY).reshape(CAPACITY, WORDS)
@@ -76,3 +80,20 @@ def motion_of(model, data):
     """Address of the layout of a simulation with a moving vessel; 0 otherwise."""
     layout = layout_of(model, data)
     return layout if layout != 0 and word(layout + MOTION) >= 0 else np.int64(0)
+
+
+@compiled
+def sharing_of(model, data, geom):
+    """Place in `userdata` of which contacts of a link share a spring, MOST numbers.
+
+    -1 where no wall of the simulation is compliant, or the geom is no link.
+    """
+    layout = layout_of(model, data)
+    if layout == 0 or word(layout + SHARING) < 0:
+        return np.int64(-1)
+    link = model_field(model, "geom_bodyid")[geom] - word(layout + LINK)
+    if not 0 <= link < word(layout + LINKS):
+        return np.int64(-1)
+    if longs(word(layout + PLACES))[link] != geom:
+        return np.int64(-1)
+    return np.int64(word(layout + SHARING) + MOST * link)

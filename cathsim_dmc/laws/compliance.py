@@ -10,6 +10,8 @@ import math
 from typing import Any, NamedTuple
 
 from cathsim_dmc.compiled import compiled
+from cathsim_dmc.laws.parameters import Array
+from cathsim_dmc.laws.planes import MOST
 
 POISSON = 0.5
 # Thickness of an artery over its radius, and the least: 1.4 and 1.0 mm at the ascending
@@ -44,6 +46,17 @@ class Law(NamedTuple):
     solref: Any
     solimp: Any
     relaxation: Any
+
+
+class Sharing(NamedTuple):
+    """Which contacts of a physics step share a spring, written with the contacts.
+
+    Attributes:
+        shared: (L, MOST), 1 where contact n of a link shares the spring of its place
+            with another one, else 0; what is beyond the last contact means nothing.
+    """
+
+    shared: Any = Array("links", MOST)
 
 
 class Links(NamedTuple):

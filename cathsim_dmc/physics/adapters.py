@@ -21,7 +21,15 @@ from cathsim_dmc.collision.native import (
     numbers,
     word,
 )
-from cathsim_dmc.collision.own import FAULT, JOINTS, LINK, LINKS, PLACES, WALL
+from cathsim_dmc.collision.own import (
+    FAULT,
+    JOINTS,
+    LINK,
+    LINKS,
+    PLACES,
+    WALL,
+    sharing_of,
+)
 from cathsim_dmc.collision.parameters import unpacked
 from cathsim_dmc.collision.table import MOTION_ENTRY, SYMBOL, entry_of, key_of
 from cathsim_dmc.compiled import compiled
@@ -123,10 +131,18 @@ def springs(model, data, layout, start):
 @_adapter
 def compliance(model, data, layout, start):
     """Halves the springs of contacts that share one, see `laws.compliance`."""
+    last, number, wall = np.int32(-1), 0, word(layout + WALL)
     for n in range(data_field(data, "ncon")):
         contact = contact_at(data, n)
-        soft = contact_field(contact, "solimp")[0] == COMPLIANT
-        if soft and native.wholes(contact)[0] & 1:
+        if contact_field(contact, "geom2")[0] != wall:
+            continue
+        # Contacts of a link with the wall follow each other.
+        link = contact_field(contact, "geom1")[0]
+        last, number = link, number + 1 if link == last else 0
+        if contact_field(contact, "solimp")[0] != COMPLIANT:
+            continue
+        first = sharing_of(model, data, link)
+        if first >= 0 and data_field(data, "userdata")[first + number] != 0.0:
             share(_contact(contact))
 
 

@@ -138,7 +138,7 @@ class Layout:
             MemoryError: if the process has too many layouts.
         """
         self._laws = laws
-        moving = [law.start for law in laws if law.adapter is adapters.motion]
+        start = {law.adapter: law.start for law in laws}
         where = np.concatenate([places.geoms, *places.hinges]).astype(np.int64)
         named = [(law.name, law.acts_in, law.start) for law in laws]
         kind = repr((sizes, places.first_link, places[3:], where.tolist(), named))
@@ -163,7 +163,7 @@ class Layout:
             *(each.ctypes.data for each in lists),
             *(places.first_link, len(places.geoms), places.hinges.shape[1] // 2),
             *(where.ctypes.data, places.wall, places.bore),
-            *(moving[0] if moving else -1, 0),
+            *(start.get(adapters.motion, -1), 0, start.get(adapters.compliance, -1)),
         )
         # Last: threads may look for other layouts meanwhile.
         taken[slot] = self.label

@@ -12,7 +12,13 @@ from numpy.random import RandomState
 
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import CONTACT_SOLIMP, CONTACT_SOLREF
-from cathsim_dmc.laws.compliance import Law, Links, Material, write_contacts
+from cathsim_dmc.laws.compliance import (
+    Law,
+    Links,
+    Material,
+    Sharing,
+    write_contacts,
+)
 from cathsim_dmc.physics.effects import Draw, Effect, World
 from cathsim_dmc.physics.flow import Flow
 from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
@@ -69,7 +75,7 @@ def rigid_stiffness(weight: np.ndarray) -> np.ndarray:
 class Wall(Effect):
     """Sets the contact of each link by the vessel where it is."""
 
-    acts_in, adapter = "contact", "compliance"
+    acts_in, adapter, parameters = "contact", "compliance", Sharing
     model_fields = ("geom_solref", "geom_solimp")
     state = ("_radius", "_material")
 

@@ -16,6 +16,7 @@ from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.laws.blood import Blood, beat
 from cathsim_dmc.laws.compliance import Material, reference, stiffness
 from cathsim_dmc.laws.parameters import total
+from cathsim_dmc.laws.planes import MOST
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
 from cathsim_dmc.physics.effects import views
 from cathsim_dmc.physics.flow import EXPONENT, velocities
@@ -134,7 +135,7 @@ def indentation(
     from cathsim_dmc.physics import adapters, dispatcher
 
     spec = bare(tube(0.2, radius).lumen)
-    spec.nuserdata = 1
+    spec.nuserdata = MOST + 1
     half = LINK / 2 if kind == "capsule" else 0.0
     body = {"size": (1e-3, half, 0), "mass": 1e-3, "priority": 1}
     body["type"] = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
@@ -143,11 +144,12 @@ def indentation(
     solref = reference(spring, model.body_invweight0[1, 0], COMPLIANT)
     model.geom_solref[geom.id], model.geom_solimp[geom.id] = solref, SOLIMP
     law = dispatcher.Law("wall", "contact", adapters.compliance, 0)
-    layout = dispatcher.layout(model, dispatcher.Places(1, np.zeros(0)), [law])
+    places = dispatcher.Places(1, np.array([geom.id]), wall=0)
+    layout = dispatcher.layout(model, places, [law])
     depths = []
     for load in loads:
         data = mujoco.MjData(model)
-        data.xfrc_applied[1, 0], data.userdata[0] = load, layout.label
+        data.xfrc_applied[1, 0], data.userdata[-1] = load, layout.label
         mujoco.mj_step(model, data, 1500)
         depths.append(data.qpos[0] - 1e-4)
     return np.array(depths)
