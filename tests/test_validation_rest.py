@@ -62,12 +62,18 @@ def test_the_checks_of_rest_see_a_swing():
     assert [check.passed for check in found.checks("one")] == [False] * 3
 
 
+def test_the_helix_of_one_hand_ends_where_it_turns_back():
+    way = np.concatenate([np.zeros(5), np.arange(80) * 0.2])
+    turn = np.where(way < 10, way, 20 - way)
+    line = np.stack([3 * np.cos(turn), 3 * np.sin(turn), way], 1) * 1e-3
+    line[:5, :2] = 0.0
+    part = helix.one_hand(line)
+    assert 6.8e-3 < np.ptp(part[:, 2]) < 7.2e-3 and part[-1, 2] < 9e-3
+    with pytest.raises(RuntimeError, match="ends after 2. links"):
+        helix.one_hand(line[30:])
+
+
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="it changes its hand: push 14 % off, bound 3 % (docs/limits.md)",
-)
 def test_a_helix_bears_what_theory_says():
     assert all(check.passed for check in helix.checks())
 

@@ -13,7 +13,6 @@ from cathsim_dmc.validation.checks import Check, Report
 
 # Checks whose bounds the physics misses (docs/limits.md).
 SHORTFALLS = {
-    rod.validate_rod: {"helix of 24° in a straight tube, links of 5 mm: push"},
     wall.validate_wall: {
         "S-bend, friction 0.037: push after a stop from 10 mm/s",
         "femoral_type1_lcca_pair, full push: control steps done again",

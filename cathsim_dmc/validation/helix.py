@@ -16,7 +16,8 @@ FORCE = 2.0  # N, at which the push stops
 HELIX_BOUND = 3.0  # % of the force
 _REST = 50  # control steps
 _MOST = 1000  # control steps of a push
-_MIDDLE = 0.3, 0.7  # of the tube, where the helix is measured
+_LEAST = 0.9  # of the largest distance from the axis, where the helix begins
+_MARGIN = 0.15  # of the helix, left out at both its ends
 
 
 def helix(link: float, force: float = FORCE) -> tuple[float, float, float]:
@@ -54,14 +55,31 @@ def helix(link: float, force: float = FORCE) -> tuple[float, float, float]:
         environment.step(0.0 * action)
     push, line = float(task.readings.push_force), task.readings.centreline
     environment.close()
-    low, high = (int(np.argmax(line[:, 2] > share * TUBE[0])) for share in _MIDDLE)
-    way = line[high, 2] - line[low, 2]
-    cosine = way / np.linalg.norm(np.diff(line[low : high + 1], axis=0), axis=-1).sum()
-    radius = np.linalg.norm(
-        line[low : high + 1, :2], axis=1
-    ).mean()  # of the joints, on the rod
+    part = one_hand(line)
+    cosine = np.ptp(part[:, 2]) / np.linalg.norm(np.diff(part, axis=0), axis=-1).sum()
+    radius = np.linalg.norm(part[:, :2], axis=1).mean()  # of the joints, on the rod
     theory = 2 * shaft.bending_stiffness * (1 - cosine**2) * cosine / radius**2
     return push, float(theory), float(np.arccos(cosine))
+
+
+def one_hand(line: np.ndarray) -> np.ndarray:
+    """The part (L, 3) of a line (N, 3) around z that is a helix of one hand.
+
+    The first one from the base, where the push acts: a rod whose base does not turn
+    may buckle into helices of both hands.
+
+    Raises:
+        RuntimeError: it is less than one turn.
+    """
+    distance = np.linalg.norm(line[:, :2], axis=1)
+    first = int(np.argmax(distance > _LEAST * distance.max()))
+    turn = np.unwrap(np.arctan2(*line[first:, 1::-1].T))
+    back = np.diff(turn) * (turn[1] - turn[0]) <= 0
+    count = int(np.argmax(back)) if back.any() else len(back)
+    low, high = (first + round(count * share) for share in (_MARGIN, 1 - _MARGIN))
+    if abs(turn[high - first] - turn[low - first]) < 2 * np.pi:
+        raise RuntimeError(f"the helix next to the base ends after {count} links")
+    return line[low : high + 1]
 
 
 def checks() -> Iterator[Check]:
