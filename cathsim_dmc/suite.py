@@ -20,7 +20,13 @@ from dm_control.utils import containers
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.tasks import observations, placement
-from cathsim_dmc.tasks.anatomies import BRANCHES, goal_of, load_anatomy, load_arches
+from cathsim_dmc.tasks.anatomies import (
+    BRANCHES,
+    arch_numbers,
+    goal_of,
+    load_anatomy,
+    load_arches,
+)
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.environment import Environment
 from cathsim_dmc.tasks.navigation import Navigation
@@ -49,8 +55,8 @@ class TaskDefinition:
             of the goal by randomisation, m.
         options: fields of `NavigationConfig` that differ from their defaults.
         random_arch: whether each episode draws a random arch, from those that the
-            task's options `arches`, `pool` and `first` name; there is no `anatomy`
-            then.
+            task's options `arches`, `pool`, `first` and `numbers` name; there is no
+            `anatomy` then.
     """
 
     description: str
@@ -66,7 +72,7 @@ class TaskDefinition:
         """Names of the options that choose the anatomy and the goal."""
         if self.random_arch:
             own = ("goal", "access") if self.goal == "any" else ()
-            return ("arches", "pool", "first", *own)
+            return ("arches", "pool", "first", "numbers", *own)
         own = () if self.anatomy is not None else ("anatomy", "access")
         return own if self.goal is not None else (*own, "goal")
 
@@ -147,8 +153,8 @@ def make_task(
         **options: Fields of `NavigationConfig`, options of the task's objective (such
             as `reward` and `goal_radius`); for `navigate`, `anatomy`, `goal` (a name,
             or (x, y, z) in the unit and frame of the file that the anatomy was
-            imported from) and `access`; for random arches, `arches`, `pool` and
-            `first`, see `load_arches`.
+            imported from) and `access`; for random arches, `arches`, `pool`, `first`
+            and `numbers`, see `load_arches`.
 
     Raises:
         ValueError: if the task or an option does not exist; lists those that do.
@@ -175,7 +181,7 @@ def make_task(
         anatomies = load_arches(**({} if access is None else {"access": access}), **own)
         named = [
             goal_of(anatomy, goal, number)
-            for number, anatomy in enumerate(anatomies, own.get("first", 0))
+            for number, anatomy in zip(arch_numbers(own), anatomies, strict=True)
         ]
     else:
         chosen = own.get("anatomy", definition.anatomy or "type1")

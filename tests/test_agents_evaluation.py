@@ -154,6 +154,9 @@ def test_a_task_is_played_with_its_own_options(own_task):
     parts = protocols.parts(varied, task, {}, 8, 0)
     arches = [one["arch"] for part in parts for one in part.conditions]
     assert sorted(arches) == [3] * 4 + [4] * 4
+    parts = protocols.parts(varied, "arch_bca", {"numbers": [88, 10]}, 8, 0)
+    arches = [one["arch"] for part in parts for one in part.conditions]
+    assert sorted(arches) == [10] * 4 + [88] * 4
     task = own_task("type1_bca", randomisation={"friction": (0.1, 0.2)})
     (part,) = protocols.parts(published, task, {}, 4, 0)
     assert all(0.1 <= one["friction"] <= 0.2 for one in part.conditions)

@@ -30,7 +30,7 @@ OPTIONS = [code for code in CODE if code.startswith("{")]
 QUICK = ["cathsim --version", "cathsim list", "cathsim list --devices"]
 # Options of a task that are arguments of its objective or of `suite.load`.
 BESIDE = {"reward", "goal_radius", "anatomy", "goal", "access"}
-BESIDE |= {"arches", "pool", "first", "random"}
+BESIDE |= {"arches", "pool", "first", "numbers", "random"}
 
 
 @pytest.mark.parametrize("line", QUICK)

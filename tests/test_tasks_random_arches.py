@@ -111,6 +111,18 @@ def test_randomised_episodes_with_images_are_equal():
                 pair.reset_some([1, 0])
 
 
+def test_arches_are_chosen_by_their_numbers():
+    chosen = suite.load_arches("test", numbers=[7, 2])
+    assert [one.name for one in chosen] == [names(n, 1, "test")[0] for n in (7, 2)]
+    task = suite.make_task("arch_any", arches="test", numbers=[2])
+    assert task.scene.anatomy.name == chosen[1].name
+    with pytest.raises(ValueError, match="leave out pool and first"):
+        suite.make_task("arch_any", numbers=[2], pool=1)
+    for wrong, message in (([98], "numbers"), ([], "numbers"), ([1.5], "numbers")):
+        with pytest.raises(ValueError, match=message):
+            suite.load_arches("test", numbers=wrong)
+
+
 def test_an_episode_is_that_of_the_anatomy_alone(plain_pair):
     """Writing an anatomy into a filled-up model changes nothing of its physics."""
     task = plain_pair.batch.task

@@ -10,7 +10,7 @@ import numpy as np
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.physics.randomisation import Draw, Randomisation
-from cathsim_dmc.tasks.anatomies import POOL
+from cathsim_dmc.tasks.anatomies import arch_numbers
 from cathsim_dmc.tasks.start import START_SPACING, STARTS_ALONG_ROUTE
 
 # Strata of each quantity, and candidates for each episode to fill them from.
@@ -99,7 +99,8 @@ def parts(
     pools = [options]
     if protocol.devices and not (options.get("devices") or options.get("device")):
         pools = [{**options, "device": name} for name in protocol.devices]
-    arches = options.get("pool", POOL) if definition and definition.random_arch else 1
+    drawn_from = definition is not None and definition.random_arch
+    arches = len(arch_numbers(options)) if drawn_from else 1
     found, played = [], 0
     for number, own in enumerate(pools[:episodes]):
         count = len(range(number, episodes, len(pools)))
@@ -118,7 +119,7 @@ def _conditions(
     ranges: Randomisation, seed: int, arches: int, options: Mapping[str, Any]
 ) -> Mapping[str, Any]:
     arch, episode = ranges.draw_in(np.random.RandomState(seed), arches)
-    where = {"arch": options.get("first", 0) + arch} if arches > 1 else {}
+    where = {"arch": arch_numbers(options)[arch]} if arches > 1 else {}
     values = {
         name + "_drawn" * (name in _REDUCED): np.asarray(value).tolist()
         for name, value in dataclasses.asdict(episode).items()
@@ -185,7 +186,7 @@ def distinct(task: str, task_kwargs: Mapping[str, Any], episodes: int) -> bool:
     if definition is None:
         return True
     ranges = Randomisation.make(task_kwargs.get("randomisation", False))
-    values = task_kwargs.get("pool", POOL) if definition.random_arch else 1
+    values = len(arch_numbers(task_kwargs)) if definition.random_arch else 1
     for name, step in _STEPS.items():
         if (chosen := getattr(ranges, name)) is not None:
             low, high = chosen if isinstance(chosen, Sequence) else (0.0, 1.0)

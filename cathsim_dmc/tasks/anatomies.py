@@ -1,6 +1,8 @@
 """Anatomies that a task can be given: a phantom, a directory, random arches."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy
@@ -45,18 +47,41 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> An
     return Anatomy.load(anatomy)
 
 
+def arch_numbers(options: Mapping[str, Any]) -> tuple[int, ...]:
+    """Numbers in their set of the arches that `pool`, `first` and `numbers` name.
+
+    Raises:
+        ValueError: if numbers stand beside a pool or a first one, or are none.
+    """
+    pool, first, numbers = map(options.get, ("pool", "first", "numbers"))
+    if numbers is None:
+        return tuple(range(first or 0, (first or 0) + (POOL if pool is None else pool)))
+    if pool is not None or first is not None:
+        raise ValueError(
+            "option numbers names the arches; leave out pool and first, which do so too"
+        )
+    found = tuple(bounds.array("numbers", numbers, "i", (-1,)).tolist())
+    if not found:
+        raise ValueError("option numbers names no arch; leave it out, or give some")
+    return found
+
+
 def load_arches(
     arches: str = "train",
-    pool: int = POOL,
-    first: int = 0,
+    pool: int | None = None,
+    first: int | None = None,
     *,
+    numbers: Sequence[int] | None = None,
     access: str = "ascending",
 ) -> list[Anatomy]:
     """Random arches of a named set, in the order of their seeds; see `arch_set`.
 
     Args:
         arches: Name of the set: "train", "test" or "test_variants".
-        pool: Number of arches; building one takes about a second and a half.
+        pool: Number of arches, `POOL` by default; building one takes about a second
+            and a half.
+        first: Number of the first one in the set, 0 by default.
+        numbers: Numbers of the arches in the set, in place of pool and first.
         access: Where the device enters, "ascending" or "descending"; "any" for one and
             the other in turn, by the number in the set.
 
@@ -69,10 +94,13 @@ def load_arches(
 
     bounds.choice("access", access, ("any", *ACCESSES))
     seeds = arch.arch_set(bounds.choice("arches", arches, arch.SETS))
-    bounds.whole(f"pool of arches {arches!r}", pool, 1, len(seeds))
-    bounds.whole(f"first of arches {arches!r}", first, 0, len(seeds) - pool)
+    if numbers is None:
+        count = POOL if pool is None else pool
+        bounds.whole(f"pool of arches {arches!r}", count, 1, len(seeds))
+        bounds.whole(f"first of arches {arches!r}", first or 0, 0, len(seeds) - count)
     found = []
-    for number in range(first, first + pool):
+    for number in arch_numbers({"pool": pool, "first": first, "numbers": numbers}):
+        bounds.whole(f"numbers of arches {arches!r}", number, 0, len(seeds) - 1)
         way = ACCESSES[number % 2] if access == "any" else access
         anatomy = arch.build_seed(seeds[number], access=way)
         if access == "any" and placement.sheath_direction(anatomy) is None:
@@ -83,7 +111,7 @@ def load_arches(
     if closed:
         raise ValueError(
             f"no sheath fits before the inlet of {', '.join(closed)}, whose aorta "
-            "bends back across it; give another first, or a smaller pool"
+            "bends back across it; give others by first or numbers, or a smaller pool"
         )
     return found
 
