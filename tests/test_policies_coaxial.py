@@ -11,7 +11,8 @@ from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan
 from cathsim_dmc.policies.expert import Teacher
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import coaxial_ends
-from cathsim_dmc.tasks.route import SIDE_AHEAD, locate
+from cathsim_dmc.tasks.retry import Memory
+from cathsim_dmc.tasks.route import SIDE_AHEAD, Place, locate
 
 TASK = "simple1_bca_pair"
 
@@ -91,6 +92,41 @@ def test_turning_by_the_error_turns_the_side_to_the_route(environment):
     after, _ = directions()
     # Friction keeps some of it.
     assert np.cos(after[0, 0]) > 0.9
+
+
+def test_a_lead_comes_about_without_a_push():
+    """In withdrawals nothing is pushed; else nothing goes faster than the first."""
+    settings, leads = CoaxialPlan.settings, CoaxialPlan.settings.retry.leads
+    place = Place(np.full(2 * len(leads), 0.1), np.full(2 * len(leads), -0.5))
+    retracting = np.repeat([True, False], len(leads))
+    insertion = np.tile([0.1, 0.08], (len(retracting), 1))
+    memory = Memory.at(place, insertion[:, 0])._replace(
+        retracting=retracting, attempts=np.tile(np.arange(len(leads)), 2)
+    )
+    speed = np.where(retracting, -settings.withdrawal, 0.3)
+    reached, zero = insertion.copy(), np.zeros(len(speed))
+    for _ in range(200):
+        moves = coaxial_pursuit._led(settings, memory, reached, speed, zero)
+        assert (moves.max(axis=1) <= speed + 1e-9).all()
+        assert (moves >= -1.0).all()
+        reached = reached + coaxial_pursuit._MOVE * moves
+    gaps = (reached[:, 0] - reached[:, 1]).reshape(2, -1)
+    np.testing.assert_allclose(gaps, [leads, leads], atol=1e-3)
+
+
+def test_a_hard_push_slows_the_pair(environment):
+    environment.reset()
+    rollout = environment.task.rollout
+    plan, memory = CoaxialPlan.for_case(rollout.case()), rollout.memory
+    speeds = []
+    for push in (0.0, 0.2, 1.0):
+        readings = rollout.readings._replace(push_force=np.full(1, push))
+        given = plan.fresh((1,)), memory, readings, rollout.wall_force, rollout.devices
+        speeds.append(plan.decide(plan.settings, *given)[0][0, ::2].max())
+    settings = plan.settings
+    assert speeds[0] == pytest.approx(settings.speed)
+    assert speeds[2] == pytest.approx(settings.speed * settings.creep)
+    assert speeds[2] < speeds[1] < speeds[0]
 
 
 @pytest.mark.slow

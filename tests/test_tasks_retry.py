@@ -56,25 +56,28 @@ def test_a_withdrawal_that_is_held_up_ends_inside_the_tube_alone():
     assert not goes_on(memory, 0.1, 0.08).retracting[0]
 
 
-def test_a_hard_push_ends_an_attempt_and_several_at_one_place_all():
+@pytest.mark.parametrize("settings", [SINGLE, COAXIAL])
+def test_a_hard_push_ends_an_attempt_and_several_at_one_place_all(settings):
     memory, retries = begun([0.1], [0.08]), []
-    for _ in range(60):
+    for _ in range(12 * settings.most_pushed):
         back = bool(memory.retracting[0])
         insertion = memory.turn[0] - 1e-6 if back else 0.08
-        push = 0.0 if back else 2 * SINGLE.hard_push
-        memory = goes_on(memory, 0.09 if back else 0.1, insertion, push=push)
+        push = 0.0 if back else 2 * settings.hard_push
+        memory = goes_on(
+            memory, 0.09 if back else 0.1, insertion, push=push, settings=settings
+        )
         retries.append(int(memory.attempts[0]))
         if memory.given_up[0]:
             break
-    assert retries[SINGLE.push_patience - 1 : SINGLE.push_patience + 1] == [0, 1]
-    assert memory.given_up[0] and memory.pushed[0] == SINGLE.most_pushed
+    assert retries[settings.push_patience - 1 : settings.push_patience + 1] == [0, 1]
+    assert memory.given_up[0] and memory.pushed[0] == settings.most_pushed
     last = memory.attempts[0]
-    for _ in range(2 * SINGLE.patience):
-        memory = goes_on(memory, 0.1, 0.08)
+    for _ in range(2 * settings.patience):
+        memory = goes_on(memory, 0.1, 0.08, settings=settings)
     assert memory.attempts[0] == last and memory.given_up[0]
     # One that has come farther is not at that place any more.
-    memory = begun([0.1], [0.08], pushed=[SINGLE.most_pushed - 1], barrier=[0.05])
-    memory = goes_on(memory, 0.1, 0.08, push=1.0)
+    memory = begun([0.1], [0.08], pushed=[settings.most_pushed - 1], barrier=[0.05])
+    memory = goes_on(memory, 0.1, 0.08, push=1.0, settings=settings)
     assert memory.pushed[0] == 0
 
 

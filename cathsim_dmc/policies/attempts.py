@@ -117,7 +117,7 @@ def translation(
     s, free = settings, freedom(settings, contact)
     clear = _ramp(cosine, s.misaligned, s.aligned)
     stuck = _ramp(memory.stale, *s.stuck) * (memory.lost == 0)
-    press = s.press * stuck * free * _ramp(push, s.hard_push, s.soft_push)
+    press = s.press * stuck * free * ease(s, push)
     forward = s.speed * np.maximum(np.maximum(free * clear, s.creep), press)
     forward = np.where(memory.given_up, 0.0, forward)
     straight = memory.stale >= s.straightening
@@ -127,6 +127,11 @@ def translation(
 def freedom(settings: AttemptSettings, contact: np.ndarray) -> np.ndarray:
     """1 where the largest contact (...), N, is soft, 0 where it is hard."""
     return _ramp(contact, settings.hard_force, settings.soft_force)
+
+
+def ease(settings: AttemptSettings, push: np.ndarray) -> np.ndarray:
+    """1 where the base is pushed softly, (...), N, 0 where it is pushed hard."""
+    return _ramp(push, settings.hard_push, settings.soft_push)
 
 
 def relaxed(

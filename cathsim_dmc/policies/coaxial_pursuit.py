@@ -48,6 +48,8 @@ class CoaxialSettings(AttemptSettings):
     """Settings of the expert of coaxial devices.
 
     Attributes:
+        gentle: slowest withdrawal, as a part of `withdrawal`, between the contact
+            forces that slow an advance.
         lead_gain: share of the error of the lead corrected in a control step.
         aside: by how much the route must bend away for a device to be turned, rad.
         turning: share of the error of direction that a base is turned by in a control
@@ -63,6 +65,10 @@ class CoaxialSettings(AttemptSettings):
     misaligned: float = 0.0
     press: float = 0.0
     straightening: int = 0
+    soft_push: float = 0.12
+    hard_push: float = 0.25
+    withdrawal: float = 0.6
+    gentle: float = 0.3
     lead_gain: float = 0.2
     aside: float = 0.2
     turning: float = 0.2
@@ -131,6 +137,11 @@ class CoaxialPlan(Route):
         cosine = np.take_along_axis(looks, leader, axis=1)[:, 0]
         contact, push = wall_force.mean_max, readings.push_force
         speed = attempts.translation(settings, memory, contact, push, cosine)
+        eased = settings.speed * attempts.ease(settings, push)
+        eased = np.maximum(eased, settings.speed * settings.creep)
+        gentle = np.maximum(attempts.freedom(settings, contact), settings.gentle)
+        back = memory.retracting
+        speed = np.where(back, speed * gentle, np.minimum(speed, eased))
         deep = np.maximum(place.arc_length - self.ostium, 0.0)
         action[:, 0::2] = _led(settings, memory, devices.insertion, speed, deep)
         insertion, arc_length = np.array(readings.insertion), np.array(place.arc_length)
@@ -145,14 +156,22 @@ def _led(
     speed: np.ndarray,
     deep: np.ndarray,
 ) -> np.ndarray:
-    """Translations (N, K) at the leads; a leading wire deep in a branch goes alone."""
+    """Translations (N, K) at the leads; a leading wire deep in a branch goes alone.
+
+    The fastest device moves at `speed` (N,). The leads come about as others are slower
+    or withdrawn, so that none is pushed against a force that slows the first, nor at
+    all in a withdrawal.
+    """
     lead = retry.lead(settings.retry, memory)
     lead = np.where(lead > 0.0, np.maximum(lead, deep), lead)[:, None]
     wanted = insertion[:, :1] - lead * np.arange(insertion.shape[1])
-    follow = speed[:, None] + settings.lead_gain * (wanted - insertion) / _MOVE
-    # While the wire goes on, the catheter waits for it rather than coming back.
-    follow = np.where(memory.retracting[:, None], follow, np.maximum(follow, 0.0))
-    return np.concatenate([speed[:, None], follow[:, 1:]], axis=1)
+    moves = speed[:, None] + settings.lead_gain * (wanted - insertion) / _MOVE
+    moves -= moves.max(axis=1, keepdims=True) - speed[:, None]
+    # While one goes on, the other waits for it; a wire that is to be behind comes back.
+    back, retracting = 0.4 * settings.withdrawal, memory.retracting[:, None]
+    least = np.where(retracting, speed[:, None] - back, np.zeros(moves.shape))
+    least[:, :1] -= np.where(~retracting & (lead < 0.0), back, 0.0)
+    return np.maximum(moves, least)
 
 
 def _directions(

@@ -90,7 +90,8 @@ COAXIAL = RetrySettings(
     progress=0.5e-3,
     patience=60,
     lost_patience=15,
-    hard_push=np.inf,
+    hard_push=0.2,
+    most_pushed=16,
     slack=12e-3,
     give=2e-3,
     thorough=4,
@@ -194,7 +195,7 @@ def advance(
     strayed, forced = lost > s.lost_patience, pressed > s.push_patience
     give_up = on & ((stale > s.patience) | buckled) | strayed | forced
     attempts = m.attempts + give_up
-    taking_up = ~strayed & ~forced & (attempts % s.thorough != 0)
+    taking_up = ~strayed & (attempts % s.thorough != 0)
     taking_up = np.where(give_up, taking_up, m.taking_up)
     growth = 1 + s.backoff_growth * (m.attempts % _GROWING)
     turn = np.where(give_up, insertion - s.backoff * growth, m.turn)
