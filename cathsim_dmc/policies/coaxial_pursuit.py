@@ -48,8 +48,8 @@ class CoaxialSettings(AttemptSettings):
     """Settings of the expert of coaxial devices.
 
     Attributes:
-        gentle: slowest withdrawal, as a part of `withdrawal`, between the contact
-            forces that slow an advance.
+        gentle: slowest withdrawal, as a part of `withdrawal`; the forces that slow an
+            advance slow it.
         lead_gain: share of the error of the lead corrected in a control step.
         aside: by how much the route must bend away for a device to be turned, rad.
         turning: share of the error of direction that a base is turned by in a control
@@ -67,8 +67,8 @@ class CoaxialSettings(AttemptSettings):
     straightening: int = 0
     soft_push: float = 0.12
     hard_push: float = 0.25
-    withdrawal: float = 0.6
-    gentle: float = 0.3
+    withdrawal: float = 0.4
+    gentle: float = 0.5
     lead_gain: float = 0.2
     aside: float = 0.2
     turning: float = 0.2
@@ -137,11 +137,11 @@ class CoaxialPlan(Route):
         cosine = np.take_along_axis(looks, leader, axis=1)[:, 0]
         contact, push = wall_force.mean_max, readings.push_force
         speed = attempts.translation(settings, memory, contact, push, cosine)
-        eased = settings.speed * attempts.ease(settings, push)
-        eased = np.maximum(eased, settings.speed * settings.creep)
-        gentle = np.maximum(attempts.freedom(settings, contact), settings.gentle)
-        back = memory.retracting
-        speed = np.where(back, speed * gentle, np.minimum(speed, eased))
+        ease = attempts.ease(settings, push)
+        eased = settings.speed * np.maximum(ease, settings.creep)
+        ease = np.minimum(ease, attempts.freedom(settings, contact))
+        gently = speed * np.maximum(ease, settings.gentle)
+        speed = np.where(memory.retracting, gently, np.minimum(speed, eased))
         deep = np.maximum(place.arc_length - self.ostium, 0.0)
         action[:, 0::2] = _led(settings, memory, devices.insertion, speed, deep)
         insertion, arc_length = np.array(readings.insertion), np.array(place.arc_length)
@@ -168,7 +168,7 @@ def _led(
     moves = speed[:, None] + settings.lead_gain * (wanted - insertion) / _MOVE
     moves -= moves.max(axis=1, keepdims=True) - speed[:, None]
     # While one goes on, the other waits for it; a wire that is to be behind comes back.
-    back, retracting = 0.4 * settings.withdrawal, memory.retracting[:, None]
+    back, retracting = 0.5 * settings.withdrawal, memory.retracting[:, None]
     least = np.where(retracting, speed[:, None] - back, np.zeros(moves.shape))
     least[:, :1] -= np.where(~retracting & (lead < 0.0), back, 0.0)
     return np.maximum(moves, least)
