@@ -2,6 +2,7 @@
 
 python benchmarks/robust.py pretrained:navigator --out runs/navigator.jsonl
 python benchmarks/robust.py expert --out runs/expert.jsonl --only anatomies
+python benchmarks/robust.py pretrained:navigator_pair --pair --out runs/pair.jsonl
 
 Every cell is a line of the file as soon as it has been played; the same command goes on
 with those that are missing. With --ray the machines of a Ray cluster play them, see
@@ -22,7 +23,7 @@ import tyro
 # torchrl goes before dm_control.
 from cathsim_dmc.agents import evaluation, protocols  # isort: skip
 
-from cathsim_dmc import cluster, files
+from cathsim_dmc import cluster, files, suite
 from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.agents.results import SAFE_FORCES
 from cathsim_dmc.anatomy.arch import arch
@@ -31,6 +32,7 @@ from cathsim_dmc.tasks.anatomies import load_anatomy
 GOALS = ("bca", "lcca", "lsa")
 ACCESSES = ("ascending", "descending")
 PHANTOMS = ("type1", "type2", "type3", "bovine")
+PAIR = suite.COAXIAL["pair"][0]  # driven from the groin
 # What the device and the surroundings of one episode may differ in, one at a time.
 CHANGES = {
     "none": {},
@@ -58,47 +60,61 @@ class Cell:
     protocol: str = "varied"
 
 
-def arches(pool=None):
+def _accesses(pair):
+    return ACCESSES[1:] if pair else ACCESSES
+
+
+def _arch(pair):
+    return "arch_any_pair" if pair else "arch_any"
+
+
+def arches(pool=None, pair=False):
     """Every held-out arch once, or so many, for each branch and access."""
     pool = pool or len(arch.arch_set("test"))
     for goal in GOALS:
-        for access in ACCESSES:
+        for access in _accesses(pair):
             where = {"goal": goal, "access": access}
             options = {**where, "arches": "test", "pool": pool}
-            yield Cell("arches", where, "arch_any", options, pool)
+            yield Cell("arches", where, _arch(pair), options, pool)
 
 
-def variants(episodes=4):
+def variants(pair=False, episodes=4):
     """Held-out arches of type III, bovine ones and aberrant ones, each by itself.
 
     The branch and the access of an arch follow from its number. Arches with another
     number of goals have no place in one pool.
     """
-    where = {"goal": "any", "access": "any", "arches": "test_variants", "pool": 1}
+    access = ACCESSES[1] if pair else "any"
+    where = {"goal": "any", "access": access, "arches": "test_variants", "pool": 1}
     for number, seed in enumerate(arch.arch_set("test_variants")):
         options = {**where, "first": number}
-        yield Cell("variants", {"arch": seed.name}, "arch_any", options, episodes)
+        yield Cell("variants", {"arch": seed.name}, _arch(pair), options, episodes)
 
 
-def anatomies(names, episodes=20):
-    """Each branch of phantoms, from each access, and of imported anatomies."""
+def anatomies(names, pair=False, wanted=GOALS, episodes=20):
+    """Branches of phantoms, from each access, and of imported anatomies."""
+    driven = {"devices": PAIR} if pair else {}
     for name in names:
         goals = load_anatomy(name).goals
-        for goal in (goal for goal in GOALS if goal in goals):
-            for access in ACCESSES if name in PHANTOMS else (None,):
+        for goal in (goal for goal in wanted if goal in goals):
+            for access in _accesses(pair) if name in PHANTOMS else (None,):
                 where = {"anatomy": name, "goal": goal, "access": access}
                 options = {key: value for key, value in where.items() if value}
+                options |= driven
                 yield Cell("anatomies", where, "navigate", options, episodes)
 
 
-def changes(episodes=20):
+def changes(pair=False, episodes=20):
     """One change at a time on a phantom."""
     where = {"anatomy": "type1", "goal": "lcca"}
+    if pair:
+        where |= {"access": ACCESSES[1], "devices": PAIR}
+    device = {"devices": ("wire_035_glide", "vertebral_5f")}
     for name, ranges in CHANGES.items():
         options = {**where, "randomisation": ranges or False}
         yield Cell("changes", {"change": name}, "navigate", options, episodes, "")
     for name, options in (
-        ("device", {"device": "steerable_4f"}),
+        ("device", device if pair else {"device": "steerable_4f"}),
         ("anatomy", {"anatomy": "type2"}),
         ("time step", {"physics_timestep": 2e-3}),
     ):
@@ -134,7 +150,7 @@ def play(policy: str, cell: Cell, player=None, threads: int | None = None) -> di
         "steps": round(float(found.values("length").mean()), 1),
         "mean_force": round(float(found.values("forces.mean_force").mean()), 6),
         "largest_sum": round(float(sums.max()), 4),
-        "by_device": _shares([one.get("device") for one in drawn], reached),
+        "by_device": _shares([_device(cell, one) for one in drawn], reached),
         "by_kind": _shares([_kind(cell, one) for one in drawn], reached),
         "missed_arches": [
             one["arch"]
@@ -151,6 +167,13 @@ def _play_apart(job):
     policy, cell, player, threads, of_torch = job
     torch.set_num_threads(of_torch)  # rounding depends on it
     return play(policy, cell, player, threads)
+
+
+def _device(cell, drawn):
+    """Name of the device of an episode; of coaxial ones the names of all."""
+    own = suite.TASKS[cell.task].options.get("devices", ())
+    devices = cell.options.get("devices", own)
+    return " in ".join(devices) or drawn.get("device")
 
 
 def _kind(cell, drawn):
@@ -172,13 +195,49 @@ def _shares(groups, reached):
     return counts
 
 
+@dataclasses.dataclass(frozen=True)
+class Selection:
+    """Which cells to play.
+
+    Attributes:
+        only: Parts to play.
+        anatomy: Names or directories of the anatomies of the part `anatomies`.
+        goals: Branches of these anatomies, of those that they have.
+        pair: Whether a guidewire in a catheter is driven from the groin.
+        pool: Number of held-out arches of the part `arches`, the first ones; all by
+            default.
+        max_steps: Number of control steps after which an episode is cut off; that of
+            the task by default.
+    """
+
+    only: tuple[Part, ...] = ("arches", "variants", "anatomies", "changes")
+    anatomy: tuple[str, ...] = PHANTOMS
+    goals: tuple[str, ...] = GOALS
+    pair: bool = False
+    pool: int | None = None
+    max_steps: int | None = None
+
+    def cells(self):
+        """The cells in turn."""
+        makers = {
+            "arches": lambda: arches(self.pool, self.pair),
+            "variants": lambda: variants(self.pair),
+            "anatomies": lambda: anatomies(self.anatomy, self.pair, self.goals),
+            "changes": lambda: changes(self.pair),
+        }
+        for cell in (cell for part in self.only for cell in makers[part]()):
+            labels, options = dict(cell.labels), dict(cell.options)
+            if self.pair:
+                labels["devices"] = "pair"
+            if self.max_steps is not None:
+                options["max_steps"] = self.max_steps
+            yield dataclasses.replace(cell, labels=labels, options=options)
+
+
 def main(
     policy: Annotated[str, tyro.conf.Positional],
     out: Path,
-    only: tuple[Part, ...] = ("arches", "variants", "anatomies", "changes"),
-    anatomy: tuple[str, ...] = PHANTOMS,
-    pool: int | None = None,
-    max_steps: int | None = None,
+    selection: Annotated[Selection, tyro.conf.OmitArgPrefixes],
     ray: bool = False,
     processors: int = 1,
 ) -> None:
@@ -187,32 +246,17 @@ def main(
     Args:
         policy: Run, checkpoint, `pretrained:NAME` or a name of `cathsim eval`.
         out: File with a line of JSON for each cell.
-        only: Parts to play.
-        anatomy: Names or directories of the anatomies of the part `anatomies`.
-        pool: Number of held-out arches of the part `arches`, the first ones; all by
-            default.
-        max_steps: Number of control steps after which an episode is cut off; that of
-            the task by default.
+        selection: Which cells to play.
         ray: Whether the machines of a Ray cluster play the cells.
         processors: Number of processors of a cell on the cluster.
     """
-    cells = {
-        "arches": lambda: arches(pool),
-        "variants": variants,
-        "anatomies": lambda: anatomies(anatomy),
-    }
-    cells["changes"] = changes
     lines = out.read_text().splitlines() if out.exists() else []
     done, missing = [json.loads(line) for line in lines], []
     files.require_file(out, make=True)
-    for cell in (cell for part in only for cell in cells[part]()):
+    for cell in selection.cells():
         key = {"policy": policy, "part": cell.part, **cell.labels}
-        if any(key.items() <= line.items() for line in done):
-            continue
-        if max_steps is not None:
-            options = {**cell.options, "max_steps": max_steps}
-            cell = dataclasses.replace(cell, options=options)
-        missing.append(cell)
+        if not any(key.items() <= line.items() for line in done):
+            missing.append(cell)
     played = enumerate(play(policy, cell) for cell in missing)
     if ray:
         own = load_policy(policy), processors, torch.get_num_threads()

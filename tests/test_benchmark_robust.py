@@ -13,6 +13,25 @@ def test_cells_of_arches_play_every_held_out_arch():
         assert set(cell.options) <= set(suite.task_options(cell.task))
 
 
+def test_a_pair_is_driven_from_the_groin_in_every_part():
+    parts = {
+        "arches": [*robust.arches(pair=True)],
+        "variants": [*robust.variants(pair=True)],
+        "anatomies": [*robust.anatomies(robust.PHANTOMS, pair=True)],
+        "changes": [*robust.changes(pair=True)],
+    }
+    counts = {part: len(cells) for part, cells in parts.items()}
+    assert counts == {
+        "arches": 3, "variants": 48, "anatomies": 12, "changes": 14
+    }  # fmt: skip
+    for cell in (cell for cells in parts.values() for cell in cells):
+        assert cell.options["access"] == "descending"
+        assert set(cell.options) <= set(suite.task_options(cell.task))
+        assert robust._device(cell, {}).startswith("wire_035_glide in ")
+    wanted = robust.anatomies(("type1",), True, ("lsa", "nowhere"))
+    assert [cell.labels["goal"] for cell in wanted] == ["lsa"]
+
+
 def test_an_episode_is_counted_for_the_kind_of_its_arch():
     kinds = [robust._kind(cell, {}) for cell in robust.variants()]
     assert kinds[:4] == [

@@ -17,7 +17,7 @@ from cathsim_dmc.analysis.intervals import success_interval
 DOCS = Path(__file__).parents[1]
 DATA, PAGE = DOCS / "data" / "robust.jsonl", DOCS / "robustness.md"
 _FIGURES = "| safe, 0.5 N | steps | mean force, mN | largest sum, N |"
-_KEYS = ("policy", "part", "goal", "access", "anatomy", "change", "arch")
+_KEYS = ("policy", "part", "goal", "access", "anatomy", "change", "arch", "devices")
 
 
 def key(row):
