@@ -117,10 +117,10 @@ def test_a_policy_that_ships_starts_a_training():
 
 def test_a_policy_that_observes_less_starts_a_training():
     """At first the new one acts as it does, whatever the new entries are."""
-    source = load_policy("pretrained:navigator")
+    source = load_policy("pretrained:femoral_type1_lcca_living")
     assert isinstance(source, TrainedPolicy)
     wider = {"observation": ("route", "route_retry")}
-    name = {"initial_policy": "pretrained:navigator"}
+    name = {"initial_policy": "pretrained:femoral_type1_lcca_living"}
     config = source.config.replace(**wider, **name)
     shapes = replace(source.shapes, vector=source.shapes.vector + 11)
     policy = make_policy(shapes, config)
