@@ -192,8 +192,8 @@ DERIVED = {
     "Moving": {"_motions", "_surfaces", "_inlets"},
     "Flow": {"_circulations"},
     # Scratch, and views of the model.
-    "SingleDevice": {"_bends", "_held", "_sheathed"},
-    "SlidingDevices": {"_fields", "_memory", "_chain", "_held", "_sheathed"},
+    "SingleDevice": {"_steering", "_held", "_sheathed", "_hinged"},
+    "SlidingDevices": {"_fields", "_memory", "_chain", "_held", "_sheathed", "_hinged"},
 }
 _CONSTANT = (World, Layout, Stepper, Case, NavigationConfig, mjcf.Element)
 

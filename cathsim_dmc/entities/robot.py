@@ -101,6 +101,27 @@ def postures(given: NDArray[np.float64]) -> NDArray[np.float64]:
     return joints
 
 
+@compiled
+def pose(qpos, held, joints):
+    """Writes the joints of N followers, both of whose pairs hold one device.
+
+    Args:
+        qpos: (N, nq), MuJoCo's.
+        held: (2,) int, places of insertion and rotation of the device among them; a
+            negative one stands for 0.
+        joints: (len(JOINTS),) int, places of the joints.
+    """
+    given = np.zeros((4, len(qpos)))
+    for k in range(4):
+        for i in range(len(qpos)):
+            if held[k % 2] >= 0:
+                given[k, i] = qpos[i, held[k % 2]]
+    posed = postures(given)
+    for i in range(len(qpos)):
+        for k in range(len(joints)):
+            qpos[i, joints[k]] = posed[i, k]
+
+
 class Robot(composer.ModelWrapperEntity):
     """The follower; attach it to the arena at the mouth of the introducer sheath.
 

@@ -7,6 +7,8 @@ compliance of the part of the rod about it that is out of the sheath.
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from cathsim_dmc.compiled import compiled
 
 # Share of its compliance that a joint keeps in the sheath. With 1e-3 the part in the
@@ -48,6 +50,11 @@ class Joints(NamedTuple):
     behind: Any
     ahead: Any
     distal: Any
+
+
+def held_stiffness(stiffness, out):
+    """Stiffness, N·m/rad, of joints of whose compliance a fraction is in no sheath."""
+    return stiffness / np.maximum(out, LEAST)
 
 
 @compiled

@@ -37,7 +37,8 @@ from cathsim_dmc.laws.blood import Blood, drag
 from cathsim_dmc.laws.compliance import share
 from cathsim_dmc.laws.contact import COMPLIANT
 from cathsim_dmc.laws.device import Contact, Device, Links
-from cathsim_dmc.laws.hinges import Bends
+from cathsim_dmc.laws.drive import follow
+from cathsim_dmc.laws.hinges import Bends, steered
 from cathsim_dmc.laws.motion import (
     VALUES,
     WARP,
@@ -46,6 +47,7 @@ from cathsim_dmc.laws.motion import (
     wall_velocity,
     warp,
 )
+from cathsim_dmc.laws.sheath import Hinges, hold
 from cathsim_dmc.laws.springs import Scratch, Springs, shape_torques
 
 _adapter = native.callback("void(int64, int64, int64, int64)")
@@ -178,6 +180,48 @@ def motion(model, data, layout, start):
         for row in range(min(contact_field(contact, "dim")[0], 3)):
             speed = frame[3 * row] * u + frame[3 * row + 1] * v + frame[3 * row + 2] * w
             jacobian[(first + row) * nv + nv - 1] = speed
+
+
+@compiled
+def hold_links(sheathed, first, stop):
+    """Holds the links in the sheaths of some of N simulations, see `laws.sheath.hold`.
+
+    Args:
+        sheathed: `held.Sheathed`.
+        first: Number of the first simulation.
+        stop: Number after that of the last one.
+    """
+    for i in range(first, stop):
+        free, (stiffness, damping, rest) = sheathed.free[i], sheathed.places[i]
+        if stiffness != 0:
+            own = Hinges(free[0], free[1], free[2])
+            model = Hinges(numbers(stiffness), numbers(damping), numbers(rest))
+            hold(sheathed.joints, sheathed.insertion[i], own, model, sheathed.out[i])
+
+
+@compiled
+def act(drives, sheathed, steering, load, control):
+    """Moves N single devices: drives, the sheath, the motors of the tip.
+
+    Args:
+        drives: `drives.Bound`.
+        sheathed: `held.Sheathed`; None where a bore holds the links.
+        steering: `sliding.Steering`; None without motors.
+        load: (N, D), see `laws.drive.follow`.
+        control: (N, A), action of the motors, then of the drives; becomes the control.
+    """
+    way = np.empty_like(load)
+    count, motors = len(control), control.shape[1] - load.shape[1]
+    follow(drives.servos, drives.state, control[:, motors:], load, drives.told, way)
+    if sheathed is not None:
+        hold_links(sheathed, 0, count)
+    if steering is not None:
+        angles = np.empty((count, len(steering.places)))
+        for i in range(count):
+            for k in range(len(steering.places)):
+                angles[i, k] = drives.state.qpos[i, steering.places[k]]
+        commands = control[:, :motors]
+        steered(commands, angles, steering.bends, commands)
 
 
 @functools.cache

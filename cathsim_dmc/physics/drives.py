@@ -5,7 +5,7 @@
 
 import math
 import types
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,17 +14,32 @@ from cathsim_dmc.laws import drive
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 
+class Bound(NamedTuple):
+    """What `laws.drive` takes of N simulations.
+
+    Attributes:
+        servos: `laws.drive.Servos`.
+        state: `laws.drive.State`, views.
+        told: `laws.drive.Told`.
+    """
+
+    servos: Any
+    state: Any
+    told: Any
+
+
 class Drives:
     """The D drives of N simulations: translation, and rotation if there is one.
 
     Attributes:
         slipped: (N, D), way by which each clamp has slipped in the episode, m and rad.
+        bound: Servos, state and what they have been told, for compiled functions.
         told: (N, D), place at which each base comes to rest without a further command,
             m and rad; it is that far behind in motion.
     """
 
     def __init__(self, model: mujoco.MjModel, arrays: Any):
-        """Finds the servos; the arrays are views (N, ...) of MuJoCo's."""
+        """Finds the servos; the arrays are views (N, ...) of MuJoCo's that stay."""
         found = np.flatnonzero(
             model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR.value
         )
@@ -47,6 +62,11 @@ class Drives:
         )
         self._sensed = np.array([_load_sensor(model, joint) for joint in joints])
         self.slipped, self.told = np.zeros((2, len(arrays.qpos), len(found)))
+        self.bound = Bound(
+            servos=self._servos,
+            state=drive.State(arrays.qpos, arrays.qvel, arrays.act),
+            told=drive.Told(self.told, self.slipped),
+        )
 
     def hold(self, index: int) -> None:
         """Sets the command of one simulation to where its base stands."""
@@ -59,7 +79,7 @@ class Drives:
     def resting(self) -> np.ndarray:
         """Places (N, D) at which the bases come to rest, where clamps have slipped."""
         slip = np.empty_like(self.told)
-        drive.slip(self._servos, self._state(), slip)
+        drive.slip(self._servos, self.bound.state, slip)
         return self.told - slip
 
     def follow(self, command: np.ndarray, load: np.ndarray | None = None) -> np.ndarray:
@@ -73,16 +93,12 @@ class Drives:
         Returns:
             Way (N, D) by which the clamps have slipped in the last one, m and rad.
         """
-        slip, told = np.empty_like(self.told), drive.Told(self.told, self.slipped)
+        slip = np.empty_like(self.told)
         if load is None:
             load = self._arrays.sensordata[:, self._sensed]
         command, load = map(np.ascontiguousarray, (command, load))
-        drive.follow(self._servos, self._state(), command, load, told, slip)
+        drive.follow(*self.bound[:2], command, load, self.bound.told, slip)
         return slip
-
-    def _state(self) -> drive.State:
-        arrays = self._arrays
-        return drive.State(arrays.qpos, arrays.qvel, arrays.act)
 
 
 def hold(model: mujoco.MjModel, data: mujoco.MjData) -> Drives:

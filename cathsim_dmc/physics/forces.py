@@ -1,7 +1,8 @@
 """Forces between device and wall, as functions of the contact sensor's readings."""
 
 import dataclasses
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -106,7 +107,12 @@ def wall_force(rows: np.ndarray) -> tuple[WallForce, np.ndarray]:
     Returns:
         Forces, and the depth (N,) of the deepest contact in them, m.
     """
+    found = _loops().summed(rows, CONTACT_SIZE)
+    return WallForce._make(found[:6]), found[6]
+
+
+@functools.cache
+def _loops() -> Any:
     from cathsim_dmc.physics import forces_loops  # late, as numba takes long
 
-    found = forces_loops.summed(rows, CONTACT_SIZE)
-    return WallForce._make(found[:6]), found[6]
+    return forces_loops

@@ -5,6 +5,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -77,6 +78,30 @@ class Held:
         finally:
             for field, values in zip(fields, before, strict=True):
                 field[:] = values
+
+
+class Sheathed(NamedTuple):
+    """The hinges of N simulations.
+
+    Attributes:
+        joints: `laws.sheath.Joints`.
+        insertion: (N,), m.
+        free: (N, 3, J, 2), stiffness, damping and rest angles without a sheath.
+        places: (N, 3) int64, see `addresses`; 0 where there is no episode yet.
+        out: (N, J), fraction of each joint's compliance that is out of the sheath.
+    """
+
+    joints: Any
+    insertion: Any
+    free: Any
+    places: Any
+    out: Any
+
+
+def addresses(fields: sheath.Hinges) -> list[int]:
+    """Where the fields of a model, contiguous arrays of float64, lie in memory."""
+    assert all(each.dtype == float and each.flags.c_contiguous for each in fields)
+    return [each.ctypes.data for each in fields]
 
 
 def fields_of(field: Callable[[str], np.ndarray]) -> sheath.Hinges:

@@ -21,8 +21,8 @@ from cathsim_dmc.entities.chain import (
 )
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
-from cathsim_dmc.entities.robot import postures
-from cathsim_dmc.laws import hinges, sliding
+from cathsim_dmc.entities.robot import pose, postures
+from cathsim_dmc.laws import sheath, sliding
 from cathsim_dmc.laws.hinges import Bends
 from cathsim_dmc.laws.parameters import Array
 from cathsim_dmc.laws.springs import Springs
@@ -44,6 +44,18 @@ _PRESLIDING = 40e-6
 # Way of a slipping clamp in a control step by the force beyond its largest, m/N. The
 # axial force of a stiff wire in a tight bend changes by 0.8 N/mm at most.
 _GIVE = 1e-3
+
+
+class Steering(NamedTuple):
+    """How motors are turned out of untwisted frames into those of links.
+
+    Attributes:
+        places: (2 J,), of the hinges among MuJoCo's `qpos`, in the order of the chain.
+        bends: `laws.hinges.Bends`, scratch.
+    """
+
+    places: Any
+    bends: Any
 
 
 class SingleDevice(Effect):
@@ -79,16 +91,27 @@ class SingleDevice(Effect):
         self._drives = Drives(world.model, world.arrays)
         self.slipped, self.told = self._drives.slipped, self._drives.told
         model, places = world.model, world.index.bends_qpos
-        self._bends_qpos, joints = np.sort(places, axis=None), len(places)
-        self._bends = Bends(np.empty(joints, complex), np.empty(joints))
+        joints, self._steering = len(places), None
+        if world.chain.tip_motors:
+            bends = Bends(np.empty(joints, complex), np.empty(joints))
+            self._steering = Steering(np.sort(places, axis=None), bends)
         hinges_x = np.searchsorted(model.jnt_qposadr, places[:, 0])
         # The shape lies in the plane of x and z.
         rest = model.qpos_spring[places[:, 1]]
         self._springs = Springs(rest, 1 / model.jnt_stiffness[hinges_x])
         self._held = held.Held(model, world.chain, places, world.start_depth)
-        # Stiffness, damping and rest angles of the joints without a sheath.
-        self._free = np.stack([self._held.nominal] * world.num_simulations)
-        self._sheathed: list[Any] = [None] * world.num_simulations
+        self._sheathed = held.Sheathed(
+            joints=self._held.joints,
+            insertion=world.arrays.qpos[:, world.index.insertion_qpos],
+            free=np.stack([self._held.nominal] * world.num_simulations),
+            places=np.zeros((world.num_simulations, len(held.FIELDS)), np.int64),
+            out=np.ones((world.num_simulations, joints)),
+        )
+        self._free = self._sheathed.free
+        self._hinged: list[Any] = [None] * world.num_simulations
+        turned = world.index.rotation_qpos
+        rotation = -1 if turned is None else turned
+        self._base = np.array([world.index.insertion_qpos, rotation])
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Holds the base of one simulation where it stands."""
@@ -111,43 +134,41 @@ class SingleDevice(Effect):
 
     def _find_hinges(self, index: int) -> None:
         fields = held.fields_of(lambda name: self.world.field(index, name))
-        self._sheathed[index] = fields
+        self._hinged[index] = fields  # what lies at their addresses stays
+        self._sheathed.places[index] = held.addresses(fields)
 
     def _hold(self, index: int) -> None:
         """Holds the links of one simulation that are in the sheath."""
-        insertion = self.world.arrays.qpos[index, self.world.index.insertion_qpos]
-        fields, out = self._sheathed[index], self._held.out
-        self._held.write(fields, self._free[index], insertion)
+        from cathsim_dmc.physics import adapters  # late, as numba takes long
+
+        adapters.hold_links(self._sheathed, index, index + 1)
+        self._soften(slice(index, index + 1))
+
+    def _soften(self, rows: slice) -> None:
+        """Writes the springs of a shaped device of which a part is in the sheath."""
         if self.parameters is Springs:
-            self.world.parameters.rest[index] = self._springs.rest * out
-            stiffness = fields.stiffness[self._held.joints.joint[:, 0]]
-            self.world.parameters.compliance[index] = 1 / stiffness
+            free, out = self._free[rows, 0, :, 0], self._sheathed.out[rows]
+            self.world.parameters.rest[rows] = self._springs.rest * out
+            stiffness = sheath.held_stiffness(free, out)
+            self.world.parameters.compliance[rows] = 1 / stiffness
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Lets clamps slip; turns motors against the twist of the links."""
-        motors = len(self.world.chain.tip_motors)
-        load = np.stack([state.push_force, state.push_torque], axis=1)
-        command = action[:, motors:]
-        self._drives.follow(command, load[:, : command.shape[1]])
-        if self._holds:
-            for index in range(len(action)):
-                self._hold(index)
-        if not motors:
-            return action
-        angles = self.world.arrays.qpos[:, self._bends_qpos]
-        commands = np.ascontiguousarray(action[:, :motors])
-        turned = np.empty_like(commands)
-        hinges.steered(commands, angles, self._bends, turned)
-        return np.concatenate([turned, action[:, motors:]], axis=1)
+        from cathsim_dmc.physics import adapters  # late, as numba takes long
 
-    def follower_posture(self) -> np.ndarray:
-        """Joints (N, len(JOINTS)) of the robot that holds the devices."""
-        index, qpos = self.world.index, self.world.arrays.qpos
-        held = np.zeros((4, len(qpos)))
-        held[::2] = qpos[:, index.insertion_qpos]
-        if index.rotation_qpos is not None:
-            held[1::2] = qpos[:, index.rotation_qpos]
-        return postures(held)
+        load = state.push_force[:, None]
+        if self._drives.slipped.shape[1] > 1:
+            load = np.stack([state.push_force, state.push_torque], axis=1)
+        control, sheathed = action.copy(), self._sheathed if self._holds else None
+        adapters.act(self._drives.bound, sheathed, self._steering, load, control)
+        if self._holds:
+            self._soften(slice(None))
+        return control
+
+    def pose_robot(self) -> None:
+        """Poses the robot that holds the devices."""
+        index = self.world.index
+        pose(self.world.arrays.qpos, self._base, index.robot_qpos)
 
     def courses(self, line: np.ndarray) -> list[tuple[Device, np.ndarray]]:
         """The devices and their points (N, n, 3) on a line (N, L + 1, 3), m.
@@ -301,7 +322,7 @@ class SlidingDevices(SingleDevice):
         factors, fields = self._factors[index].tolist(), self._fields[index]
         chain_fields.write(fields, self._places, self._chain, factors[0], factors[1])
         if self._holds:
-            self._free[index] = self._held.read(self._sheathed[index])
+            self._free[index] = self._held.read(self._hinged[index])
             self._hold(index)
 
     def _settle(self, rate: np.ndarray, lead: np.ndarray, state: Readings) -> None:
@@ -351,8 +372,8 @@ class SlidingDevices(SingleDevice):
         sliding.held(told, place, where)
         return where
 
-    def follower_posture(self) -> np.ndarray:
-        """Joints (N, len(JOINTS)) of the robot that holds the outer and inner device.
+    def pose_robot(self) -> None:
+        """Poses the robot that holds the outer and the inner device.
 
         Of more than two devices it holds the outermost and the innermost; of one, both
         units work on the same.
@@ -361,7 +382,7 @@ class SlidingDevices(SingleDevice):
         pushed = reached[:, None] - gaps_of(self._pushed())
         turned = self._angles[..., 0]
         ends = (pushed[:, -1], turned[:, -1], pushed[:, 0], turned[:, 0])
-        return postures(np.array(ends))
+        self._qpos[:, self._index.robot_qpos] = postures(np.array(ends))
 
     def read(self, readings: Readings) -> CoaxialReadings:
         """State of the devices at readings of the same control step."""

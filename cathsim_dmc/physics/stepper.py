@@ -5,10 +5,11 @@
 """
 
 import abc
+import functools
 import math
 import types
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -55,7 +56,6 @@ class Stepper(abc.ABC):
         self._timestep, self._scratch = model.opt.timestep, mujoco.MjData(model)
         self._wall = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "wall")
         self._links = _moving(model)
-        self._views: tuple[np.ndarray, ...] = ()
 
     @abc.abstractmethod
     def _model_of(self, index: int) -> mujoco.MjModel:
@@ -120,6 +120,9 @@ class Stepper(abc.ABC):
         """
         warned, (force, depth) = self._warned(), self._forces()
         limit = forces.DEEPEST if self.deepest is None else self.deepest
+        limits = forces.HARDEST, limit, self._timestep
+        if not _in_doubt(force.peak_max, depth, limits, self._motion, self._links):
+            return force, warned
         depth = self._depth_at_end(depth, warned, limit)
         again: list[tuple[np.ndarray, forces.WallForce]] = []
         # Half the step usually suffices for a compliant wall.
@@ -135,6 +138,10 @@ class Stepper(abc.ABC):
             for whole, each in zip(force, finer, strict=True):
                 whole[indices] = each
         return force, warned
+
+    @functools.cached_property
+    def _motion(self) -> "_Motion":  # a batch looks for each of them every time
+        return _Motion._make(getattr(self.arrays, name) for name in _Motion._fields)
 
     def _forces(self) -> tuple[forces.WallForce, np.ndarray]:
         """Force on the wall over a control step, and its deepest contact (N,), m."""
@@ -208,10 +215,7 @@ class Stepper(abc.ABC):
 
         Contacts are looked for once more where a link may have gone too deep.
         """
-        if not self._views:  # a batch looks for them each time
-            names = ("qvel", "cdof", "xpos", "subtree_com")
-            self._views = tuple(getattr(self.arrays, name) for name in names)
-        way = self._timestep * _fastest(*self._views, *self._links)
+        way = self._timestep * _fastest(self._motion, self._links)
         suspect = (depth + way > limit) & (depth <= limit) & ~warned
         indices = np.flatnonzero(suspect)
         states = self.states(indices) if indices.size else ()
@@ -314,8 +318,9 @@ class SingleStepper(Stepper):
 
     def run(self) -> None:
         """Does all physics steps of a control step."""
-        for _ in range(self.substeps):
-            self.step()
+        for row in self._rows:
+            self._advance(row)
+        self._substep = self.substeps
 
     def _advance(self, row: np.ndarray) -> None:
         """Does a physics step; none after a warning, where a batch stops, too."""
@@ -341,8 +346,35 @@ class SingleStepper(Stepper):
         mujoco.mj_forward(self._model, self._data)
 
 
-def _moving(model: mujoco.MjModel) -> tuple[np.ndarray, ...]:
-    """What `_fastest` knows of the links that can touch a wall."""
+class _Motion(NamedTuple):
+    """Views (N, ...) of what moves the links of N devices, with MuJoCo's names."""
+
+    qvel: Any
+    cdof: Any
+    xpos: Any
+    subtree_com: Any
+
+
+class _Links(NamedTuple):
+    """The M links that can touch a wall.
+
+    Attributes:
+        parents: (nv,), degree of freedom before each of the model.
+        bodies: (M,), numbers of the links among all bodies.
+        last: (M,), degree of freedom that moves each last.
+        roots: (M,), first bodies of their kinematic trees.
+        reach: (M,), m, farthest places from the origins of the bodies.
+    """
+
+    parents: Any
+    bodies: Any
+    last: Any
+    roots: Any
+    reach: Any
+
+
+def _moving(model: mujoco.MjModel) -> _Links:
+    """The links of a model that can touch a wall."""
     links = np.flatnonzero((model.geom_contype == 0) & (model.geom_conaffinity != 0))
     bodies, last = model.geom_bodyid[links], []
     for body in bodies:
@@ -351,23 +383,44 @@ def _moving(model: mujoco.MjModel) -> tuple[np.ndarray, ...]:
         last.append(model.body_dofadr[body] + model.body_dofnum[body] - 1)
     reach = np.linalg.norm(model.geom_pos[links], axis=1) + model.geom_size[links, 1]
     roots = model.body_rootid[bodies]
-    return model.dof_parentid.copy(), bodies, np.array(last), roots, reach
+    return _Links(model.dof_parentid.copy(), bodies, np.array(last), roots, reach)
 
 
 @compiled
-def _fastest(velocity, motions, places, poles, parents, bodies, last, roots, reach):
+def _in_doubt(peak, depth, limits, motion, links):
+    """Whether one of N control steps was too coarse, or may end too deep.
+
+    Args:
+        peak: (N,), largest force of a contact in it, N.
+        depth: (N,), m, of the deepest one.
+        limits: Of force, N, of depth, m, and the physics step, s.
+        motion: `_Motion`.
+        links: `_Links`.
+    """
+    hardest, deepest, timestep = limits
+    speed = _fastest(motion, links)
+    for i in range(len(peak)):
+        if peak[i] > hardest or depth[i] + timestep * speed[i] > deepest:
+            return True
+    return False
+
+
+@compiled
+def _fastest(motion, links):
     """Largest velocity (N,) m/s of places of N devices, but along themselves."""
+    velocity, places, bodies = motion.qvel, motion.xpos, links.bodies
+    parents = links.parents
     found = np.zeros(len(velocity))
     total = np.empty((len(parents), 6))
     for i in range(len(velocity)):
         for dof in range(len(parents)):
             for k in range(6):
-                total[dof, k] = motions[i, dof, k] * velocity[i, dof]
+                total[dof, k] = motion.cdof[i, dof, k] * velocity[i, dof]
                 if parents[dof] >= 0:
                     total[dof, k] += total[parents[dof], k]
         for n in range(len(bodies)):
-            place, pole = places[i, bodies[n]], poles[i, roots[n]]
-            a, b, c, u, v, w = total[last[n]]
+            place, pole = places[i, bodies[n]], motion.subtree_com[i, links.roots[n]]
+            a, b, c, u, v, w = total[links.last[n]]
             x, y, z = place[0] - pole[0], place[1] - pole[1], place[2] - pole[2]
             u, v, w = u + b * z - c * y, v + c * x - a * z, w + a * y - b * x
             along = 0.0
@@ -377,6 +430,6 @@ def _fastest(velocity, motions, places, poles, parents, bodies, last, roots, rea
                 along = (u * x + v * y + w * z) / (x * x + y * y + z * z)
             u, v, w = u - along * x, v - along * y, w - along * z
             speed = math.sqrt(u * u + v * v + w * w)
-            speed += reach[n] * math.sqrt(a * a + b * b + c * c)
+            speed += links.reach[n] * math.sqrt(a * a + b * b + c * c)
             found[i] = max(found[i], speed)
     return found

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -134,14 +135,18 @@ def judge(
                 shapes = f"{value.shape}; it must be {own.distance.shape}"
                 _refuse(objective, f"{name} of shape {shapes}")
             into[rows] = value
-            if failed is not None:
-                into[failed] = 0
-            judged = into[rows]
-            # A sum of plain numbers takes a tenth of the time of `isfinite`.
-            if not math.isfinite(sum(judged.tolist())):
-                if not np.isfinite(judged).all():
-                    given = f"{name} {bounds.shown(value)}, which is not finite"
-                    _refuse(objective, given)
+    judged = {"reward": reward, **terms}
+    if failed is not None:
+        for each in (success, *judged.values()):
+            each[failed] = 0
+    # Sums of plain numbers take a tenth of the time of `isfinite`.
+    if not math.isfinite(sum(sum(each.tolist()) for each in judged.values())):
+        for (objective, rows), (name, each) in itertools.product(
+            groups, judged.items()
+        ):
+            if not np.isfinite(each[rows]).all():
+                given = f"{name} {bounds.shown(each[rows])}, which is not finite"
+                _refuse(objective, given)
     return Outcome(reward, success, terms)
 
 

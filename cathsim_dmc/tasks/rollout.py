@@ -153,7 +153,7 @@ class Rollout(Restorable):
         self._stepper.restore(indices)
         for index in indices:
             self._draw(index, random_states[index])
-        self._pose_robot()
+        self._devices.pose_robot()
         self._choose_objectives()
         self.steps[indices] = 0
         # New arrays: those handed out before stay what they were.
@@ -203,9 +203,6 @@ class Rollout(Restorable):
         for effect in self.effects:
             effect.enter(index, self.case(index).scene.anatomy)
 
-    def _pose_robot(self) -> None:
-        self._state.qpos[:, self.index.robot_qpos] = self._devices.follower_posture()
-
     def command(self, action: np.ndarray) -> None:
         """Takes the actions of a control step; its physics steps must follow.
 
@@ -224,7 +221,7 @@ class Rollout(Restorable):
             )
         self._open[:] = True
         self._previous_action, self._action = self._action, action
-        self._pose_robot()
+        self._devices.pose_robot()
         for effect in self.effects:
             action = effect.act(action, self.readings)
             if action is None:
@@ -275,9 +272,10 @@ class Rollout(Restorable):
         self._errors = physics_errors.found(
             self.case, self.steps, nodes, warned, force.peak_max
         )
-        for error, last, steps in zip(self._errors, old, self.steps, strict=True):
-            if logs and error is not None and last is None:
-                _LOG.error("%s after %d steps", error, steps)
+        if logs and any(self._errors):
+            for error, last, steps in zip(self._errors, old, self.steps, strict=True):
+                if error is not None and last is None:
+                    _LOG.error("%s after %d steps", error, steps)
         step = self._step(everyone)
         self._open[:] = False
         return step
@@ -305,14 +303,18 @@ class Rollout(Restorable):
     def _step(self, rows: np.ndarray, begins: bool = False) -> Step:
         """Judges and observes; captures images of all, or of those that have begun."""
         distance = straight(self.resting.head, self.resting_goal)
-        failed = np.array([error is not None for error in self._errors])
+        failed = None
+        if any(self._errors):
+            failed = np.array([error is not None for error in self._errors])
         measured = Measurement(
             self.resting, self.wall_force, self._action, self._previous_action, distance
         )
-        outcome = judge(self.objectives, measured, failed if failed.any() else None)
+        outcome = judge(self.objectives, measured, failed)
         observation = self._observe(rows, begins)
-        ended = outcome.success | failed | self.progress.given_up
-        ended = ended & (not begins) & (self.steps > 0)
+        ended = outcome.success | self.progress.given_up
+        if failed is not None:
+            ended |= failed
+        ended &= False if begins else self.steps > 0
         return Step(
             observation=observation,
             outcome=outcome,
