@@ -1,24 +1,32 @@
-"""Figures of docs/gpu.md: parity with the CPU, and speed on a GPU.
+"""Figures of docs/gpu.md: parity with the CPU, speed and training on a GPU.
 
-    python benchmarks/gpu.py --out gpu.json          (some six minutes on an H100)
+    python benchmarks/gpu.py --out gpu.json          (some eight minutes on an H100)
+    python benchmarks/gpu.py --only parity
     python benchmarks/gpu.py --device warp:cpu --worlds 4 --steps 5   (a check)
+    python benchmarks/gpu.py --write docs/gpu.md --out docs/data/gpu.json
 
 Parity replays the same actions in `BatchSimulation` and in MuJoCo Warp. Speed counts
-control steps of 40 ms per second of wall time, from actions to observations.
+control steps of 40 ms per second of wall time, from actions to observations. Training
+counts from where all is compiled to the first checkpoint whose policy succeeds in 95 %
+of the episodes, each of at most 200 control steps. Each figure is written as soon as it
+is known, and what does not begin within the budget is left out.
 """
 
 import argparse
+import csv
 import json
+import os
 import platform
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 # isort: off
 # torchrl goes before dm_control.
 import torch
+from cathsim_dmc import agents
 from cathsim_dmc.simulation.torchrl import BatchedEnv
 
 # isort: on
@@ -30,11 +38,56 @@ from cathsim_dmc.simulation.warp.simulation import WarpSimulation
 
 PARITY_TASKS: dict[str, dict[str, Any]] = {
     "type1_lcca": {},
-    "femoral_type1_lcca": {},
     "type1_lcca randomised": {"randomisation": True},
+    "femoral_type1_lcca": {},
     "arch_lcca": {"pool": 2},
 }
-OBSERVATIONS = ("internal", "route", "image")
+# Observation, worlds and actions, the most important ones first.
+SPEED = (
+    ("internal", 4096, "random"), ("internal", 4096, "push"),
+    ("image", 1024, "random"), ("internal", 16384, "random"),
+    ("image", 4096, "random"), ("internal", 1024, "random"),
+    ("route", 4096, "random"), ("internal", 1024, "push"),
+    ("internal", 16384, "push"), ("image", 4096, "push"), ("route", 4096, "push"),
+)  # fmt: skip
+ON_THE_CPU = 1024  # simulations on all cores
+# Large batches, as a GPU steps thousands of worlds in the time of a few.
+TRAINING: dict[str, dict[str, Any]] = {
+    "PPO-Internal": {
+        "preset": "tuned", "num_envs": 1024, "steps_per_update": 16_384,
+        "minibatch_size": 1024, "epochs": 10, "learning_rate": 1e-3,
+        "total_frames": 589_824, "checkpoint_frames": 49_152,
+    },
+    "PPO-Image": {
+        "preset": "tuned_image", "num_envs": 1024, "steps_per_update": 16_384,
+        "minibatch_size": 1024, "epochs": 6, "learning_rate": 1e-3,
+        "total_frames": 589_824, "checkpoint_frames": 49_152,
+    },
+}  # fmt: skip
+EPISODES, LONGEST, ENOUGH = 40, 200, 0.95
+
+
+class Report:
+    """What has been found, on disk as soon as it is known."""
+
+    def __init__(self, path: Path | None, budget: float):
+        self.found: dict[str, Any] = {}
+        self._path, self._budget, self._began = path, budget, time.perf_counter()
+
+    def add(self, part: str, value: Any) -> None:
+        """Adds a row to a part, or sets it."""
+        if isinstance(value, dict):
+            self.found.setdefault(part, []).append(value)
+        else:
+            self.found[part] = value
+        seconds = time.perf_counter() - self._began
+        print(f"[{seconds:.0f} s] {part}: {json.dumps(value)}", flush=True)
+        if self._path is not None:
+            files.write_json(self._path, self.found)
+
+    def has(self, seconds: float) -> bool:
+        """Whether so many seconds are left."""
+        return time.perf_counter() - self._began + seconds <= self._budget
 
 
 def actions(policy: str, steps: int, shape: tuple[int, int]) -> np.ndarray:
@@ -46,38 +99,31 @@ def actions(policy: str, steps: int, shape: tuple[int, int]) -> np.ndarray:
     return held
 
 
-def parity(device: str, steps: int) -> list[dict[str, Any]]:
-    """Differences of four worlds from `BatchSimulation`, by task."""
-    rows = []
-    for name, options in PARITY_TASKS.items():
-        task = name.split()[0]
-        one = BatchSimulation(suite.make_task(task, **options), 4, num_threads=4)
-        two = WarpSimulation(suite.make_task(task, **options), 4, device=device)
-        for simulation in (one, two):
-            simulation.seed(0)
-            simulation.reset()
-        tip, force, count = [], [], []
-        for action in actions("push", steps, (4, one.num_actions)):
-            here, there = one.step(action), two.step(action)
-            apart = here.readings.head - there.readings.head
-            tip.append(np.linalg.norm(apart, axis=-1))
-            force.append(np.stack([here.wall_force.sum, there.wall_force.sum]))
-            found = [len(s.contacts().present.nonzero()[0]) for s in (one, two)]
-            count.append(found)
-        sums = np.array(force).sum(axis=(0, 2))
-        rows.append(
-            {
-                "task": name,
-                "steps": steps,
-                "tip_mm_median": 1e3 * float(np.median(tip)),
-                "tip_mm_largest": 1e3 * float(np.max(tip)),
-                "force_ratio": float(sums[1] / sums[0]),
-                "contacts": np.array(count).sum(axis=0).tolist(),
-                "lost": int(two.stepper.lost.sum()),
-            }
-        )
-        print(rows[-1], file=sys.stderr, flush=True)
-    return rows
+def parity(device: str, name: str, steps: int) -> dict[str, Any]:
+    """Differences of four worlds of a task from `BatchSimulation`."""
+    task, options = name.split()[0], PARITY_TASKS[name]
+    one = BatchSimulation(suite.make_task(task, **options), 4, num_threads=4)
+    two = WarpSimulation(suite.make_task(task, **options), 4, device=device)
+    for simulation in (one, two):
+        simulation.seed(0)
+        simulation.reset()
+    tip, force, count = [], [], []
+    for action in actions("push", steps, (4, one.num_actions)):
+        here, there = one.step(action), two.step(action)
+        apart = here.readings.head - there.readings.head
+        tip.append(np.linalg.norm(apart, axis=-1))
+        force.append(np.stack([here.wall_force.sum, there.wall_force.sum]))
+        count.append([len(s.contacts().present.nonzero()[0]) for s in (one, two)])
+    sums = np.array(force).sum(axis=(0, 2))
+    return {
+        "task": name,
+        "steps": steps,
+        "tip_mm_median": 1e3 * float(np.median(tip)),
+        "tip_mm_largest": 1e3 * float(np.max(tip)),
+        "force_ratio": float(sums[1] / sums[0]),
+        "contacts": np.array(count).sum(axis=0).tolist(),
+        "lost": int(two.stepper.lost.sum()),
+    }
 
 
 def pace(step: Callable[[int], Any], steps: int) -> float:
@@ -122,42 +168,165 @@ def speed(
     }
     if device != "cpu":
         stepper = env.simulation.stepper
-        row["physics"] = round(worlds * pace(lambda _: stepper.step_device(), steps))
         row["lost"] = int(stepper.lost.sum())
         row["seconds"] = {k: round(v, 4) for k, v in stepper.profile().items()}
+        row["physics"] = round(worlds / row["seconds"]["step"])
+        row["again"] = round(worlds * pace(lambda _: stepper.step_device(), 10))
         if env.device.type == "cuda":
             free, total = torch.cuda.mem_get_info(env.device)
             row["memory_mb"] = round((total - free) / 2**20)
-    print(row, file=sys.stderr, flush=True)
     env.close()
     return row
+
+
+def training(name: str, device: str, folder: Path) -> dict[str, Any]:
+    """Frames and seconds until a policy succeeds."""
+    settings = {"task": "type1_lcca", "simulation_device": device, **TRAINING[name]}
+    place = "cuda" if device.startswith("cuda") else "cpu"
+    cores = os.cpu_count() or 1
+    settings |= {"torch_device": place, "torch_threads": cores, "metrics_frames": 1}
+    settings |= {"checkpoint_seconds": 1e6, "keep_checkpoints": 100}
+    config = agents.make_config("ppo", **settings)
+    run = folder / name.lower()
+    result = agents.train(config, run, progress=False)
+    with (run / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    seconds = {int(float(row["frames"])): float(row["seconds"]) for row in rows}
+    curve = []
+    for checkpoint in sorted(
+        (run / "checkpoints").iterdir(), key=lambda p: int(p.name)
+    ):
+        options = {"max_steps": LONGEST}
+        found = agents.evaluate(
+            str(checkpoint), episodes=EPISODES, task_kwargs=options, num_threads=cores
+        )
+        success = float(found.values("success").mean())
+        frames = int(checkpoint.name)
+        curve.append([frames, round(seconds.get(frames, result.seconds), 1), success])
+        if success >= ENOUGH:
+            break
+    reached = [row for row in curve if row[2] >= ENOUGH]
+    return {
+        "agent": name,
+        "settings": TRAINING[name],
+        "frames_per_second": round(result.frames / result.seconds),
+        "seconds": round(result.seconds, 1),
+        "success": curve,
+        "frames_to_95": reached[0][0] if reached else None,
+        "seconds_to_95": reached[0][1] if reached else None,
+    }
+
+
+def measure(given: argparse.Namespace, report: Report) -> None:
+    """All parts, the most important ones first."""
+    device, only = given.device, given.only
+    report.add("command", " ".join(["benchmarks/gpu.py", *sys.argv[1:]]))
+    report.add("date", time.strftime("%Y-%m-%d"))
+    report.add("host", f"{os.cpu_count()} processors, {platform.machine()}")
+    if device.startswith("cuda"):
+        report.add("gpu", torch.cuda.get_device_name())
+    rows = [row for row in SPEED if given.worlds is None or row[1] in given.worlds]
+    if given.worlds is not None and not rows:
+        rows = [("internal", worlds, "random") for worlds in given.worlds]
+
+    def speeds(chosen: Any, seconds: float) -> None:
+        for observation, worlds, policy in chosen if "speed" in only else ():
+            if report.has(seconds):
+                row = speed(device, worlds, policy, observation, given.steps)
+                report.add("speed", row)
+
+    def trained(name: str, seconds: float) -> None:
+        if name in TRAINING and "ppo" in only and report.has(seconds):
+            report.add("training", training(name, device, given.runs))
+
+    speeds(rows[:2], 0)
+    trained("PPO-Internal", 60)
+    speeds(rows[2:4], 30)
+    for observation in ("internal", "image") if "speed" in only else ():
+        if report.has(20):
+            row = speed("cpu", ON_THE_CPU, "random", observation, given.steps // 2)
+            report.add("speed", row)
+    names = list(PARITY_TASKS) if "parity" in only else []
+    name = device.removeprefix("warp:")
+    for task in names[:2]:
+        if report.has(20):
+            report.add("parity", parity(name, task, given.parity_steps))
+    trained("PPO-Image", 60)
+    speeds(rows[4:], 30)
+    for task in names[2:]:  # compiled for another model
+        if report.has(110):
+            report.add("parity", parity(name, task, given.parity_steps))
+
+
+def tables(found: Mapping[str, Any]) -> dict[str, str]:
+    """The tables of docs/gpu.md by name."""
+    parities = [
+        "| task | control steps | tip, median | tip, largest | wall force, ratio "
+        "| contacts, CPU and GPU |\n|---|---|---|---|---|---|"
+    ]
+    for row in found.get("parity", ()):
+        name, *rest = row["task"].split()
+        parities.append(
+            f"| {' '.join([f'`{name}`', *rest])} | {row['steps']} | "
+            f"{row['tip_mm_median']:.3f} mm | {row['tip_mm_largest']:.2f} mm | "
+            f"{row['force_ratio']:.3f} | {row['contacts'][0]}, {row['contacts'][1]} |"
+        )
+    speeds = [
+        "| observation | where | worlds | actions | physics alone | from actions to "
+        "observations | GPU memory |\n|---|---|---|---|---|---|---|"
+    ]
+    for row in found.get("speed", ()):
+        on_gpu = row["device"] != "cpu"
+        memory = row.get("memory_mb", 0) / 1000
+        speeds.append(
+            f"| `{row['observation']}` | {'GPU' if on_gpu else 'all cores'} | "
+            f"{row['worlds']:,} | {row['policy']} | "
+            f"{format(row['physics'], ',') if on_gpu else '–'} | "
+            f"{row['end_to_end']:,} | {f'{memory:.1f} GB' if on_gpu else '–'} |"
+        )
+    trainings = [
+        "| agent | control steps to 95 % | seconds to 95 % | control steps a second "
+        "|\n|---|---|---|---|"
+    ]
+    for row in found.get("training", ()):
+        reached = row["frames_to_95"] is not None
+        frames = f"{row['frames_to_95']:,}" if reached else "not reached"
+        trainings.append(
+            f"| {row['agent']} | {frames} | "
+            f"{row['seconds_to_95'] if reached else '–'} | "
+            f"{row['frames_per_second']:,} |"
+        )
+    written = {"parity": parities, "speed": speeds, "training": trainings}
+    return {name: "\n".join(rows) for name, rows in written.items() if rows[1:]}
+
+
+def write(page: Path, found: Mapping[str, Any]) -> None:
+    """Writes the tables into a page, each between its two comments."""
+    text = page.read_text()
+    for name, table in tables(found).items():
+        first, last = f"<!-- {name} -->\n", f"\n<!-- /{name} -->"
+        before, _, rest = text.partition(first)
+        text = before + first + table + last + rest.partition(last)[2]
+    files.write_text(page, text)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 4096, 16384])
-    parser.add_argument("--steps", type=int, default=40)
-    parser.add_argument("--observations", nargs="+", default=list(OBSERVATIONS))
-    parser.add_argument("--no-parity", action="store_true")
+    parser.add_argument("--worlds", type=int, nargs="+")
+    parser.add_argument("--steps", type=int, default=30)
+    parser.add_argument("--parity-steps", type=int, default=50)
+    parts = ("speed", "parity", "ppo")
+    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts))
+    parser.add_argument("--budget", type=float, default=480.0, help="seconds")
+    parser.add_argument("--runs", type=Path, default=Path("runs/gpu"))
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--write", type=Path, help="page to write the file into")
     given = parser.parse_args()
-    found: dict[str, Any] = {"machine": platform.processor() or platform.machine()}
-    if given.device.startswith("cuda"):
-        found["gpu"] = torch.cuda.get_device_name()
-    if not given.no_parity:
-        name = given.device.removeprefix("warp:")
-        found["parity"] = parity(name, 50)
-    rows = found["speed"] = []
-    for observation in given.observations:
-        for worlds in given.worlds:
-            for policy in ("random", "push"):
-                own = policy, observation, given.steps
-                rows.append(speed(given.device, worlds, *own))
-        rows.append(speed("cpu", 256, "random", observation, given.steps))
-        if given.out is not None:
-            files.write_json(given.out, found)
-    print(json.dumps(found, indent=1))
+    if given.write is not None:
+        write(given.write, json.loads(given.out.read_text()))
+        return
+    measure(given, Report(given.out, given.budget))
 
 
 if __name__ == "__main__":

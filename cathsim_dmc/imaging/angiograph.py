@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cathsim_dmc import rows
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging import views
 from cathsim_dmc.imaging.device import Shadow
@@ -95,10 +96,21 @@ def images(
         (N, rows, columns, planes) uint8.
     """
     image = _blank(machines, 1)
+    # Frames of one state draw in their order.
+    alone = random_states and len(set(map(id, random_states))) < len(random_states)
     for plane, chosen, fluoroscope in _each(machines):
-        states = random_states and [random_states[i] for i in chosen]
-        own = [shadow.of(chosen) for shadow in shadows]
-        image[chosen, ..., plane] = fluoroscope.render(own, states)[..., 0]
+
+        def render(part: slice) -> None:
+            these = chosen[part]  # noqa: B023
+            states = random_states and [random_states[i] for i in these]
+            own = [shadow.of(these) for shadow in shadows]
+            frames = fluoroscope.render(own, states)  # noqa: B023
+            image[these, ..., plane] = frames[..., 0]  # noqa: B023
+
+        if alone:
+            render(slice(None))
+        else:
+            rows.each(len(chosen), render, least=16)
     return image
 
 

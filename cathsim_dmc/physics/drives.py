@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.laws import drive
+from cathsim_dmc.physics.readings import part
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 
@@ -26,6 +27,10 @@ class Bound(NamedTuple):
     servos: Any
     state: Any
     told: Any
+
+    def of(self, rows: slice) -> "Bound":
+        """Some of the simulations."""
+        return Bound(self.servos, part(self.state, rows), part(self.told, rows))
 
 
 class Drives:

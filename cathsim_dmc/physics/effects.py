@@ -239,14 +239,14 @@ class Layout:
         self._callbacks = dispatcher.layout(world.model, places, laws)
         self._stand = dispatcher.stand
 
-    def begin(self, index: int) -> None:
-        """Has laws act on a simulation, whose `userdata` have been reset.
+    def begin(self, indices: np.ndarray) -> None:
+        """Has laws act on simulations (K,), whose `userdata` have been reset.
 
         Raises:
             RuntimeError: if a Python function stands in one of MuJoCo's callbacks.
         """
         self._stand()
-        self._user[index, -1] = self._callbacks.label
+        self._user[indices, -1] = self._callbacks.label
 
     def raise_fault(self) -> None:
         """Raises RuntimeError if a law has raised an error since the last call."""

@@ -97,6 +97,10 @@ class Sheathed(NamedTuple):
     places: Any
     out: Any
 
+    def of(self, rows: slice) -> "Sheathed":
+        """Some of the simulations."""
+        return Sheathed._make((self.joints, *(each[rows] for each in self[1:])))
+
 
 def addresses(fields: sheath.Hinges) -> list[int]:
     """Where the fields of a model, contiguous arrays of float64, lie in memory."""

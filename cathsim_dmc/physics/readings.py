@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from cathsim_dmc import rows as array_rows
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.physics import forces
@@ -179,10 +180,10 @@ class ModelIndex:
                 insertion=insertion.copy(),
                 joint_positions=positions.take(order, axis=-1),
                 joint_velocities=velocities.take(order, axis=-1),
-                com_inertia=inertia.copy(),
-                com_velocity=velocity.copy(),
+                com_inertia=array_rows.copied(inertia),
+                com_velocity=array_rows.copied(velocity),
                 actuator_force=motors.take(order, axis=-1),
-                external_force=external.copy(),
+                external_force=array_rows.copied(external),
                 centreline=np.concatenate(nodes, axis=-2),
                 head=head.copy(),
                 head_frame=frame.reshape((*frame.shape[:-1], 3, 3)).copy(),

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc import rows
 from cathsim_dmc.entities import stack_memory
 from cathsim_dmc.entities.chain import (
     MAX_PUSH_FORCE,
@@ -160,7 +161,20 @@ class SingleDevice(Effect):
         if self._drives.slipped.shape[1] > 1:
             load = np.stack([state.push_force, state.push_torque], axis=1)
         control, sheathed = action.copy(), self._sheathed if self._holds else None
-        adapters.act(self._drives.bound, sheathed, self._steering, load, control)
+        drives, steering = self._drives.bound, self._steering
+
+        def move(own: slice) -> None:
+            memory = steering
+            if memory is not None:
+                bends = Bends._make(map(np.empty_like, memory.bends))
+                memory = memory._replace(bends=bends)
+            held_ = sheathed and sheathed.of(own)
+            adapters.act(drives.of(own), held_, memory, load[own], control[own])
+
+        if len(control) < rows.MANY:
+            adapters.act(drives, sheathed, steering, load, control)
+        else:
+            rows.each(len(control), move)
         if self._holds:
             self._soften(slice(None))
         return control

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from cathsim_dmc import rows
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.entities.chain import TIMESTEP
 from cathsim_dmc.physics import forces, readings
@@ -121,7 +122,10 @@ class Stepper(abc.ABC):
         warned, (force, depth) = self._warned(), self._forces()
         limit = forces.DEEPEST if self.deepest is None else self.deepest
         limits = forces.HARDEST, limit, self._timestep
-        if not _in_doubt(force.peak_max, depth, limits, self._motion, self._links):
+        few = len(depth) < rows.MANY
+        if few and not _in_doubt(
+            force.peak_max, depth, limits, self._motion, self._links
+        ):
             return force, warned
         depth = self._depth_at_end(depth, warned, limit)
         again: list[tuple[np.ndarray, forces.WallForce]] = []
@@ -215,7 +219,13 @@ class Stepper(abc.ABC):
 
         Contacts are looked for once more where a link may have gone too deep.
         """
-        way = self._timestep * _fastest(self._motion, self._links)
+        way = np.empty_like(depth)
+
+        def measure(part: slice) -> None:
+            motion = _Motion._make(each[part] for each in self._motion)
+            way[part] = self._timestep * _fastest(motion, self._links)
+
+        rows.each(len(way), measure)
         suspect = (depth + way > limit) & (depth <= limit) & ~warned
         indices = np.flatnonzero(suspect)
         states = self.states(indices) if indices.size else ()

@@ -16,7 +16,7 @@ import numpy as np
 from dm_control import mjcf
 from mujoco import batch as mujoco_batch
 
-from cathsim_dmc import bounds
+from cathsim_dmc import bounds, rows
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks import rehearsal
@@ -362,7 +362,7 @@ class _PoolStepper(_BatchStepper):
 
 def _own(step: Step) -> Step:
     """Observations as the caller's own, as composer's buffers make them."""
-    copies = {key: np.array(value) for key, value in step.observation.items()}
+    copies = {key: rows.copied(value) for key, value in step.observation.items()}
     return step._replace(observation=copies)
 
 

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from cathsim_dmc import bounds, suite
+from cathsim_dmc import bounds, rows, suite
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.simulation.error_files import ErrorFiles
 from cathsim_dmc.tasks.navigation import Navigation
@@ -151,9 +151,9 @@ class BatchedEnv(EnvBase):
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
         """On the device; numbers as float32."""
-        tensor = torch.as_tensor(values)
-        kept = tensor.dtype in (torch.uint8, torch.bool)
-        return (tensor if kept else tensor.float()).to(self.device)
+        if values.dtype not in (np.uint8, np.bool_):
+            values = rows.copied(values, np.float32)
+        return torch.as_tensor(values).to(self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         self.simulation.seed(0 if seed is None else seed)

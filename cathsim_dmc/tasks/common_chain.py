@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cathsim_dmc import rows
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.devices import Discretisation
@@ -88,7 +89,14 @@ class CommonChain:
         shape = len(state.com_inertia), self.num_links
         inertia, velocity, force = (np.zeros((*shape, width)) for width in (10, 6, 6))
         found = LinkState(inertia, velocity, force)
-        _continued(arrays, state.centreline, self._behind, found)
+
+        def continue_(part: slice) -> None:
+            own, out = (
+                LinkState._make(a[part] for a in each) for each in (arrays, found)
+            )
+            _continued(own, state.centreline[part], self._behind, out)
+
+        rows.each(len(force), continue_)
         return found
 
     def tracked(self, line: np.ndarray) -> np.ndarray:

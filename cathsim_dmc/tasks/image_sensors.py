@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from cathsim_dmc import rows as array_rows
 from cathsim_dmc.imaging import angiograph as angiographs
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.tasks import observations
@@ -86,7 +87,8 @@ class ImageSensors:
                 if begins or not age:
                     self.hold(f"past_{age}", image, rows)
                 else:
-                    self.images[f"past_{age}"] = self.images[f"past_{age - 1}"].copy()
+                    last_one = self.images[f"past_{age - 1}"]
+                    self.images[f"past_{age}"] = array_rows.copied(last_one)
             if self._wants("biplane", "biplane_retry"):
                 # The roadmaps show the vessel at rest.
                 resting = [self.planes[index] for index in rows]
@@ -113,7 +115,10 @@ class ImageSensors:
         if name not in self.images:
             shape = (self._count, *image.shape[1:])
             self.images[name] = np.zeros(shape, dtype=image.dtype)
-        self.images[name][rows] = image
+        if len(rows) == self._count:
+            array_rows.copy(self.images[name], image)
+        else:
+            self.images[name][rows] = image
 
     def _wants(self, *names: str) -> bool:
         return any(name in self._names for name in names)

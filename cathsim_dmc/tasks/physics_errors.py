@@ -61,6 +61,7 @@ def found(
         force: (N,), largest contact force in any physics step, N.
     """
     errors: list[str | None] = [None] * len(steps)
+    due: dict[Case, list[int]] = {}
     # Of few simulations, plain numbers take less time than arrays.
     ends = zip(steps.tolist(), warned.tolist(), force.tolist(), strict=True)
     for index, (step, has_warned, hardest) in enumerate(ends):
@@ -69,7 +70,10 @@ def found(
         elif not hardest <= MAX_FORCE:
             errors[index] = EXPLODED
         elif step % ESCAPE_INTERVAL == 0:
-            scene = case(index).scene
-            if escaped(scene.anatomy, nodes[index], scene.placement.direction):
-                errors[index] = ESCAPED
+            due.setdefault(case(index), []).append(index)
+    for own, indices in due.items():
+        scene = own.scene
+        left = escaped(scene.anatomy, nodes[indices], scene.placement.direction)
+        for index in np.array(indices)[left].tolist():
+            errors[index] = ESCAPED
     return tuple(errors)

@@ -150,8 +150,7 @@ class Restorable:
                     old[:] = new  # others may hold the same array
                 else:  # others may have been given the old value
                     setattr(holder, attribute, new)
-        for index in indices.tolist():
-            self._layout.begin(index)
+        self._layout.begin(indices)
         step = self._derive(indices)
         self._open[indices] = False
         return step

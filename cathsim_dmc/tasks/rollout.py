@@ -151,6 +151,7 @@ class Rollout(Restorable):
         self._open[indices] = True
         self._random_states = list(random_states)
         self._stepper.restore(indices)
+        self._layout.begin(indices)
         for index in indices:
             self._draw(index, random_states[index])
         self._devices.pose_robot()
@@ -184,7 +185,6 @@ class Rollout(Restorable):
             self._load(index, number)
         case = self.case(index)
         case.start.write(self._state.qpos[index], episode, random_state)
-        self._layout.begin(index)
         for effect in self.effects:
             effect.restart(index, episode, random_state)
         (primary, secondary), kerma = episode.view, episode.kerma

@@ -206,7 +206,7 @@ class Rig:
             field=nothing,
             parameters=self.data.userdata[None],
         )
-        Layout([blood], world, places).begin(0)
+        Layout([blood], world, places).begin(np.arange(1))
         blood.restart(0, Draw(np.zeros(3)), np.random.RandomState(0))
 
     def qpos(self, joint: str) -> float:

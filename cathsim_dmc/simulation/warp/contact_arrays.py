@@ -80,12 +80,12 @@ class Found(NamedTuple):
     """Contacts of all threads, before they are counted.
 
     Attributes:
-        count: (T,) contacts of a thread.
+        number: (T,) contacts of a thread.
         rows: (T, MOST, 7) of each the distance m, the place (3) m, and the direction
             (3) from the link into the wall.
     """
 
-    count: Any
+    number: Any
     rows: Any
 
 

@@ -10,7 +10,7 @@ import math
 from typing import Any, NamedTuple
 
 from cathsim_dmc.compiled import compiled
-from cathsim_dmc.laws.capsule import SAMPLES, is_far
+from cathsim_dmc.laws.capsule import SAMPLES
 from cathsim_dmc.laws.contact import (
     CONTACT,
     contact_law,
@@ -25,7 +25,7 @@ from cathsim_dmc.laws.field import FieldArrays
 from cathsim_dmc.laws.places import Capsule
 from cathsim_dmc.laws.planes import MOST, PLANES
 from cathsim_dmc.laws.vectors import into
-from cathsim_dmc.laws.wall import Wall, is_straight_bore
+from cathsim_dmc.laws.wall import Wall
 from cathsim_dmc.simulation.warp.contact_arrays import (
     Contacts,
     Fields,
@@ -177,34 +177,20 @@ class Written(NamedTuple):
         links: See `Links`.
         fields: See `Fields`.
         found: See `Found`.
-        out: Warp's contacts; world w has the places from w K on.
-        overflow: (N,) gets 1 where there are more than K contacts.
+        out: Warp's contacts; those of a world follow each other, without a gap between
+            two worlds.
+        counts: (N,) contacts of a world.
+        starts: (N,) places of the first ones.
+        overflow: (N,) gets 1 where a world has more contacts than places.
     """
 
     links: Links
     fields: Fields
     found: Found
     out: Contacts
+    counts: Any
+    starts: Any
     overflow: Any
-
-
-@compiled
-def is_near(thread, scene):
-    """Whether `find` is to look at the link and the wall of a thread; clears `found`.
-
-    Most links are far from the wall. The others are gathered, so that all threads of a
-    GPU that run together have as much to do.
-    """
-    scene.found.count[thread] = 0
-    pair = pair_of(thread, scene.links, scene.walls, scene.fields, scene.motion)
-    place = pair.capsule.centre
-    if not math.isfinite(place[0] + place[1] + place[2] + pair.axis[0] + pair.axis[1]):
-        return False
-    if is_straight_bore(pair.wall):
-        return True
-    law = pair.law
-    limit = max(law.radius + law.margin + law.activation, pair.sweep.reach)
-    return not is_far(pair.wall, pair.capsule, limit)
 
 
 @compiled
@@ -217,7 +203,11 @@ def find(thread, scratch, scene):
         scene: `Scene`.
     """
     found = scene.found
+    found.number[thread] = 0
     pair = pair_of(thread, scene.links, scene.walls, scene.fields, scene.motion)
+    centre = pair.capsule.centre
+    if not math.isfinite(centre[0] + centre[1] + centre[2] + pair.axis[0]):
+        return
     samples, planes, out = scratch
     memory = Memory(samples, planes)
     count = contacts(pair.wall, pair.capsule, pair.law, pair.sweep, memory, out)
@@ -229,7 +219,7 @@ def find(thread, scratch, scene):
         row[0] = distance
         for k in range(3):
             row[1 + k], row[4 + k] = place[k], towards[k]
-    found.count[thread] = count
+    found.number[thread] = count
 
 
 @compiled
@@ -288,47 +278,71 @@ def _write_law(links, fields, out, at, pair):
 
 
 @compiled
-def place(world, scratch, given):
-    """Writes the contacts of a world into its own places of Warp's arrays.
+def count(world, scratch, given):
+    """Counts the contacts of a world.
 
     Args:
         world: Its number.
         scratch: Not used.
         given: `Written`.
     """
-    links, fields, found = given.links, given.fields, given.found
-    out, overflow = given.out, given.overflow
-    count, most = len(links.geoms), len(out.dist) // len(overflow)
-    carriers, at = len(links.carriers), world * most
-    for own in range(count * carriers):
-        link, which = own // carriers, own % carriers
-        thread = (which * len(overflow) + world) * count + link
-        for n in range(found.count[thread]):
-            if at == (world + 1) * most:
-                overflow[world] = 1
-                break
-            row = found.rows[thread, n]
-            out.dist[at], out.includemargin[at] = row[0], 0.0
-            normal = (row[4], row[5], row[6])
-            side = _tangent(normal)
-            other = (
-                normal[1] * side[2] - normal[2] * side[1],
-                normal[2] * side[0] - normal[0] * side[2],
-                normal[0] * side[1] - normal[1] * side[0],
-            )
-            for k in range(3):
-                out.pos[at, k] = row[1 + k]
-                out.frame[at, 0, k] = normal[k]
-                out.frame[at, 1, k] = side[k]
-                out.frame[at, 2, k] = other[k]
-            _write_law(links, fields, out, at, (world, link, which))
-            out.worldid[at], out.type[at] = world, _CONSTRAINT
-            out.geomcollisionid[at], out.adhesion[at] = n, 0.0
-            at += 1
-    for free in range(world * most, (world + 1) * most):
-        for k in range(out.efc_address.shape[1]):
-            out.efc_address[free, k] = -1
-        if free >= at:
-            out.type[free], out.worldid[free] = 0, world
-    if world == 0:
-        out.nacon[0] = len(out.dist)
+    links, found, worlds = given.links, given.found, len(given.overflow)
+    threads, total = len(links.geoms), 0
+    for which in range(len(links.carriers)):
+        first = (which * worlds + world) * threads
+        for thread in range(first, first + threads):
+            total += found.number[thread]
+    most = len(given.out.dist) // worlds
+    if total > most:
+        given.overflow[world] = 1
+    given.counts[world] = min(total, most)
+
+
+@compiled
+def place(thread, scratch, given):
+    """Writes the contacts of a link with a wall into Warp's arrays.
+
+    Args:
+        thread: As `pair_of`.
+        scratch: Not used.
+        given: `Written`.
+    """
+    links, found, out = given.links, given.found, given.out
+    threads, worlds = len(links.geoms), len(given.overflow)
+    link, world = thread % threads, (thread // threads) % worlds
+    which = thread // (threads * worlds)
+    last = given.starts[world] + given.counts[world]
+    if thread == 0:
+        out.nacon[0] = given.starts[worlds - 1] + given.counts[worlds - 1]
+    at = given.starts[world]
+    for own in range(which * threads + link):  # those that other threads write
+        carrier, before = own // threads, own % threads
+        at += found.number[(carrier * worlds + world) * threads + before]
+    for n in range(min(found.number[thread], last - at)):
+        _write(given, at, (world, link, which, n), found.rows[thread, n])
+        at += 1
+
+
+@compiled
+def _write(given, at, own, row):
+    """Writes a contact into a place of Warp's arrays."""
+    world, link, which, n = own
+    out = given.out
+    out.dist[at], out.includemargin[at] = row[0], 0.0
+    normal = (row[4], row[5], row[6])
+    side = _tangent(normal)
+    other = (
+        normal[1] * side[2] - normal[2] * side[1],
+        normal[2] * side[0] - normal[0] * side[2],
+        normal[0] * side[1] - normal[1] * side[0],
+    )
+    for k in range(3):
+        out.pos[at, k] = row[1 + k]
+        out.frame[at, 0, k] = normal[k]
+        out.frame[at, 1, k] = side[k]
+        out.frame[at, 2, k] = other[k]
+    _write_law(given.links, given.fields, out, at, (world, link, which))
+    out.worldid[at], out.type[at] = world, _CONSTRAINT
+    out.geomcollisionid[at], out.adhesion[at] = n, 0.0
+    for k in range(out.efc_address.shape[1]):
+        out.efc_address[at, k] = -1

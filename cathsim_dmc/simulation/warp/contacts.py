@@ -22,11 +22,11 @@ from cathsim_dmc.simulation.warp.contact_kernels import (
     SCRATCH,
     Scene,
     Written,
+    count,
     find,
-    is_near,
     place,
 )
-from cathsim_dmc.simulation.warp.devices import NONE, Chosen, Device
+from cathsim_dmc.simulation.warp.devices import NONE, Device
 
 
 class WallContacts:
@@ -35,6 +35,8 @@ class WallContacts:
     Attributes:
         num_worlds: N.
         carriers: (C,) geoms that carry a wall.
+        counts, starts: (N,) contacts of each world in Warp's arrays, and the first.
+        is_wall: (ngeom,) whether a geom is the wall of the vessel.
     """
 
     def __init__(self, device: Device, model: mujoco.MjModel, num_worlds: int):
@@ -50,6 +52,8 @@ class WallContacts:
         """
         self._device, self.num_worlds = device, num_worlds
         self.carriers = carriers_of(model)
+        self.is_wall = np.zeros(model.ngeom, bool)
+        self.is_wall[self.carriers] = model.geom_bodyid[self.carriers] == 0
         self._host = _links(model, self.carriers)
         self._links = Links._make(map(device.constant, self._host))
         self._numbers: dict[tuple[float, ...], int] = {}
@@ -104,14 +108,14 @@ class WallContacts:
             device.constant(np.zeros((threads, MOST, 7))),
         )
         self._overflow = device.constant(np.zeros(self.num_worlds, np.int32))
-        self._near = Chosen(
-            device.constant(np.zeros(threads, np.int32)),
-            device.constant(np.zeros(1, np.int32)),
-        )
         self._scene = Scene(self._links, self._walls, fields, motion, found)
         contacts = Contacts._make([*arrays, view(data.nacon)])
-        links, overflow = self._links, self._overflow
-        self._written = Written(links, fields, found, contacts, overflow)
+        self._places = tuple(device.zeros(self.num_worlds) for _ in range(2))
+        self.counts, self.starts = map(view, self._places)
+        self._written = Written(
+            self._links, fields, found, contacts, self.counts, self.starts,
+            self._overflow,
+        )  # fmt: skip
 
     def begin(self) -> None:
         """Begins a control step."""
@@ -124,9 +128,11 @@ class WallContacts:
     def __call__(self, model: Any, data: Any) -> None:
         """What mujoco_warp calls at the end of its own collision."""
         del model, data
-        near = self._device.select(is_near, self._near, self._scene)
-        self._device.launch(find, near, SCRATCH, self._scene)
-        self._device.launch(place, self.num_worlds, NONE, self._written)
+        device, threads = self._device, self.num_worlds * self._host.dims.size
+        device.launch(find, threads, SCRATCH, self._scene)
+        device.launch(count, self.num_worlds, NONE, self._written)
+        device.sum_before(*self._places)
+        device.launch(place, threads, NONE, self._written)
 
     def _made(self) -> Walls:
         """The walls of all anatomies on the device."""

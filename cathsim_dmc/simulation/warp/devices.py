@@ -9,29 +9,17 @@ from __future__ import annotations
 
 import functools
 import importlib
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from cathsim_dmc import bounds, extras
 from cathsim_dmc.compiled import compiled, for_cuda
 
-_THREADS = 128  # of a block
+_THREADS, _MANY = 64, 32_768  # of a block, of all
 
 Scratch = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 NONE: Scratch = ((1,), (1,), (1,))
-
-
-class Chosen(NamedTuple):
-    """Threads that a test has chosen, in any order.
-
-    Attributes:
-        threads: (T,) int32, the first of which are chosen.
-        found: (1,) int32, how many they are.
-    """
-
-    threads: Any
-    found: Any
 
 
 def warp_modules() -> tuple[Any, Any]:
@@ -73,6 +61,14 @@ class Device:
             return array.numpy()
         return _cuda().as_cuda_array(array)
 
+    def zeros(self, size: int) -> Any:
+        """Warp's array of whole numbers, all 0."""
+        return self._warp.zeros(size, dtype=int, device=self.name)
+
+    def sum_before(self, numbers: Any, sums: Any) -> None:
+        """Writes sums of all numbers before each, of two arrays of `zeros`."""
+        self._warp.utils.array_scan(numbers, sums, inclusive=False)
+
     def write(self, array: Any, values: np.ndarray) -> None:
         """Writes into what `constant` returned."""
         if self.is_cuda:
@@ -84,37 +80,25 @@ class Device:
         """What `constant` returned, on the host, a copy."""
         return array.copy_to_host() if self.is_cuda else array.copy()
 
-    def launch(
-        self, function: Any, count: int | Chosen, scratch: Scratch, given: Any
-    ) -> None:
+    def launch(self, function: Any, count: int, scratch: Scratch, given: Any) -> None:
         """Runs `function(thread, scratch, given)` in many threads.
 
         Args:
             function: Compiled thread function.
-            count: Number of threads, or those of `select`.
+            count: Number of threads.
             scratch: Shapes of arrays of float64 that each thread has for itself.
             given: Named tuple of arrays, numbers and named tuples.
         """
-        picked = isinstance(count, Chosen)
         if self.is_cuda:
-            total = len(count.threads) if picked else count
-            self._run(_kernel(function, scratch, picked), total, (count, given))
+            self._run(_kernel(function, scratch), count, given)
         else:
-            _loop(function, picked)(count, tuple(map(np.zeros, scratch)), given)
+            _loop(function)(count, tuple(map(np.zeros, scratch)), given)
 
-    def select(self, test: Any, chosen: Chosen, given: Any) -> Chosen:
-        """Chooses the threads in which `test(thread, given)` is true."""
-        if self.is_cuda:
-            self.launch(_forget, 1, NONE, chosen)
-            self._run(_test_kernel(test), len(chosen.threads), (chosen, given))
-        else:
-            _test_loop(test)(chosen, given)
-        return chosen
-
-    def _run(self, kernel: Any, count: int, arguments: tuple[Any, Any]) -> None:
+    def _run(self, kernel: Any, count: int, given: Any) -> None:
         stream = _cuda().external_stream(self._warp.get_stream(self.name).cuda_stream)
-        blocks = (count + _THREADS - 1) // _THREADS
-        kernel[blocks, _THREADS, stream](arguments[0], arguments[1])
+        # Few threads are spread over all processors of the GPU.
+        block = _THREADS if count > _MANY else 32
+        kernel[(count + block - 1) // block, block, stream](count, given)
 
 
 def _cuda() -> Any:
@@ -127,84 +111,32 @@ def _cuda() -> Any:
 # Loops and kernels refer to the function: none is kept on disk.
 
 
-@compiled
-def _every(count, n):
-    """The number of a thread, -1 for none."""
-    return n if n < count else -1
-
-
-@compiled
-def _picked(chosen, n):
-    """The number of a chosen thread, -1 for none."""
-    return chosen.threads[n] if n < chosen.found[0] else -1
-
-
-@compiled
-def _forget(thread, scratch, chosen):
-    """Chooses no thread."""
-    chosen.found[thread] = 0
-
-
 @functools.cache
-def _loop(function: Any, picked: bool) -> Any:
-    """A compiled loop over the threads of a thread function, or the chosen ones."""
-    number = _picked if picked else _every
+def _loop(function: Any) -> Any:
+    """A compiled loop over the threads of a thread function."""
 
-    def loop(threads, scratch, given):
-        n, thread = 0, number(threads, 0)
-        while thread >= 0:
+    def loop(count, scratch, given):
+        for thread in range(count):
             function(thread, scratch, given)
-            n += 1
-            thread = number(threads, n)
 
     return compiled(loop, cache=False)
 
 
 @functools.cache
-def _test_loop(test: Any) -> Any:
-    """A compiled loop that chooses threads."""
-
-    def loop(chosen, given):
-        found = 0
-        for thread in range(len(chosen.threads)):
-            if test(thread, given):
-                chosen.threads[found] = thread
-                found += 1
-        chosen.found[0] = found
-
-    return compiled(loop, cache=False)
-
-
-@functools.cache
-def _kernel(function: Any, scratch: Scratch, picked: bool) -> Any:
-    """A kernel of a thread function, of all threads or the chosen ones."""
+def _kernel(function: Any, scratch: Scratch) -> Any:
+    """A kernel of a thread function."""
     cuda, inner = _cuda(), for_cuda(function)
-    number = for_cuda(_picked if picked else _every)
     one, two, three = scratch
 
     @cuda.jit
-    def kernel(threads, given):
-        thread = number(threads, cuda.grid(1))
-        if thread >= 0:
+    def kernel(count, given):
+        thread = cuda.grid(1)
+        if thread < count:
             own = (
                 cuda.local.array(one, np.float64),
                 cuda.local.array(two, np.float64),
                 cuda.local.array(three, np.float64),
             )
             inner(thread, own, given)
-
-    return kernel
-
-
-@functools.cache
-def _test_kernel(test: Any) -> Any:
-    """A kernel that chooses threads."""
-    cuda, inner = _cuda(), for_cuda(test)
-
-    @cuda.jit
-    def kernel(chosen, given):
-        thread = cuda.grid(1)
-        if thread < len(chosen.threads) and inner(thread, given):
-            chosen.threads[cuda.atomic.add(chosen.found, 0, 1)] = thread
 
     return kernel

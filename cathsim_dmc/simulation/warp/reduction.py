@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cathsim_dmc.compiled import compiled
-from cathsim_dmc.physics.forces import CONTACT_SIZE
+from cathsim_dmc.simulation.warp.contacts import WallContacts
 from cathsim_dmc.simulation.warp.devices import NONE, Device
 
 _LARGEST = 1e10  # MuJoCo's mjMAXVAL: beyond it a simulation has diverged
+_FORCES = 7  # rows of `Totals.force`
 
 
 class Totals(NamedTuple):
@@ -29,31 +30,54 @@ class Totals(NamedTuple):
     beside: Any
 
 
-@compiled
-def clear(world, scratch, totals):
-    """Begins a control step of a world."""
-    for k in range(7):
-        totals.force[k, world] = 0.0
-    totals.diverged[world] = 0
-
-
 class Added(NamedTuple):
-    """What a physics step adds to the totals.
+    """What a physics step adds to the totals, arrays of Warp's.
+
+    Attributes:
+        counts, starts: (N,), see `WallContacts`.
+        is_wall: (ngeom,) whether a geom is the wall of the vessel.
+        geom: (K, 2) geoms of the contacts.
+        dist: (K,) m.
+        dim: (K,) rows of a contact.
+        rows: (K, dim) its rows; -1 for none.
+        forces: (N, R) of the rows, N.
+        out: (8 + B, N) `Totals`, one after the other.
+    """
+
+    counts: Any
+    starts: Any
+    is_wall: Any
+    geom: Any
+    dist: Any
+    dim: Any
+    rows: Any
+    forces: Any
+    out: Any
+
+
+class Ended(NamedTuple):
+    """What ends a control step.
 
     Attributes:
         sensors: (N, nsensordata), Warp's.
-        first, last: Places of the wall's contacts in it.
+        places: (B,) of the sensors beside those of contacts.
         qpos: (N, nq), Warp's.
         qvel: (N, nv), Warp's.
-        totals: See `Totals`.
+        out: See `Added`.
     """
 
     sensors: Any
-    first: Any
-    last: Any
+    places: Any
     qpos: Any
     qvel: Any
-    totals: Totals
+    out: Any
+
+
+@compiled
+def clear(world, scratch, given):
+    """Begins a control step of a world; `given` is `Added`."""
+    for k in range(_FORCES + 1):
+        given.out[k, world] = 0.0
 
 
 @compiled
@@ -65,66 +89,88 @@ def add(world, scratch, given):
         scratch: Not used.
         given: `Added`.
     """
-    sensors, first, last = given.sensors, given.first, given.last
-    qpos, qvel, totals = given.qpos, given.qvel, given.totals
-    total, largest, deepest = 0.0, 0.0, totals.force[6, world]
-    for at in range(first, last, CONTACT_SIZE):
-        if sensors[world, at] == 0.0:
-            break
-        x, y, z = sensors[world, at + 1], sensors[world, at + 2], sensors[world, at + 3]
-        force = math.sqrt(float(x) ** 2 + float(y) ** 2 + float(z) ** 2)
+    out, rows, forces = given.out, given.rows, given.forces
+    total, largest, deepest = 0.0, 0.0, out[6, world]
+    first = given.starts[world]
+    for at in range(first, first + given.counts[world]):
+        if not given.is_wall[given.geom[at, 1]]:
+            continue
+        square = 0.0
+        # Three forces, and no torques.
+        for k in range(min(given.dim[at], 3)):
+            if 0 <= rows[at, k] < forces.shape[1]:
+                square += float(forces[world, rows[at, k]]) ** 2
+        force = math.sqrt(square)
         total += force
         largest = max(largest, force)
-        deepest = max(deepest, -float(sensors[world, at + 4]))
-    totals.force[0, world], totals.force[1, world] = total, largest
-    totals.force[2, world] = max(totals.force[2, world], total)
-    totals.force[3, world] = max(totals.force[3, world], largest)
-    totals.force[4, world] += total
-    totals.force[5, world] += largest
-    totals.force[6, world] = deepest
-    for k in range(totals.beside.shape[1]):
-        at = k if k < first else k - first + last
-        totals.beside[world, k] = sensors[world, at]
+        deepest = max(deepest, -float(given.dist[at]))
+    out[0, world], out[1, world] = total, largest
+    out[2, world], out[3, world] = (
+        max(out[2, world], total),
+        max(out[3, world], largest),
+    )
+    out[4, world] += total
+    out[5, world] += largest
+    out[6, world] = deepest
+
+
+@compiled
+def end(world, scratch, given):
+    """Ends a control step of a world; `given` is `Ended`."""
+    out, qpos, qvel = given.out, given.qpos, given.qvel
     for k in range(qpos.shape[1]):
         if not abs(qpos[world, k]) < _LARGEST:
-            totals.diverged[world] = 1
+            out[_FORCES, world] = 1.0
     for k in range(qvel.shape[1]):
         if not abs(qvel[world, k]) < _LARGEST:
-            totals.diverged[world] = 1
+            out[_FORCES, world] = 1.0
+    for k in range(len(given.places)):
+        out[_FORCES + 1 + k, world] = given.sensors[world, given.places[k]]
 
 
 class Reduction:
     """Forces, errors and sensors of N worlds over a control step."""
 
-    def __init__(self, device: Device, data: Any, contacts: slice):
+    def __init__(
+        self, device: Device, data: Any, contacts: WallContacts, beside: np.ndarray
+    ):
         """Takes the arrays of Warp's data.
 
         Args:
             device: Where they are.
             data: `mujoco_warp.Data`.
-            contacts: Place of the wall's contacts in `sensordata`.
+            contacts: With the places of the contacts.
+            beside: (B,) places of the sensors beside those of contacts.
         """
-        view = device.view
-        self._device, self._contacts = device, contacts
-        self._count, size = data.sensordata.shape
-        beside = size - (contacts.stop - contacts.start)
-        self._totals = Totals(
-            device.constant(np.zeros((7, self._count))),
-            device.constant(np.zeros(self._count, np.int32)),
-            device.constant(np.zeros((self._count, beside))),
+        view, found = device.view, data.contact
+        self._device, self._count = device, len(data.qpos)
+        self._out = device.constant(np.zeros((_FORCES + 1 + len(beside), self._count)))
+        self._added = Added(
+            contacts.counts,
+            contacts.starts,
+            device.constant(contacts.is_wall),
+            *(view(each) for each in (found.geom, found.dist, found.dim)),
+            view(found.efc_address),
+            view(data.efc.force),
+            self._out,
         )
         state = view(data.qpos), view(data.qvel)
-        sensors, first, last = view(data.sensordata), contacts.start, contacts.stop
-        self._added = Added(sensors, first, last, state[0], state[1], self._totals)
+        places = device.constant(beside.astype(np.int64))
+        self._ended = Ended(view(data.sensordata), places, *state, self._out)
 
     def begin(self) -> None:
         """Begins a control step."""
-        self._device.launch(clear, self._count, NONE, self._totals)
+        self._device.launch(clear, self._count, NONE, self._added)
 
     def add(self) -> None:
         """Adds a physics step."""
         self._device.launch(add, self._count, NONE, self._added)
 
+    def end(self) -> None:
+        """Ends a control step."""
+        self._device.launch(end, self._count, NONE, self._ended)
+
     def read(self) -> Totals:
         """The totals on the host."""
-        return Totals._make(map(self._device.host, self._totals))
+        out = self._device.host(self._out)
+        return Totals(out[:_FORCES], out[_FORCES], out[_FORCES + 1 :].T)

@@ -19,6 +19,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from cathsim_dmc import rows
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.dispatcher import Places
 from cathsim_dmc.physics.stepper import Stepper
@@ -149,8 +150,11 @@ class WarpStepper(Stepper):
     def begin(self, control: np.ndarray) -> None:
         """Begins a control step with the control (N, U) of all its physics steps."""
         self.arrays.ctrl[:] = control
-        names = (*_STATE, "userdata", "time")
-        self._begun = {name: getattr(self.arrays, name).copy() for name in names}
+        # The physics leaves the parameters of the effects as they are.
+        self._begun = {
+            n: rows.copied(getattr(self.arrays, n)) for n in (*_STATE, "time")
+        }
+        self._begun["userdata"] = self.arrays.userdata
         self._warnings_before = self.warnings.copy()
 
     def step_device(self) -> None:

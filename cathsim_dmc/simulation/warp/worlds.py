@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from cathsim_dmc import rows
 from cathsim_dmc.simulation.warp.contacts import WallContacts
 from cathsim_dmc.simulation.warp.devices import Device, warp_modules
 from cathsim_dmc.simulation.warp.passive import PassiveForces
@@ -17,6 +18,9 @@ from cathsim_dmc.simulation.warp.reduction import Reduction, Totals
 
 # Places for contacts and for rows of constraints, in each world.
 CONTACTS, ROWS = 48, 128
+# The solver takes a full matrix of constraints one contact of all worlds after the
+# other, a sparse one the contacts of a world where it is not done.
+SPARSE = True
 _WRITTEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl")
 _ALWAYS = ("qpos", "act", "ctrl")
 # Fields of a model that Warp's lacks or does not read: walls are found by `geom_user`,
@@ -57,15 +61,19 @@ class Worlds:
         prepared = copy.copy(model)
         # Their contacts come from the field.
         prepared.geom_contype[contacts.carriers] = 0
+        kinds = mujoco.mjtJacobian
+        kind = kinds.mjJAC_SPARSE if SPARSE else kinds.mjJAC_DENSE
+        prepared.opt.jacobian = kind.value
         wall = model.sensor("wall_contacts")
         start, size = int(wall.adr[0]), int(wall.dim[0])
         with self._warp.ScopedDevice(device.name):
             self.model = self._mjwarp.put_model(prepared)
             self.model.opt.contact_sensor_maxmatch = max(size // 14, CONTACTS)
-            self.model.opt.run_rne_postconstraint = True
             self.model.opt.warn_overflow = 0  # counted instead
             count = contacts.num_worlds
-            sizes = {"nconmax": CONTACTS, "njmax": ROWS}
+            # Warp's default is for contacts of its own collision.
+            entries = ROWS * model.nv
+            sizes = {"nconmax": CONTACTS, "njmax": ROWS, "njmax_nnz": entries}
             self.data = self._mjwarp.make_data(prepared, nworld=count, **sizes)
             for name in own:
                 self._expand(name, own[name])
@@ -74,8 +82,8 @@ class Worlds:
             self.model.callback.contactfilter = contacts
             self._passive.bind(self.model, self.data, model)
             self.model.callback.passive = self._passive
-            self._reduction = Reduction(device, self.data, slice(start, start + size))
-        self._beside = np.r_[:start, start + size : model.nsensordata]
+            self._beside = np.r_[:start, start + size : model.nsensordata]
+            self._reduction = Reduction(device, self.data, contacts, self._beside)
         self._staged: dict[str, Any] = {}
         self._graph: Any = None
         self.seconds: dict[str, float] = {}
@@ -109,7 +117,7 @@ class Worlds:
         for name in names:
             if not name.startswith(_HOST_ONLY):
                 array = getattr(self.model, name)
-                array.assign(self._shaped(own[name], array))
+                self._put(name, array, own[name])
 
     def write(self, arrays: Any, whole: bool) -> None:
         """Writes the state of all worlds, or what the host changes in every step.
@@ -121,11 +129,15 @@ class Worlds:
         began = time.perf_counter()
         self._passive.write(whole)
         for name in _WRITTEN if whole else _ALWAYS:
-            array = getattr(self.data, name)
-            staged = self._stage(f"to {name}", array)
-            np.copyto(staged.numpy(), getattr(arrays, name), casting="same_kind")
-            self._warp.copy(array, staged)
+            self._put(name, getattr(self.data, name), getattr(arrays, name))
         self.seconds["write"] = time.perf_counter() - began
+
+    def _put(self, name: str, array: Any, values: np.ndarray) -> None:
+        """Writes values into an array of the device."""
+        staged = self._stage(f"to {name}", array)
+        there = staged.numpy()
+        rows.copy(there, values.reshape(there.shape))
+        self._warp.copy(array, staged)
 
     def _stage(self, key: str, array: Any) -> Any:
         """Page-locked memory of the host for a copy of an array."""
@@ -149,15 +161,25 @@ class Worlds:
             self._warp.capture_launch(self._graph)
 
     def _steps(self) -> None:
-        for _ in range(self._substeps):
-            self._mjwarp.step(self.model, self.data)
-            self._reduction.add()
+        for left in reversed(range(self._substeps)):
+            self._step(last=not left)
+        self._reduction.end()
+
+    def _step(self, last: bool) -> None:
+        """Does a physics step; sensors and forces on links are of the last one."""
+        option, without = self.model.opt, mujoco.mjtDisableBit.mjDSBL_SENSOR.value
+        kept, option.run_rne_postconstraint = option.disableflags, last
+        option.disableflags = kept if last else kept | without
+        self._mjwarp.step(self.model, self.data)
+        option.disableflags = kept
+        self._reduction.add()
 
     def _captured(self) -> Any:
         """The physics steps as a CUDA graph; the state stays as it is."""
         kept = {name: self._warp.clone(getattr(self.data, name)) for name in _WRITTEN}
-        self._mjwarp.step(self.model, self.data)  # compiles what is not compiled yet
-        self._reduction.add()
+        for last in (False, True):  # compiles what is not compiled yet
+            self._step(last)
+        self._reduction.end()
         with self._warp.ScopedCapture() as capture:
             self._steps()
         for name, array in kept.items():
@@ -183,7 +205,7 @@ class Worlds:
         copied = time.perf_counter()
         for name in chosen:
             there = getattr(arrays, name)
-            np.copyto(there, self._staged[name].numpy().reshape(there.shape))
+            rows.copy(there, self._staged[name].numpy().reshape(there.shape))
         totals = self._reduction.read()
         arrays.sensordata[:, self._beside] = totals.beside
         done = time.perf_counter()

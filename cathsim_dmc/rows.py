@@ -1,0 +1,56 @@
+"""Rows of large arrays, shared out among the cores.
+
+What acts on them must give the Python interpreter free, as compiled functions and
+copies of numpy's do.
+"""
+
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+_LEAST = 256  # rows of a part: for fewer, handing them out takes longer
+MANY = 2 * _LEAST  # rows of which there are several parts
+
+
+def each(count: int, act: Callable[[slice], Any], least: int = _LEAST) -> None:
+    """Calls a function with parts of the rows 0 to `count`, at once where many.
+
+    Args:
+        count: Number of rows.
+        act: Gets the rows of a part, and writes no others.
+        least: Number of rows of a part.
+    """
+    cores = os.cpu_count() or 1
+    parts = min(cores, count // least)
+    if parts < 2:
+        act(slice(0, count))
+        return
+    ends = [count * part // parts for part in range(parts + 1)]
+    # The results raise what the calls have raised.
+    list(_pool(os.getpid(), cores).map(act, map(slice, ends[:-1], ends[1:])))
+
+
+def copy(target: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """Copies all rows, as numbers of the target's kind; returns the target."""
+
+    def part(own: slice) -> None:
+        np.copyto(target[own], source[own], casting="same_kind")
+
+    each(len(target), part)
+    return target
+
+
+def copied(source: np.ndarray, kind: Any = None) -> np.ndarray:
+    """A copy of an array with one axis or more, of a kind of numbers."""
+    return copy(np.empty(source.shape, kind or source.dtype), source)
+
+
+@functools.cache
+def _pool(process: int, cores: int) -> ThreadPoolExecutor:
+    """Threads of one process: a fork has none."""
+    del process
+    return ThreadPoolExecutor(cores)
