@@ -6,12 +6,13 @@ import importlib.util
 import pkgutil
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from numba.core import types
 
 import cathsim_dmc
-from cathsim_dmc import laws
+from cathsim_dmc import laws, suite
 from cathsim_dmc.compiled import _Compiled, for_cuda, law
 from cathsim_dmc.laws import (
     bore,
@@ -31,6 +32,11 @@ from cathsim_dmc.laws import (
     wall,
 )
 from cathsim_dmc.laws.blood import Blood, drag
+from cathsim_dmc.simulation.warp import contact_kernels, reduction
+from cathsim_dmc.simulation.warp.contact_kernels import SCRATCH
+from cathsim_dmc.simulation.warp.devices import NONE
+from cathsim_dmc.simulation.warp.simulation import WarpSimulation
+from cathsim_dmc.simulation.warp.worlds import Worlds
 
 PACKAGE = Path(cathsim_dmc.__file__).parent
 MOST_PARAMETERS = 8
@@ -191,7 +197,6 @@ def signatures():
     told = named(drive.Told, two, two)
     shape = named(springs.Springs, one, one)
     guided = named(sheath.Joints, *[rows(BITS, 2)] * 3, *[one] * 4)
-    free, of_model = named(sheath.Hinges, *[two] * 3), named(sheath.Hinges, *[one] * 3)
     memory = named(springs.Scratch, one, bends, two)
     return {
         contact.contacts: (a_wall, capsule, given, sweep, scratch, two),
@@ -220,7 +225,9 @@ def signatures():
             *(one, material, links, types.UniTuple(rule, 2), two, two),
         ),
         drive.slip: (servos, state, two),
-        sheath.hold: (guided, REAL, free, of_model, one),
+        sheath.hold_all: (
+            *(guided, one, rows(REAL, 4), named(sheath.Hinges, *[two] * 3), two),
+        ),
         drive.follow: (servos, state, two, two, told, two),
     }
 
@@ -264,3 +271,28 @@ def test_every_law_compiles_for_a_gpu(cuda):
     left = [name for each, name in names if "on_cuda" not in vars(each)]
     left = [name for name in left if not name.startswith(ON_THE_HOST)]
     assert not left, f"add signatures that call {left}"
+
+
+@pytest.mark.slow
+def test_threads_of_warp_compile_for_a_gpu(cuda):
+    """What runs on Warp's arrays, with the arrays of a task."""
+    pytest.importorskip("mujoco_warp")
+    task = suite.make_task("type1_lcca")
+    stepper = WarpSimulation(task, 2, device="cpu").stepper
+    laws_ = stepper.contacts, stepper._passive
+    world = Worlds(stepper._device, stepper._model, stepper._own, laws_, 1)
+    wall_, added = stepper.contacts, world._reduction._added
+    threads = [
+        (contact_kernels.find, SCRATCH, wall_._scene),
+        (contact_kernels.count, NONE, wall_._written),
+        (contact_kernels.place, NONE, wall_._written),
+        *((each, NONE, added) for each in (reduction.clear, reduction.add)),
+        (reduction.end, NONE, world._reduction._ended),
+        *((each, NONE, given) for each, given in stepper._passive._calls),
+    ]
+    for thread, shapes, given in threads:
+        own = types.Tuple([rows(REAL, len(shape)) for shape in shapes])
+        arguments = BITS, own, numba.typeof(given)
+        options = {"device": True, "cc": (9, 0), "abi": "numba"}
+        ptx, _ = cuda.compile_ptx(for_cuda(thread).py_func, arguments, **options)
+        assert ".visible .func" in ptx, thread.__name__

@@ -45,6 +45,9 @@ def test_worlds_follow_the_batch():
         counts = [each.present.sum(axis=1) for each in found]
         equal += int((counts[0] == counts[1]).sum())
         forces.append((here.wall_force.sum, there.wall_force.sum))
+        # The forces are summed up from the rows of constraints, not from the sensors.
+        loads = found[1].magnitude.sum(axis=1)
+        np.testing.assert_allclose(there.wall_force.sum, loads, rtol=1e-5)
     totals = np.array(forces).sum(axis=(0, 2))
     assert totals[0] > 0.0
     assert totals[1] == pytest.approx(totals[0], rel=0.05)

@@ -131,7 +131,7 @@ class WallContacts:
         device, threads = self._device, self.num_worlds * self._host.dims.size
         device.launch(find, threads, SCRATCH, self._scene)
         device.launch(count, self.num_worlds, NONE, self._written)
-        device.sum_before(*self._places)
+        device.sum_before(self._places[0], self._places[1])
         device.launch(place, threads, NONE, self._written)
 
     def _made(self) -> Walls:

@@ -146,17 +146,23 @@ class Reduction:
         self._device, self._count = device, len(data.qpos)
         self._out = device.constant(np.zeros((_FORCES + 1 + len(beside), self._count)))
         self._added = Added(
-            contacts.counts,
-            contacts.starts,
-            device.constant(contacts.is_wall),
-            *(view(each) for each in (found.geom, found.dist, found.dim)),
-            view(found.efc_address),
-            view(data.efc.force),
-            self._out,
+            counts=contacts.counts,
+            starts=contacts.starts,
+            is_wall=device.constant(contacts.is_wall),
+            geom=view(found.geom),
+            dist=view(found.dist),
+            dim=view(found.dim),
+            rows=view(found.efc_address),
+            forces=view(data.efc.force),
+            out=self._out,
         )
-        state = view(data.qpos), view(data.qvel)
-        places = device.constant(beside.astype(np.int64))
-        self._ended = Ended(view(data.sensordata), places, *state, self._out)
+        self._ended = Ended(
+            sensors=view(data.sensordata),
+            places=device.constant(beside.astype(np.int64)),
+            qpos=view(data.qpos),
+            qvel=view(data.qvel),
+            out=self._out,
+        )
 
     def begin(self) -> None:
         """Begins a control step."""

@@ -1,0 +1,44 @@
+"""Rows of large arrays, shared out among the cores."""
+
+import os
+import threading
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import rows
+
+
+@pytest.fixture(autouse=True)
+def cores(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+
+
+@pytest.mark.parametrize("count", [0, 1, 511, 512, 4099])
+def test_each_row_has_its_turn_once(count):
+    turns = np.zeros(count, int)
+    names = set()
+
+    def act(part):
+        turns[part] += 1
+        names.add(threading.get_ident())
+
+    rows.each(count, act)
+    assert (turns == 1).all()
+    alone = names == {threading.get_ident()}
+    assert alone == (count < 512)
+
+
+def test_an_error_in_a_part_is_raised():
+    with pytest.raises(ZeroDivisionError):
+        rows.each(2048, lambda part: 1 // (part.start - 512))
+
+
+def test_copies_are_of_the_kind_asked_for():
+    source = np.random.RandomState(0).uniform(size=(2048, 3, 2))[:, ::2]
+    found = rows.copied(source, np.float32)
+    np.testing.assert_array_equal(found, source.astype(np.float32))
+    assert found.dtype == np.float32 and found.flags.c_contiguous
+    same = rows.copied(source)
+    np.testing.assert_array_equal(same, source)
+    assert not np.shares_memory(same, source)
