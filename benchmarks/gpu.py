@@ -18,6 +18,7 @@ import json
 import os
 import platform
 import sys
+import tarfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -51,17 +52,17 @@ SPEED = (
     ("internal", 16384, "push"), ("image", 4096, "push"), ("route", 4096, "push"),
 )  # fmt: skip
 ON_THE_CPU = 1024  # simulations on all cores
-# Large batches, as a GPU steps thousands of worlds in the time of a few.
+# Hundreds of worlds, a few steps of each: an update needs no more frames.
+_UPDATES = {"minibatch_size": 512, "epochs": 10, "checkpoint_frames": 40_960}
+_SMALL = {"num_envs": 512, "steps_per_update": 4096, "learning_rate": 2.5e-4}
+_LARGE = {"num_envs": 1024, "steps_per_update": 8192, "learning_rate": 3e-4}
 TRAINING: dict[str, dict[str, Any]] = {
-    "PPO-Internal": {
-        "preset": "tuned", "num_envs": 1024, "steps_per_update": 16_384,
-        "minibatch_size": 1024, "epochs": 10, "learning_rate": 1e-3,
-        "total_frames": 589_824, "checkpoint_frames": 49_152,
+    "PPO-Internal": {"preset": "tuned", "total_frames": 409_600, **_SMALL, **_UPDATES},
+    "PPO-Internal, 1,024 worlds": {
+        "preset": "tuned", "total_frames": 737_280, **_LARGE, **_UPDATES
     },
     "PPO-Image": {
-        "preset": "tuned_image", "num_envs": 1024, "steps_per_update": 16_384,
-        "minibatch_size": 1024, "epochs": 6, "learning_rate": 1e-3,
-        "total_frames": 589_824, "checkpoint_frames": 49_152,
+        "preset": "tuned_image", "total_frames": 409_600, **_SMALL, **_UPDATES
     },
 }  # fmt: skip
 EPISODES, LONGEST, ENOUGH = 40, 200, 0.95
@@ -179,20 +180,21 @@ def speed(
     return row
 
 
-def training(name: str, device: str, folder: Path) -> dict[str, Any]:
-    """Frames and seconds until a policy succeeds."""
+def training(name: str, device: str, folder: Path, out: Path | None) -> dict[str, Any]:
+    """Frames and seconds until a policy succeeds; its files go beside `out`."""
     settings = {"task": "type1_lcca", "simulation_device": device, **TRAINING[name]}
     place = "cuda" if device.startswith("cuda") else "cpu"
     cores = os.cpu_count() or 1
     settings |= {"torch_device": place, "torch_threads": cores, "metrics_frames": 1}
     settings |= {"checkpoint_seconds": 1e6, "keep_checkpoints": 100}
     config = agents.make_config("ppo", **settings)
-    run = folder / name.lower()
+    short = name.lower().replace(", ", "-").replace(" ", "-").replace(",", "")
+    run = folder / short
     result = agents.train(config, run, progress=False)
     with (run / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     seconds = {int(float(row["frames"])): float(row["seconds"]) for row in rows}
-    curve = []
+    curve, checkpoint = [], result.checkpoint
     for checkpoint in sorted(
         (run / "checkpoints").iterdir(), key=lambda p: int(p.name)
     ):
@@ -206,6 +208,12 @@ def training(name: str, device: str, folder: Path) -> dict[str, Any]:
         if success >= ENOUGH:
             break
     reached = [row for row in curve if row[2] >= ENOUGH]
+    if out is not None:
+        last = run / "checkpoints" / checkpoint.name
+        kept = [run / "config.json", run / "metrics.csv", *last.iterdir()]
+        with tarfile.open(out.parent / f"{short}.tar.gz", "w:gz") as archive:
+            for path in kept:
+                archive.add(path, path.relative_to(run.parent))
     return {
         "agent": name,
         "settings": TRAINING[name],
@@ -237,7 +245,8 @@ def measure(given: argparse.Namespace, report: Report) -> None:
 
     def trained(name: str, seconds: float) -> None:
         if name in TRAINING and "ppo" in only and report.has(seconds):
-            report.add("training", training(name, device, given.runs))
+            row = training(name, device, given.runs, given.out)
+            report.add("training", row)
 
     speeds(rows[:2], 0)
     trained("PPO-Internal", 60)
@@ -251,7 +260,8 @@ def measure(given: argparse.Namespace, report: Report) -> None:
     for task in names[:2]:
         if report.has(20):
             report.add("parity", parity(name, task, given.parity_steps))
-    trained("PPO-Image", 60)
+    trained("PPO-Image", 100)
+    trained("PPO-Internal, 1,024 worlds", 90)
     speeds(rows[4:], 30)
     for task in names[2:]:  # compiled for another model
         if report.has(110):
@@ -296,8 +306,20 @@ def tables(found: Mapping[str, Any]) -> dict[str, str]:
             f"{row['seconds_to_95'] if reached else '–'} | "
             f"{row['frames_per_second']:,} |"
         )
-    written = {"parity": parities, "speed": speeds, "training": trainings}
-    return {name: "\n".join(rows) for name, rows in written.items() if rows[1:]}
+    place = [
+        "",
+        f"`type1_lcca` on one {found.get('gpu', 'CPU')}, {found['host']}, "
+        f"{found['date']}; control steps per second:",
+    ]
+    written = {
+        "where": place,
+        "parity": parities,
+        "speed": speeds,
+        "training": trainings,
+    }
+    return {
+        name: "\n".join(rows).lstrip() for name, rows in written.items() if rows[1:]
+    }
 
 
 def write(page: Path, found: Mapping[str, Any]) -> None:
