@@ -197,6 +197,7 @@ def signatures():
     told = named(drive.Told, two, two)
     shape = named(springs.Springs, one, one)
     guided = named(sheath.Joints, *[rows(BITS, 2)] * 3, *[one] * 4)
+    free, of_model = named(sheath.Hinges, *[two] * 3), named(sheath.Hinges, *[one] * 3)
     memory = named(springs.Scratch, one, bends, two)
     return {
         contact.contacts: (a_wall, capsule, given, sweep, scratch, two),
@@ -225,9 +226,7 @@ def signatures():
             *(one, material, links, types.UniTuple(rule, 2), two, two),
         ),
         drive.slip: (servos, state, two),
-        sheath.hold_all: (
-            *(guided, one, rows(REAL, 4), named(sheath.Hinges, *[two] * 3), two),
-        ),
+        sheath.hold: (guided, REAL, free, of_model, one),
         drive.follow: (servos, state, two, two, told, two),
     }
 

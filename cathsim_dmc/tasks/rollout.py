@@ -151,9 +151,10 @@ class Rollout(Restorable):
         self._open[indices] = True
         self._random_states = list(random_states)
         self._stepper.restore(indices)
-        self._layout.begin(indices)
         for index in indices:
             self._draw(index, random_states[index])
+        # Only now: an anatomy that is loaded resets what a simulation has.
+        self._layout.begin(indices)
         self._devices.pose_robot()
         self._choose_objectives()
         self.steps[indices] = 0
