@@ -57,7 +57,7 @@ _UPDATES = {"minibatch_size": 512, "epochs": 10, "checkpoint_frames": 40_960}
 _SMALL = {"num_envs": 512, "steps_per_update": 4096, "learning_rate": 2.5e-4}
 _LARGE = {"num_envs": 1024, "steps_per_update": 8192, "learning_rate": 3e-4}
 TRAINING: dict[str, dict[str, Any]] = {
-    "PPO-Internal": {"preset": "tuned", "total_frames": 409_600, **_SMALL, **_UPDATES},
+    "PPO-Internal": {"preset": "tuned", "total_frames": 614_400, **_SMALL, **_UPDATES},
     "PPO-Internal, 1,024 worlds": {
         "preset": "tuned", "total_frames": 737_280, **_LARGE, **_UPDATES
     },

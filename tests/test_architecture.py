@@ -25,6 +25,7 @@ BELOW = {
     "compiled_cache",
     "compiled_parts",
     "cluster",
+    "rows",
 }
 _TASK = {"anatomy", "laws", "collision", "imaging", "entities", "physics", "tasks"}
 _FACE = _TASK | {"suite", "simulation"}
@@ -33,7 +34,7 @@ _FACE = _TASK | {"suite", "simulation"}
 ALLOWED = {
     "__init__": set(),
     # Below everything: how files are written, what values may be, how figures look,
-    # how loops are compiled and kept, how jobs are spread over machines.
+    # how loops are compiled and kept, how work is spread over machines and cores.
     "files": set(),
     "file_maps": set(),
     "bounds": set(),
@@ -43,6 +44,7 @@ ALLOWED = {
     "compiled_cache": set(),
     "compiled_parts": set(),
     "cluster": set(),
+    "rows": set(),
     # Laws know no engine and no task.
     "laws": set(),
     "anatomy": {"laws"},

@@ -6,7 +6,8 @@ import threading
 import numpy as np
 import pytest
 
-from cathsim_dmc import rows
+from cathsim_dmc import rows, suite
+from cathsim_dmc.simulation.batch import BatchSimulation
 
 
 @pytest.fixture(autouse=True)
@@ -42,3 +43,18 @@ def test_copies_are_of_the_kind_asked_for():
     same = rows.copied(source)
     np.testing.assert_array_equal(same, source)
     assert not np.shares_memory(same, source)
+
+
+@pytest.mark.slow
+def test_many_simulations_are_those_of_few():
+    def play(count):
+        task = suite.make_task("type1_lcca", observation=["internal", "image"])
+        batch = BatchSimulation(task, count, num_threads=2, seeds=0)
+        batch.reset()
+        actions = np.random.RandomState(1).uniform(-1, 1, (600, batch.num_actions))
+        return batch.step(actions[:count])
+
+    few, many = play(3), play(600)
+    for name, values in few.observation.items():
+        np.testing.assert_array_equal(many.observation[name][:3], values)
+    np.testing.assert_array_equal(many.outcome.reward[:3], few.outcome.reward)
