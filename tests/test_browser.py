@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "browser"
@@ -97,6 +98,30 @@ console.log(JSON.stringify({ action, pressed, shares, still: [...controls.action
     np.testing.assert_allclose(page["strengths"], [*map(hands.strength, given)])
 
 
+@needs_node
+def test_the_curve_of_the_device_has_no_corner(tmp_path):
+    """It passes through the joints, and turns by little from piece to piece."""
+    shutil.copy(PAGES / "centreline.js", tmp_path / "centreline.mjs")
+    angle = 0.4 * np.arange(12)
+    helix = np.stack([np.sin(angle), np.cos(angle), angle / 4], axis=1).tolist()
+    in_line = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 1, 0]]  # and then bent
+    (tmp_path / "run.mjs").write_text(f"""
+import {{ smooth }} from "./centreline.mjs";
+const lines = {json.dumps([helix, in_line])};
+console.log(JSON.stringify(lines.map((line) => smooth(line, 20))));
+""")
+    done = subprocess.run(
+        ["node", tmp_path / "run.mjs"], capture_output=True, text=True, check=True
+    )
+    for joints, points in zip((helix, in_line), json.loads(done.stdout), strict=True):
+        curve = np.array(points)
+        np.testing.assert_allclose(curve[::20], joints, atol=1e-12)
+        pieces = np.diff(curve, axis=0)
+        pieces /= np.linalg.norm(pieces, axis=1, keepdims=True)
+        turns = np.arccos(np.clip(np.vecdot(pieces[1:], pieces[:-1]), -1, 1))
+        assert turns.max() < np.radians(5)  # the joints of the second turn by 45°
+
+
 @pytest.fixture(scope="module")
 def builder():
     """The script that makes what the pages need."""
@@ -153,43 +178,124 @@ def test_webassembly_moves_and_draws_as_python_does(builder, scene, tmp_path):
     assert grey.std() > 1
 
 
-@pytest.mark.slow
-@needs_node
-@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
-def test_a_visitor_steers(builder, scene, tmp_path):
-    site = tmp_path / "browser"
-    shutil.copytree(PAGES, site)
-    shutil.copytree(scene, site / "scenes" / "type1_lcca")
-    (site / "scenes" / "scenes.json").write_text('["type1_lcca"]')
-    builder.write_mujoco(site / "vendor")
-    modules = builder.install()
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+
+
+@pytest.fixture(scope="module")
+def site(builder, scene, tmp_path_factory):
+    """The pages with one scene and one recording: the address of a server of them."""
+    folder = tmp_path_factory.mktemp("site") / "browser"
+    shutil.copytree(PAGES, folder)
+    shutil.copytree(scene, folder / "scenes" / "type1_lcca")
+    (folder / "scenes" / "scenes.json").write_text('["type1_lcca"]')
+    builder.write_vendor(folder / "vendor")
+    (folder / "recordings").mkdir()
+    jam = ("jam", "A push", "push", "type1_lcca", 0, 100)
+    entry = builder.write_recording(folder / "recordings", *jam)
+    (folder / "recordings" / "recordings.json").write_text(json.dumps([entry]))
+    (folder / "viewer").mkdir()
+    (folder / "viewer" / "index.html").write_text("Rerun's viewer")
     server = subprocess.Popen(
         [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1"],
-        cwd=site,
+        cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
     )
-    try:
-        port = re.search(r"port (\d+)", server.stdout.readline()).group(1)
-        picture = tmp_path / "page.png"
-        address = f"http://127.0.0.1:{port}/steer.html"
-        visit = ["node", PAGES / "visit.mjs", modules, address, picture]
-        done = subprocess.run(
-            [*visit, "KeyW:2", "KeyW+ArrowRight:1", "Pad:1"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-    finally:
-        server.terminate()
-        server.wait()
+    port = re.search(r"port (\d+)", server.stdout.readline()).group(1)
+    yield f"http://127.0.0.1:{port}"
+    server.terminate()
+    server.wait()
+
+
+def visit(builder, script, *arguments):
+    """What a visit of the pages prints, which has no errors of the page."""
+    command = ["node", PAGES / script, builder.install(), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     seen = json.loads(done.stdout)
     assert not seen["errors"]
+    return seen
+
+
+@pytest.mark.slow
+@needs_node
+@needs_chromium
+def test_a_visitor_steers(builder, site, tmp_path):
+    picture = tmp_path / "page.png"
+    keys = ("KeyW:2", "KeyW+ArrowRight:1", "Pad:1")
+    seen = visit(builder, "visit.mjs", f"{site}/steer.html", picture, *keys)
     assert seen["seconds"] > 0.5 and seen["felt"] > 0
     # It was pushed at 40 mm/s for about as long as it was simulated.
     assert (
         0.3 * 0.04 * seen["seconds"] < seen["inserted"] < 0.04 * seen["seconds"] + 0.01
     )
     assert picture.stat().st_size > 50_000
+
+
+def _colour(picture, pixel):
+    """RGBA of a picture at a pixel, in [0, 255]."""
+    image = Image.open(picture).convert("RGBA")
+    return image.getpixel(tuple(round(place) for place in pixel))
+
+
+@pytest.mark.slow
+@needs_node
+@needs_chromium
+def test_a_visitor_steers_in_an_emulated_headset(builder, site, tmp_path):
+    picture = tmp_path / "room.png"
+    inputs = (
+        "right.trigger=1:1",
+        "left.y=1:0.4",  # the stick towards oneself
+        "right.x=1:0.4",
+        "right.a=1:0.1",
+        "right.squeeze=1,right.move=0.05/0/0:0.1",
+        "left.stick=1:0.1",
+        "left.squeeze=1,right.squeeze=1,left.move=-0.105/0/0,right.move=0.105/0/0:0.1",
+    )
+    page = f"{site}/steer.html"
+    seen = visit(builder, "visit_xr.mjs", page, "vr", picture, *inputs)
+    assert seen["three"] == [0, 2]  # three.js is loaded when a session begins
+    begun, pushed, pulled, bent, straight, moved, placed, scaled, drawn, left = seen[
+        "states"
+    ]
+    assert begun["presenting"] and begun["visibility"] == "visible"
+    assert pushed["inserted"] - begun["inserted"] > 0.02
+    assert pulled["inserted"] - pushed["inserted"] < -0.005
+    assert bent["bend"][1] > 0.3 and straight["bend"] == [0, 0]
+    # At its true size, in front of eyes 1.6 m above the floor.
+    head, goal = np.array(begun["places"])
+    assert begun["scale"] == 1
+    assert np.linalg.norm(head - goal) == pytest.approx(begun["distance"], rel=1e-5)
+    assert 0.3 < -goal[2] < 0.55 and 1.3 < goal[1] < 1.7
+    # One hand moves the arch, a pressed stick puts it back, two hands scale it.
+    goals = [np.array(each["places"][1]) for each in (straight, moved, placed)]
+    np.testing.assert_allclose(goals[1] - goals[0], [0.05, 0, 0], atol=1e-4)
+    np.testing.assert_allclose(goals[2], goals[0], atol=1e-4)
+    assert scaled["scale"] == pytest.approx(0.58 / 0.37, rel=0.02)
+    for (red, green, blue, alpha), of_head in zip(
+        (_colour(picture, pixel) for pixel in drawn["pixels"]),
+        (True, False),
+        strict=True,
+    ):
+        assert alpha == 255
+        assert red > green > blue + 30 if of_head else green > red + 10
+    # Afterwards the page goes on, without a headset.
+    assert not left["presenting"] and left["time"] > drawn["time"]
+
+
+@pytest.mark.slow
+@needs_node
+@needs_chromium
+def test_a_recording_plays_in_an_emulated_headset(builder, site, tmp_path):
+    picture = tmp_path / "room.png"
+    page = f"{site}/recordings.html"
+    inputs = ("left.a=0:0.4", "right.a=1:0", "right.b=0:0")  # A pauses
+    seen = visit(builder, "visit_xr.mjs", page, "ar", picture, *inputs)
+    begun, played, paused, still, _, left = seen["states"]
+    assert played["inserted"] > begun["inserted"]
+    assert still["time"] == paused["time"] and not left["presenting"]
+    # The surroundings are seen where nothing is drawn.
+    assert _colour(picture, (2, 2))[3] == 0
+    apart = np.subtract(*still["places"])
+    assert np.linalg.norm(apart) == pytest.approx(still["distance"], rel=1e-5)

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
 from cathsim_dmc.imaging.carm import CArm
-from cathsim_dmc.imaging.device import Shadow, add_disc, device_attenuation
+from cathsim_dmc.imaging.device import Shadow, _bends, add_disc, device_attenuation
 
 RADIUS = 0.84e-3
 SCRATCH = np.empty((3, 20))
@@ -183,3 +183,14 @@ def test_devices_outside_the_view_or_broken_leave_the_rest():
 def test_wrong_devices_are_refused(points, radius, message):
     with pytest.raises(ValueError, match=message):
         device_thickness(CArm(), points, radius)
+
+
+def test_the_curve_has_no_corner_beside_links_in_one_line():
+    joints = np.array([[0, 0, 1], [1, 0, 1], [2, 0, 1], [3, 1, 1], [3, 3, 1.0]])
+    links = np.diff(joints, axis=0)
+    bends = np.array([_bends(joints, link) for link in range(4)])
+    lengths = np.linalg.norm(links, axis=1, keepdims=True)
+    starts = (links + bends[:, :3]) / lengths  # tangents at the joints of every link
+    ends = (links + bends[:, 3:]) / lengths
+    np.testing.assert_allclose(starts[1:], ends[:-1], atol=1e-12)
+    assert np.abs(bends[0]).max() == 0.0  # a link beside one in its line is straight

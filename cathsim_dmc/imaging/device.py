@@ -157,25 +157,28 @@ def _chord(joints, link):
 
 @compiled
 def _turn(joints, link, other):
-    """Tangent less chord of a link where it meets another, times its length."""
+    """Tangent less chord of a link where it meets another, times its length.
+
+    And whether it meets one: else its end is free.
+    """
     if 0 <= other < len(joints) - 1:
         x, y, z, length = _chord(joints, link)
         u, v, w, beside = _chord(joints, other)
         if 0.0 < beside < math.inf:
             share, ratio = length / (length + beside), length / beside
             u, v, w = u * ratio - x, v * ratio - y, w * ratio - z
-            return share * u, share * v, share * w
-    return 0.0, 0.0, 0.0
+            return share * u, share * v, share * w, True
+    return 0.0, 0.0, 0.0, False
 
 
 @compiled
 def _bends(joints, link):
     """Turns of a link's curve at its two ends, of a parabola where one end is free."""
-    a, b, c = _turn(joints, link, link - 1)
-    d, e, f = _turn(joints, link, link + 1)
-    if a == b == c == 0.0:
+    a, b, c, behind = _turn(joints, link, link - 1)
+    d, e, f, before = _turn(joints, link, link + 1)
+    if not behind:
         a, b, c = -d, -e, -f
-    elif d == e == f == 0.0:
+    elif not before:
         d, e, f = -a, -b, -c
     return a, b, c, d, e, f
 

@@ -30,7 +30,7 @@ export class Controls {
 
   restart() {
     this.held = new Set();
-    this.leaning = {}; // shares by axis, of a gamepad
+    this.leaning = new Map(); // shares by axis, of each hand beside the keys
     this.bend = [0, 0];
   }
 
@@ -51,7 +51,8 @@ export class Controls {
       axes[axis] += sign;
     }
     for (const axis of Object.keys(axes)) {
-      axes[axis] = Math.min(Math.max(axes[axis] + (this.leaning[axis] ?? 0), -1), 1);
+      for (const shares of this.leaning.values()) axes[axis] += shares[axis] ?? 0;
+      axes[axis] = Math.min(Math.max(axes[axis], -1), 1);
     }
     this.bend = [axes.bendX, axes.bendY].map((rate, i) =>
       Math.min(Math.max(this.bend[i] + BEND_RATE * duration * rate, -1), 1),

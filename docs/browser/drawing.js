@@ -1,9 +1,16 @@
-/** What is drawn on the canvases: glass views of the vessel, and the curve of forces. */
+/**
+ * What is drawn on the canvases, of the readings of a state (state.js): glass views of the
+ * vessel, fluoroscopy, the curve of forces, and the figures beside them.
+ */
 
-const DEVICE = "#173a63";
-const DEVICE_LIGHT = "#7fb2e5";
-const HEAD = "#ffb000";
-const GOAL = "#12805c";
+import { smooth } from "./centreline.js";
+
+// Colours and sizes of the things in a scene, for every view.
+export const DEVICE = "#173a63";
+export const DEVICE_LIGHT = "#7fb2e5";
+export const HEAD = "#ffb000";
+export const GOAL = "#12805c";
+const GOAL_LIGHT = "#5fd7ac";
 const FORCE = "#b3202c";
 // Colours of a contact from none to the top of the scale, as in the package's figures.
 const FORCE_COLOURS = [
@@ -15,6 +22,7 @@ const FORCE_COLOURS = [
 const FORCE_TOP = 0.2; // N, the last colour
 const ARROW = 0.022; // m, of a contact of that force
 const ARROW_LEAST = 0.004; // m
+const PIECES = 8; // of the drawn curve of the device in each link
 const THICKER = 1.5; // the device is drawn thicker than it is, to be seen
 
 export function forceColour(force) {
@@ -25,6 +33,11 @@ export function forceColour(force) {
     Math.round(x * (1 - share) + FORCE_COLOURS[lower + 1][i] * share),
   );
   return `rgb(${mixed})`;
+}
+
+/** Length, m, of the arrow of a contact force, N. */
+export function arrowLength(force) {
+  return Math.min(Math.max((ARROW * force) / FORCE_TOP, ARROW_LEAST), ARROW);
 }
 
 /** A view of the vessel as glass, with the device between its two pictures. */
@@ -41,10 +54,9 @@ export class GlassView {
     return [(flat(right) - low[0]) * pixels, (high[1] - flat(up)) * pixels];
   }
 
-  draw(simulation) {
+  draw({ goal, radius, line: joints, contacts }) {
     const { canvas, view } = this;
     const pen = canvas.getContext("2d");
-    const { goal, device_radius } = simulation.task;
     pen.clearRect(0, 0, canvas.width, canvas.height);
     pen.drawImage(this.behind, 0, 0);
     const place = this.pixel(goal.position);
@@ -55,13 +67,14 @@ export class GlassView {
     pen.strokeStyle = GOAL;
     pen.lineWidth = 2;
     pen.stroke();
-    const line = simulation.line.map((point) => this.pixel(point));
-    const width = 2 * device_radius * THICKER * view.pixels;
+    const line = smooth(joints, PIECES).map((point) => this.pixel(point));
+    const width = 2 * radius * THICKER * view.pixels;
     pen.lineCap = pen.lineJoin = "round";
     for (const [colour, share] of [["#fff", 1.5], [DEVICE, 1], [DEVICE_LIGHT, 0.35]]) {
       pen.strokeStyle = colour;
       pen.lineWidth = share * width;
-      curve(pen, line);
+      pen.beginPath();
+      for (const point of line) pen.lineTo(...point);
       pen.stroke();
     }
     const head = line[line.length - 1];
@@ -70,13 +83,12 @@ export class GlassView {
     pen.fillStyle = HEAD;
     pen.fill();
     pen.drawImage(this.glaze, 0, 0);
-    for (const contact of simulation.contacts()) this.arrow(pen, contact);
+    for (const contact of contacts) this.arrow(pen, contact);
   }
 
   arrow(pen, { position, force, magnitude }) {
     const start = this.pixel(position);
-    const length = Math.max((ARROW * magnitude) / FORCE_TOP, ARROW_LEAST);
-    const scale = Math.min(length, ARROW) / Math.max(magnitude, 1e-9);
+    const scale = arrowLength(magnitude) / Math.max(magnitude, 1e-9);
     const end = this.pixel(position.map((x, i) => x + scale * force[i]));
     pen.strokeStyle = forceColour(magnitude);
     pen.fillStyle = forceColour(magnitude);
@@ -94,56 +106,93 @@ export class GlassView {
   }
 }
 
-/** A smooth curve through points: quadratic arcs between the middles of its pieces. */
-function curve(pen, line) {
-  pen.beginPath();
-  pen.moveTo(...line[0]);
-  for (let i = 1; i + 1 < line.length; i += 1) {
-    const [x, y] = line[i];
-    pen.quadraticCurveTo(x, y, (x + line[i + 1][0]) / 2, (y + line[i + 1][1]) / 2);
+/** The X-ray image on a canvas, with the goal as a ring. */
+export class FluoroscopyScreen {
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {Fluoroscope} fluoroscope
+   * @param {number} noise Standard deviation of the noise at signal 1.
+   */
+  constructor(canvas, fluoroscope, noise) {
+    Object.assign(this, { canvas, fluoroscope, noise });
+    canvas.width = fluoroscope.view.columns;
+    canvas.height = fluoroscope.view.rows;
   }
-  pen.lineTo(...line[line.length - 1]);
+
+  draw({ line, radius, goal }) {
+    const { canvas, fluoroscope, noise } = this;
+    const { window, focal } = fluoroscope.view;
+    const pen = canvas.getContext("2d");
+    const image = pen.createImageData(canvas.width, canvas.height);
+    fluoroscope.render(line, radius, image.data, noise, window);
+    pen.putImageData(image, 0, 0);
+    const { pixel, depth } = fluoroscope.project(goal.position);
+    pen.beginPath();
+    pen.arc(...pixel, (goal.radius * focal) / depth, 0, 2 * Math.PI);
+    pen.strokeStyle = GOAL_LIGHT;
+    pen.lineWidth = 1.5;
+    pen.stroke();
+  }
 }
 
 /** The largest contact over time, mN. */
 export class Trace {
-  constructor(canvas, width, height) {
-    canvas.width = width;
-    canvas.height = height;
-    this.canvas = canvas;
-    this.clear();
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {number} width Of the drawing, with letters of 11.
+   * @param {number} height
+   * @param {number} pixels Of the canvas for each unit of these.
+   */
+  constructor(canvas, width, height, pixels = 1) {
+    canvas.width = width * pixels;
+    canvas.height = height * pixels;
+    Object.assign(this, { canvas, width, height, pixels });
   }
 
-  clear() {
-    this.values = [];
-  }
-
-  add(force) {
-    this.values.push(1e3 * force);
-  }
-
-  draw(timestep) {
-    const { canvas, values } = this;
+  draw({ peaks, timestep }) {
+    const { canvas, width, height, pixels } = this;
     const pen = canvas.getContext("2d");
-    const [left, bottom, top] = [38, canvas.height - 18, 18];
-    const highest = Math.max(20, ...values) * 1.1;
-    const span = Math.max(values.length, 10 / timestep); // ten seconds at least
-    const x = (i) => left + ((canvas.width - left - 6) * i) / span;
-    const y = (value) => bottom - ((bottom - top) * value) / highest;
-    pen.clearRect(0, 0, canvas.width, canvas.height);
+    const [left, bottom, top] = [38, height - 18, 18];
+    const highest = 1.1e3 * Math.max(0.02, ...peaks);
+    const span = Math.max(peaks.length, 10 / timestep); // ten seconds at least
+    const x = (i) => left + ((width - left - 6) * i) / span;
+    const y = (force) => bottom - ((bottom - top) * 1e3 * force) / highest;
+    pen.setTransform(pixels, 0, 0, pixels, 0, 0);
+    pen.clearRect(0, 0, width, height);
     pen.font = "11px system-ui, sans-serif";
     pen.fillStyle = "#63717d";
     pen.fillText("peak contact*, mN", left, 12);
     pen.fillText(highest.toFixed(0), 4, top + 4);
     pen.fillText("0", 4, bottom);
-    pen.fillText(`${(span * timestep).toFixed(0)} s`, canvas.width - 34, bottom + 13);
+    pen.fillText(`${(span * timestep).toFixed(0)} s`, width - 34, bottom + 13);
     pen.strokeStyle = "#b9c2c9";
     pen.lineWidth = 1;
-    pen.strokeRect(left, top, canvas.width - left - 6, bottom - top);
+    pen.strokeRect(left, top, width - left - 6, bottom - top);
     pen.strokeStyle = FORCE;
     pen.lineWidth = 1.5;
     pen.beginPath();
-    values.forEach((value, i) => pen.lineTo(x(i), y(value)));
+    peaks.forEach((force, i) => pen.lineTo(x(i), y(force)));
     pen.stroke();
   }
+}
+
+const mN = (force) => `${(1e3 * force).toFixed(1)} mN`;
+const mm = (length) => `${(1e3 * length).toFixed(1)} mm`;
+
+/** Names and texts of the figures of a state; a recording has neither bend nor pace. */
+export function figures(readings) {
+  const { goal, time, distance, inserted, push, wall, bend, pace } = readings;
+  const rows = [
+    ["goal", goal.name.toUpperCase()],
+    ["time", `${time.toFixed(1)} s`],
+    ["to the goal", mm(distance)],
+    ["inserted", mm(inserted)],
+    ["push force", mN(push)],
+    ["on the wall, sum", mN(wall.sum)],
+    ["largest contact", mN(wall.max)],
+    ["its peak in the step*", mN(wall.peakMax)],
+  ];
+  if (bend) rows.push(["tip, about x / y", bend.map((share) => share.toFixed(2)).join(" / ")]);
+  if (pace !== undefined) rows.push(["physics", pace ? `${pace.toFixed(1)}× real time` : "–"]);
+  return rows;
 }

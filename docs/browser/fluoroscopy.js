@@ -4,6 +4,8 @@
  * for the derivation (imaging/device.py, imaging/fluoroscopy.py).
  */
 
+import { bends } from "./centreline.js";
+
 const SPACING = 1 / 3; // of the discs along a link, px
 const RELATIVE_SPACING = 0.1; // the same on wide shadows, radii
 const NEAREST = 0.05; // m before the source, where nothing is imaged
@@ -128,28 +130,6 @@ export class Fluoroscope {
     }
     return length;
   }
-}
-
-/** Tangent less chord of a link at the joint it shares with another, times its length. */
-function turn(joints, link, other) {
-  const chord = (i) => joints[i + 1].map((x, axis) => x - joints[i][axis]);
-  if (other >= 0 && other < joints.length - 1) {
-    const [own, next] = [chord(link), chord(other)];
-    const [length, beside] = [Math.hypot(...own), Math.hypot(...next)];
-    if (beside > 0 && beside < Infinity) {
-      const share = length / (length + beside);
-      return own.map((x, axis) => share * ((next[axis] * length) / beside - x));
-    }
-  }
-  return [0, 0, 0];
-}
-
-/** Turns of a link's curve at its two ends, of a parabola where one end is free. */
-function bends(joints, link) {
-  const [start, end] = [turn(joints, link, link - 1), turn(joints, link, link + 1)];
-  if (start.every((x) => x === 0)) return [end.map((x) => -x), end];
-  if (end.every((x) => x === 0)) return [start, start.map((x) => -x)];
-  return [start, end];
 }
 
 function left(t) {

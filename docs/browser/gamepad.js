@@ -3,7 +3,7 @@
 // As in cathsim_dmc/play/hands.py.
 const DEAD_ZONE = 0.15; // share of an axis that rest and wear move it by
 const FULL_FORCE = 1.5; // N, of the strongest vibration; the strength grows as the root
-const FELT = 100; // ms, of a vibration; a control step begins the next one
+export const FELT = 100; // ms, of a vibration; a control step begins the next one
 const BUTTONS = { 0: "straight", 9: "restart" }; // A and Start
 
 const clamp = (value) => Math.min(Math.max(value, -1), 1);
@@ -30,6 +30,23 @@ export function leaning(pad) {
   };
 }
 
+/**
+ * Commands of the buttons that are down; `press` is called once for each that goes down.
+ * @param {object} buttons Commands by number of a button.
+ * @param {Gamepad[]} pads
+ * @param {Set} before Commands that were down.
+ */
+export function pressed(buttons, pads, before, press) {
+  const held = (number) => pads.some((pad) => pad.buttons[number]?.pressed);
+  const down = new Set(
+    Object.keys(buttons)
+      .filter(held)
+      .map((number) => buttons[number]),
+  );
+  down.forEach((command) => before.has(command) || press(command));
+  return down;
+}
+
 export class Gamepads {
   constructor() {
     this.down = new Set();
@@ -44,15 +61,8 @@ export class Gamepads {
   /** Read it into controls; `press` is called once for a button that goes down. */
   poll(controls, press) {
     const { pad } = this;
-    controls.leaning = pad ? leaning(pad) : {};
-    const down = new Set();
-    for (const [number, command] of Object.entries(BUTTONS)) {
-      if (pad?.buttons[number]?.pressed) {
-        down.add(command);
-        if (!this.down.has(command)) press(command);
-      }
-    }
-    this.down = down;
+    controls.leaning.set(this, pad ? leaning(pad) : {});
+    this.down = pressed(BUTTONS, pad ? [pad] : [], this.down, press);
   }
 
   /** Vibrate with the largest contact force, N, where the gamepad can. */

@@ -9,27 +9,10 @@
  * contact (N), milliseconds of a control step, and errors of the page.
  */
 
-import { createRequire } from "node:module";
+import { visiting } from "./headless.mjs";
 
 const [modules, address, screenshot, ...keys] = process.argv.slice(2);
-const { chromium } = createRequire(`${modules}/`)("playwright-core");
-const browser = await chromium.launch({
-  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
-  args: [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-  ],
-});
-try {
-  const page = await browser.newPage({ viewport: { width: 1560, height: 760 } });
-  const errors = [];
-  page.on("pageerror", (error) => errors.push(error.message));
-  page.on("requestfailed", (request) => errors.push(`not loaded: ${request.url()}`));
+const result = await visiting(modules, { width: 1560, height: 760 }, async (page) => {
   await page.addInitScript(() => {
     globalThis.pad = { connected: false, mapping: "standard", axes: [0, -1, 0, 0],
       buttons: [], felt: [], vibrationActuator: { playEffect: async (kind, how) => {
@@ -53,18 +36,17 @@ try {
     for (const each of held) await page.keyboard.up(each);
   }
   const state = await page.evaluate(() => {
-    const { simulation, milliseconds, trace } = globalThis.cathsim;
+    const { simulation, milliseconds, peaks } = globalThis.cathsim.state;
     return {
       seconds: simulation.time,
       inserted: simulation.inserted,
       distance: simulation.distance,
-      largest: Math.max(0, ...trace.values) / 1e3,
+      largest: Math.max(0, ...peaks),
       milliseconds,
       felt: globalThis.pad.felt.length,
     };
   });
   await page.screenshot({ path: screenshot });
-  console.log(JSON.stringify({ ...state, errors }));
-} finally {
-  await browser.close();
-}
+  return state;
+});
+console.log(JSON.stringify(result));

@@ -2,11 +2,11 @@
 
     python docs/scripts/browser.py [SITE]
 
-Writes into SITE/browser (build/site/browser): MuJoCo's WebAssembly build from the npm
-registry, at the version and checksum of docs/browser/package-lock.json; the web viewer
-of the installed rerun-sdk, which alone reads the recordings of its version; the scenes
-that `cathsim export` writes, with pictures of their vessels; and recordings of policies
-that ship. Nothing of it is in the repository.
+Writes into SITE/browser (build/site/browser): MuJoCo's WebAssembly build and three.js
+from the npm registry, at the versions and checksums of docs/browser/package-lock.json;
+the web viewer of the installed rerun-sdk, which alone reads the recordings of its
+version; the scenes that `cathsim export` writes, with pictures and surfaces of their
+vessels; and recordings of policies that ship. Nothing of it is in the repository.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from PIL import Image
 
 from cathsim_dmc import agents, suite  # agents before anything of dm_control
 from cathsim_dmc.agents.policies import task_and_options
+from cathsim_dmc.anatomy.scan.topology import decimated
 from cathsim_dmc.imaging import materials
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.options import FluoroscopyOptions
@@ -36,6 +37,7 @@ from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.pictures import record
 from cathsim_dmc.pictures.figure import background
+from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.simulation.mjcf import write_mjcf
 
 ROOT = Path(__file__).parents[2]
@@ -43,9 +45,15 @@ PAGES = ROOT / "docs" / "browser"
 SCENES = ("type1_lcca", "type1_bca", "type2_lcca", "femoral_type1_lcca")
 SEED = 3
 GLASS_HEIGHT = 620  # px
+VESSEL_FACES = 10_000  # of the surface that a headset shows
 DEVICE_RADIUS = 0.835e-3  # m, of the published device
 # The blur of the detector, a quarter of a pixel here, is left out.
 FLUOROSCOPY = FluoroscopyOptions(size=480, magnification=1.2, kerma=2e-7, blur=0.0)
+# Files of npm packages that the pages load, and their licences.
+VENDOR = {
+    "@mujoco/mujoco": ("mujoco.js", "mujoco.wasm"),
+    "three": ("build/three.module.js", "build/three.core.js"),
+}
 # Files that Rerun's own server hands to a browser.
 VIEWER = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
 POLICY = (
@@ -67,7 +75,7 @@ def main() -> None:
     out = site / "browser"
     if not (out / "steer.html").is_file():
         raise SystemExit(f"{out} holds no pages; run `make docs` first")
-    write_mujoco(out / "vendor")
+    write_vendor(out / "vendor")
     for name in SCENES:
         write_scene(name, out / "scenes" / name)
     (out / "scenes" / "scenes.json").write_text(json.dumps(SCENES))
@@ -117,13 +125,16 @@ class ExportedScene:
         return self.data.site(self._task["head"]).xpos.copy()
 
 
-def write_mujoco(out: Path) -> None:
-    """MuJoCo's WebAssembly build, as the lock file has it."""
-    modules = install(production=True) / "@mujoco" / "mujoco"
+def write_vendor(out: Path) -> None:
+    """MuJoCo's WebAssembly build and three.js, as the lock file has them."""
+    modules = install(production=True)
     out.mkdir(parents=True, exist_ok=True)
-    for name in ("mujoco.js", "mujoco.wasm"):
-        shutil.copy(modules / name, out / name)
-    shutil.copy(modules / "package.json", out / "package.json")
+    for package, files in VENDOR.items():
+        for name in files:
+            shutil.copy(modules / package / name, out)
+        for name in ("package.json", "LICENSE"):
+            if (path := modules / package / name).is_file():
+                shutil.copy(path, out / f"{package.split('/')[-1]}.{name}")
 
 
 def install(production: bool = False) -> Path:
@@ -146,6 +157,7 @@ def write_scene(name: str, out: Path) -> None:
     write_mjcf(name, out, seed=SEED)
     surface = suite.make_task(name).scene.anatomy.surface
     views = {"glass": [], "fluoroscopy": _fluoroscopy(surface, out)}
+    views["vessel"] = _vessel(surface, out)
     for view in ("front", "left"):
         projection, drawn = background(surface, view, GLASS_HEIGHT)
         rows, columns = projection.shape
@@ -169,6 +181,15 @@ def write_scene(name: str, out: Path) -> None:
         )
     (out / "views.json").write_text(json.dumps(views))
     print(f"{name}: {sum(p.stat().st_size for p in out.iterdir()) / 1e6:.1f} MB")
+
+
+def _vessel(surface, out: Path) -> dict:
+    """The surface of the lumen, simplified: float32 vertices, m, then uint32 faces."""
+    vertices, faces = decimated(surface.vertices, surface.faces, VESSEL_FACES)
+    with (out / "vessel.bin").open("wb") as file:
+        file.write(vertices.astype("<f4").tobytes())
+        file.write(faces.astype("<u4").tobytes())
+    return {"file": "vessel.bin", "vertices": len(vertices)}
 
 
 def _fluoroscopy(surface, out: Path) -> dict:
@@ -206,26 +227,83 @@ def _window(plane) -> list[float]:
 def write_recordings(out: Path) -> None:
     """Recordings of the policies that ship, of the expert and of a failure."""
     out.mkdir(parents=True, exist_ok=True)
-    listed = []
-    for name, title, policy, task, seed, steps in RECORDINGS:
-        path = out / f"{name}.rrd"
-        player = agents.load_policy(policy, seed)
-        limit = {"max_steps": steps} if steps else {}
-        played, options = task_and_options(player, task, limit)
-        options["observation"] = player.observation or "internal"
-        env = suite.load("cathsim", played, options)
-        episode = record(env, player, path, seed=seed)
-        largest = 1e3 * episode.wall_force_max.max()
-        command = f"cathsim record {policy} --seed {seed} --out {path.name}"
-        command += f" --task {task}" if task else ""
-        command += f" --max-steps {steps}" if steps else ""
-        text = (
-            f"{episode.task}, {policy}: {episode.termination} after {episode.steps} "
-            f"steps of 40 ms, largest contact {largest:.0f} mN. Made by: {command}"
-        )
-        listed.append({"name": name, "title": title, "file": path.name, "text": text})
-        print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB")
+    listed = [write_recording(out, *each) for each in RECORDINGS]
     (out / "recordings.json").write_text(json.dumps(listed, indent=1))
+
+
+def write_recording(
+    out: Path,
+    name: str,
+    title: str,
+    policy: str,
+    task: str | None,
+    seed: int,
+    steps: int | None,
+) -> dict[str, str]:
+    """A recording for Rerun and for a headset; its entry in the list."""
+    path = out / f"{name}.rrd"
+    player = agents.load_policy(policy, seed)
+    limit = {"max_steps": steps} if steps else {}
+    played, options = task_and_options(player, task, limit)
+    if played not in SCENES:
+        raise SystemExit(f"{name} plays {played}, whose scene is not in SCENES")
+    options["observation"] = player.observation or "internal"
+    env = suite.load("cathsim", played, options)
+    episode = record(env, player, path, seed=seed)
+    write_states(episode, title, env.task.scene.goal.name, path)
+    largest = 1e3 * episode.wall_force_max.max()
+    command = f"cathsim record {policy} --seed {seed} --out {path.name}"
+    command += f" --task {task}" if task else ""
+    command += f" --max-steps {steps}" if steps else ""
+    text = (
+        f"{episode.task}, {policy}: {episode.termination} after {episode.steps} "
+        f"steps of 40 ms, largest contact {largest:.0f} mN. Made by: {command}"
+    )
+    print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB")
+    entry = {"name": name, "title": title, "file": path.name, "text": text}
+    return {**entry, "scene": played}
+
+
+def write_states(episode: Episode, title: str, goal: str, path: Path) -> None:
+    """What a headset shows of an episode, see docs/browser/playback.js.
+
+    Writes PATH.json and PATH.bin; steps' series begin with a row of zeros for the
+    start, so that all have a row for each state.
+    """
+    meta, states = episode.meta, episode.steps + 1
+    contacts: list[list] = [[] for _ in range(states)]
+    for step, position, force in zip(
+        episode.contact_step,
+        episode.contact_position,
+        episode.contact_force,
+        strict=True,
+    ):
+        magnitude = float(np.linalg.norm(force))
+        each = {"position": position.tolist(), "force": force.tolist()}
+        contacts[step + 1].append({**each, "magnitude": magnitude})
+    ended = f"{episode.termination} after {episode.time[-1] - episode.time[0]:.1f} s"
+    values = {
+        "title": title,
+        "message": f"{title}: {ended}",
+        "mood": "good" if episode.success else "bad",
+        "goal": {
+            "name": goal,
+            "position": meta["goal_position"],
+            "radius": meta["goal_radius"],
+        },
+        "radius": float(episode.radii[0]),
+        "timestep": meta["control_timestep"],
+        "joints": episode.catheter.shape[1],
+        "time": (episode.time - episode.time[0]).tolist(),
+        "inserted": episode.insertion.tolist(),
+        "push": [0.0, *episode.push_force.tolist()],
+        "sum": [0.0, *episode.wall_force_sum.tolist()],
+        "max": [0.0, *episode.wall_force_max.tolist()],
+        "peaks": [0.0, *meta["wall_force_peak_max"]],
+        "contacts": contacts,
+    }
+    path.with_suffix(".json").write_text(json.dumps(values))
+    episode.catheter.astype("<f4").tofile(path.with_suffix(".bin"))
 
 
 def write_viewer(out: Path, recordings: Path) -> None:
