@@ -13,6 +13,7 @@ const AWAY = new THREE.Vector3(0, -0.08, -0.42); // of the arch from the eyes, m
 // second, and each image costs it several milliseconds.
 const SCREEN = { width: 0.2, place: [0.2, 0, 0.02], turn: -0.45, period: 75 };
 const PANEL = { width: 0.155, place: [-0.18, 0, 0.02], turn: 0.45, period: 200 };
+const PEAK_NOTE = "* At 4 ms, peaks read 0.4 to 0.7 times those at 0.5 ms.";
 const PANEL_PIXELS = [600, 800];
 const SMALLEST = 0.25; // scale of the arch
 const LARGEST = 10;
@@ -199,7 +200,9 @@ export class Room {
     pen.drawImage(trace.canvas, 20, 94 + 36 * rows.length - 16);
     pen.font = "21px system-ui, sans-serif";
     pen.fillStyle = "#63717d";
-    this.help.forEach((line, row) => pen.fillText(line, 20, 675 + 28 * row, panel.width - 40));
+    [...this.help, PEAK_NOTE].forEach((line, row) =>
+      pen.fillText(line, 20, 660 + 28 * row, panel.width - 40),
+    );
   }
 
   end() {
