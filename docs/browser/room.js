@@ -4,7 +4,7 @@
  */
 
 import * as THREE from "./vendor/three.module.js";
-import { DEVICE, GOAL, HEAD, Trace, arrowLength, figures, forceColour } from "./drawing.js";
+import { DEVICE, DEVICE_LIGHT, GOAL, HEAD, Trace, arrowLength, figures, forceColour } from "./drawing.js";
 import { smooth } from "./centreline.js";
 
 const BACKGROUND = "#bcc4cb"; // of a room without a camera
@@ -21,6 +21,11 @@ const PIECES = 5; // of the drawn curve of the device in each link
 const AROUND = 12; // vertices around the device
 const CONTACTS = 64; // drawn at most
 const HEAD_SIZE = 1.5; // radii of the device
+
+// Opacity of the far and the near wall, and colour of the device: on the background, and on
+// whatever surrounds the user.
+const IN_A_ROOM = { far: 1, near: 0.6, device: DEVICE };
+const AMONG_THINGS = { far: 2, near: 1, device: DEVICE_LIGHT };
 
 // Glass as in cathsim_dmc/pictures/translucent.py: denser along the line of sight.
 const GLASS_VERTEX = `
@@ -44,7 +49,7 @@ const GLASS_FRAGMENT = `
     vec3 above = normalize((viewMatrix * vec4(-0.35, 0.55, 0.76, 0.0)).xyz);
     float light = clamp(dot(normal, above), 0.0, 1.0);
     vec3 wall = vec3(0.80, 0.36, 0.33) * (0.55 + 0.55 * light) + 0.5 * pow(light, 24.0);
-    gl_FragColor = vec4(min(wall, 1.0), opacity * dense);
+    gl_FragColor = vec4(min(wall, 1.0), min(opacity * dense, 0.95));
   }`;
 
 export class Room {
@@ -62,7 +67,7 @@ export class Room {
     lamp.position.set(-0.35, 0.55, 0.76);
     this.scene.add(lamp);
     if (!transparent) this.scene.add(new THREE.GridHelper(6, 24, "#98a2ab", "#a9b2ba"));
-    this.patient = new Patient(vessel, state.readings);
+    this.patient = new Patient(vessel, state.readings, transparent ? AMONG_THINGS : IN_A_ROOM);
     this.stand = new THREE.Group(); // in front of the eyes
     this.stand.add(this.patient.group);
     this.addScreens(screen);
@@ -243,7 +248,7 @@ function byTwo(before, now) {
 
 /** Vessel, device, goal and forces, in metres of the patient frame. */
 class Patient {
-  constructor({ positions, faces }, { goal, radius, line }) {
+  constructor({ positions, faces }, { goal, radius, line }, { far, near, device }) {
     this.group = new THREE.Group(); // moved, turned and scaled by hands
     // Patient frame (left, posterior, superior) to the room's (right, up, towards you),
     // as seen from the front.
@@ -258,8 +263,8 @@ class Patient {
     const middle = shape.boundingBox.getCenter(new THREE.Vector3());
     this.frame.position.copy(middle.negate().applyEuler(this.frame.rotation));
     // Far walls are drawn before what is inside, near ones over it.
-    this.frame.add(glass(shape, THREE.BackSide, 1, 1), glass(shape, THREE.FrontSide, 3, 0.6));
-    this.device = new Tube(PIECES * (line.length - 1) + 1, radius);
+    this.frame.add(glass(shape, THREE.BackSide, 1, far), glass(shape, THREE.FrontSide, 3, near));
+    this.device = new Tube(PIECES * (line.length - 1) + 1, radius, device);
     this.head = new THREE.Mesh(
       new THREE.SphereGeometry(HEAD_SIZE * radius, 24, 16),
       new THREE.MeshStandardMaterial({ color: HEAD, roughness: 0.4 }),
@@ -307,7 +312,7 @@ function glass(shape, side, order, opacity) {
 
 /** The device as a tube around a line. */
 class Tube {
-  constructor(points, radius) {
+  constructor(points, radius, colour) {
     this.radius = radius;
     this.shape = new THREE.BufferGeometry();
     for (const name of ["position", "normal"]) {
@@ -325,7 +330,7 @@ class Tube {
     this.shape.setIndex(faces);
     this.mesh = new THREE.Mesh(
       this.shape,
-      new THREE.MeshStandardMaterial({ color: DEVICE, roughness: 0.35 }),
+      new THREE.MeshStandardMaterial({ color: colour, roughness: 0.35 }),
     );
     this.mesh.frustumCulled = false; // it moves
   }
