@@ -46,6 +46,8 @@ def copy(target: np.ndarray, source: np.ndarray) -> np.ndarray:
 
 def copied(source: np.ndarray, kind: Any = None) -> np.ndarray:
     """A copy of an array with one axis or more, of a kind of numbers."""
+    if kind is None and len(source) < MANY:
+        return source.copy()
     return copy(np.empty(source.shape, kind or source.dtype), source)
 
 

@@ -193,7 +193,7 @@ DERIVED = {
     "Flow": {"_circulations"},
     # Scratch, and views of the model.
     "SingleDevice": {"_steering", "_held", "_sheathed", "_hinged"},
-    "SlidingDevices": {"_fields", "_memory", "_chain", "_held", "_sheathed", "_hinged"},
+    "SlidingDevices": {"_fields", "_live", "_held", "_sheathed", "_hinged"},
 }
 _CONSTANT = (World, Layout, Stepper, Case, NavigationConfig, mjcf.Element)
 

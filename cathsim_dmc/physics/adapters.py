@@ -33,6 +33,8 @@ from cathsim_dmc.collision.own import (
 from cathsim_dmc.collision.parameters import unpacked
 from cathsim_dmc.collision.table import MOTION_ENTRY, SYMBOL, entry_of, key_of
 from cathsim_dmc.compiled import compiled
+from cathsim_dmc.entities.robot import pose
+from cathsim_dmc.laws import sliding
 from cathsim_dmc.laws.blood import Blood, drag
 from cathsim_dmc.laws.compliance import share
 from cathsim_dmc.laws.contact import COMPLIANT
@@ -49,6 +51,8 @@ from cathsim_dmc.laws.motion import (
 )
 from cathsim_dmc.laws.sheath import Hinges, hold
 from cathsim_dmc.laws.springs import Scratch, Springs, shape_torques
+from cathsim_dmc.physics import chain_fields
+from cathsim_dmc.physics.chain_fields import Fields
 
 _adapter = native.callback("void(int64, int64, int64, int64)")
 
@@ -200,16 +204,20 @@ def hold_links(sheathed, first, stop):
 
 
 @compiled
-def act(drives, sheathed, steering, load, control):
-    """Moves N single devices: drives, the sheath, the motors of the tip.
+def act(drives, sheathed, steering, robot, load, control):
+    """Moves N single devices: drives, the sheath, the motors of the tip, the robot.
 
     Args:
         drives: `drives.Bound`.
         sheathed: `held.Sheathed`; None where a bore holds the links.
-        steering: `sliding.Steering`; None without motors.
+        steering: `single_device.Steering`; None without motors.
+        robot: Places of insertion and rotation, and of the joints of the robot, see
+            `entities.robot.pose`.
         load: (N, D), see `laws.drive.follow`.
         control: (N, A), action of the motors, then of the drives; becomes the control.
     """
+    base, joints = robot
+    pose(drives.state.qpos, base, joints)
     way = np.empty_like(load)
     count, motors = len(control), control.shape[1] - load.shape[1]
     follow(drives.servos, drives.state, control[:, motors:], load, drives.told, way)
@@ -222,6 +230,76 @@ def act(drives, sheathed, steering, load, control):
                 angles[i, k] = drives.state.qpos[i, steering.places[k]]
         commands = control[:, :motors]
         steered(commands, angles, steering.bends, commands)
+
+
+@compiled
+def _rows(address, count, width):
+    """An array (count, width) of float64 at an address."""
+    return numbers(address)[: count * width].reshape((count, width))
+
+
+@compiled
+def _fields(places, sizes):
+    """The `chain_fields.Fields` at addresses (11,)."""
+    joints, dofs, positions, geoms, bodies = sizes
+    return Fields(
+        numbers(places[0])[:joints],
+        numbers(places[1])[:dofs],
+        numbers(places[2])[:positions],
+        _rows(places[3], geoms, 3),
+        numbers(places[4])[:geoms],
+        _rows(places[5], geoms, 6),
+        _rows(places[6], geoms, 3),
+        numbers(places[7])[:bodies],
+        _rows(places[8], bodies, 3),
+        numbers(places[9])[:bodies],
+        numbers(places[10])[:bodies],
+    )
+
+
+@compiled
+def settle(live, loads, state, rows, lays):
+    """Settles coaxial devices, writes their chains, and holds the links in the sheath.
+
+    Args:
+        live: `chain_fields.Live`.
+        loads: `laws.sliding.Loads` of N simulations, arrays with the leading axis N.
+        state: `laws.sliding.State` of them, likewise.
+        rows: Number of the first simulation, and the number after that of the last.
+        lays: Whether the devices have just been laid, see `laws.sliding.lay`.
+    """
+    devices, scratch, chain, sheathed = (
+        live.devices,
+        live.scratch,
+        live.chain,
+        live.sheathed,
+    )
+    for i in range(rows[0], rows[1]):
+        if live.fields[i, 0] == 0:
+            continue
+        own = sliding.State(
+            state.gaps[i], state.hinges[i], state.angles[i], state.ways[i],
+            state.drag[i], state.slipped[i], state.axial[i],
+        )  # fmt: skip
+        stiffness, loss = loads.stiffness[i], loads.loss[i]
+        if lays:
+            sliding.lay(devices, own, loads.friction[i], scratch, chain)
+        else:
+            turned, force = loads.turned[i], loads.force[i]
+            each = sliding.Loads(
+                turned, force, loads.axial[i], loads.friction[i], stiffness, loss
+            )
+            sliding.settle(devices, each, own, scratch, chain)
+        fields = _fields(live.fields[i], live.sizes)
+        chain_fields.write(fields, live.places, chain, stiffness, loss)
+        if sheathed is not None:
+            joints, free = sheathed.joints, sheathed.free[i]
+            for j in range(free.shape[1]):
+                for axis in range(2):
+                    free[0, j, axis] = fields.jnt_stiffness[joints.joint[j, axis]]
+                    free[1, j, axis] = fields.dof_damping[joints.dof[j, axis]]
+                    free[2, j, axis] = fields.qpos_spring[joints.qpos[j, axis]]
+            hold_links(sheathed, i, i + 1)
 
 
 @functools.cache

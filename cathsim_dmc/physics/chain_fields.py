@@ -1,7 +1,7 @@
 """Local properties of the chain of coaxial devices, written into a model's fields."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -62,6 +62,29 @@ class Places(NamedTuple):
     half_lengths: np.ndarray
     times: np.ndarray
     timestep: float
+
+
+class Live(NamedTuple):
+    """The chains of N simulations, for compiled functions.
+
+    Attributes:
+        devices: `laws.sliding.Devices`.
+        scratch: `laws.sliding.Scratch`.
+        chain: `laws.sliding.Chain`, written for one simulation after the other.
+        places: `Places`.
+        fields: (N, 11) int64, addresses of the `Fields`; 0 where there is no episode.
+        sizes: (5,), numbers of joints, of degrees of freedom, of positions, of geoms
+            and of bodies of the model.
+        sheathed: `held.Sheathed`; None where a bore holds the links.
+    """
+
+    devices: Any
+    scratch: Any
+    chain: Any
+    places: Places
+    fields: np.ndarray
+    sizes: np.ndarray
+    sheathed: Any
 
 
 def places_of(model: mujoco.MjModel, chain: DeviceStack) -> Places:

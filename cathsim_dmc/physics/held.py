@@ -4,7 +4,7 @@
 """
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -102,7 +102,7 @@ class Sheathed(NamedTuple):
         return Sheathed._make((self.joints, *(each[rows] for each in self[1:])))
 
 
-def addresses(fields: sheath.Hinges) -> list[int]:
+def addresses(fields: Sequence[np.ndarray]) -> list[int]:
     """Where the fields of a model, contiguous arrays of float64, lie in memory."""
     assert all(each.dtype == float and each.flags.c_contiguous for each in fields)
     return [each.ctypes.data for each in fields]

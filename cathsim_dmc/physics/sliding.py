@@ -1,4 +1,4 @@
-"""The devices of N simulations, moved by the actions.
+"""Coaxial devices of N simulations, moved by the actions.
 
 Once in a control step, coaxial devices are moved along and about their axis;
 `chain_fields` then writes the properties of the chain. Where each device is and how it
@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.random import RandomState
 
-from cathsim_dmc import rows
 from cathsim_dmc.entities import stack_memory
 from cathsim_dmc.entities.chain import (
     MAX_PUSH_FORCE,
@@ -18,26 +17,22 @@ from cathsim_dmc.entities.chain import (
     MAX_ROTATION_SPEED,
     MAX_TORQUE,
     Chain,
-    hinge_time,
 )
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
-from cathsim_dmc.entities.robot import pose, postures
-from cathsim_dmc.laws import sheath, sliding
-from cathsim_dmc.laws.hinges import Bends
+from cathsim_dmc.entities.robot import postures
+from cathsim_dmc.laws import sliding
 from cathsim_dmc.laws.parameters import Array
-from cathsim_dmc.laws.springs import Springs
 from cathsim_dmc.physics import chain_fields, held
 from cathsim_dmc.physics.device_points import (
-    BEHIND,
     DEVICE_PLACES,
     device_points,
     gaps_of,
     points_at,
 )
-from cathsim_dmc.physics.drives import Drives
-from cathsim_dmc.physics.effects import Draw, Effect, World
+from cathsim_dmc.physics.effects import Draw, World
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
+from cathsim_dmc.physics.single_device import SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 # Way by which a device slides before the friction in the lumen acts in full, m.
@@ -45,156 +40,6 @@ _PRESLIDING = 40e-6
 # Way of a slipping clamp in a control step by the force beyond its largest, m/N. The
 # axial force of a stiff wire in a tight bend changes by 0.8 N/mm at most.
 _GIVE = 1e-3
-
-
-class Steering(NamedTuple):
-    """How motors are turned out of untwisted frames into those of links.
-
-    Attributes:
-        places: (2 J,), of the hinges among MuJoCo's `qpos`, in the order of the chain.
-        bends: `laws.hinges.Bends`, scratch.
-    """
-
-    places: Any
-    bends: Any
-
-
-class SingleDevice(Effect):
-    """One device, whose own motors move it.
-
-    Attributes:
-        slipped: Way by which the clamps have slipped in the episode, m and rad: (N, 1)
-            or, with rotation, (N, 2) of a single device; (N, 2 K) of coaxial devices,
-            translation and rotation of each.
-    """
-
-    data_fields: tuple[str, ...] = ("act",)
-    model_fields: tuple[str, ...] = held.FIELDS
-    step_fields: tuple[str, ...] = held.FIELDS
-    state = ("slipped", "told", "_free")
-
-    def __init__(self, chain: Chain, holds: bool = True):
-        """Takes the entity of the device.
-
-        Args:
-            holds: Whether the hinges hold the links that are in the sheath, which then
-                has no bore that does.
-        """
-        self._device, self._holds = chain.device, holds
-        self._behind = BEHIND / float(chain.link_lengths[0])  # links
-        if self._device.tip_shape:
-            self.parameters = Springs
-            self.acts_in, self.adapter = "passive", "springs"
-
-    def bind(self, world: World) -> None:
-        """Finds the drives and the hinges in the model."""
-        super().bind(world)
-        self._drives = Drives(world.model, world.arrays)
-        self.slipped, self.told = self._drives.slipped, self._drives.told
-        model, places = world.model, world.index.bends_qpos
-        joints, self._steering = len(places), None
-        if world.chain.tip_motors:
-            bends = Bends(np.empty(joints, complex), np.empty(joints))
-            self._steering = Steering(np.sort(places, axis=None), bends)
-        hinges_x = np.searchsorted(model.jnt_qposadr, places[:, 0])
-        # The shape lies in the plane of x and z.
-        rest = model.qpos_spring[places[:, 1]]
-        self._springs = Springs(rest, 1 / model.jnt_stiffness[hinges_x])
-        self._held = held.Held(model, world.chain, places, world.start_depth)
-        self._sheathed = held.Sheathed(
-            joints=self._held.joints,
-            insertion=world.arrays.qpos[:, world.index.insertion_qpos],
-            free=np.stack([self._held.nominal] * world.num_simulations),
-            places=np.zeros((world.num_simulations, len(held.FIELDS)), np.int64),
-            out=np.ones((world.num_simulations, joints)),
-        )
-        self._free = self._sheathed.free
-        self._hinged: list[Any] = [None] * world.num_simulations
-        turned = world.index.rotation_qpos
-        rotation = -1 if turned is None else turned
-        self._base = np.array([world.index.insertion_qpos, rotation])
-
-    def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
-        """Holds the base of one simulation where it stands."""
-        self._drives.hold(index)
-        if self.parameters is Springs:
-            self.world.parameters.rest[index] = self._springs.rest
-            self.world.parameters.compliance[index] = self._springs.compliance
-        if not self._holds:
-            return
-        factor, loss = (
-            1.0 if value is None else value
-            for value in (episode.stiffness, episode.loss)
-        )
-        material = self._device.relaxation_time * loss
-        stiffness, damping, _ = self._free[index]
-        stiffness[:] = self._held.nominal[0] * factor
-        damping[:] = hinge_time(material, self.world.chain.timestep) * stiffness
-        self._find_hinges(index)
-        self._hold(index)
-
-    def _find_hinges(self, index: int) -> None:
-        fields = held.fields_of(lambda name: self.world.field(index, name))
-        self._hinged[index] = fields  # what lies at their addresses stays
-        self._sheathed.places[index] = held.addresses(fields)
-
-    def _hold(self, index: int) -> None:
-        """Holds the links of one simulation that are in the sheath."""
-        from cathsim_dmc.physics import adapters  # late, as numba takes long
-
-        adapters.hold_links(self._sheathed, index, index + 1)
-        self._soften(slice(index, index + 1))
-
-    def _soften(self, rows: slice) -> None:
-        """Writes the springs of a shaped device of which a part is in the sheath."""
-        if self.parameters is Springs:
-            free, out = self._free[rows, 0, :, 0], self._sheathed.out[rows]
-            self.world.parameters.rest[rows] = self._springs.rest * out
-            stiffness = sheath.held_stiffness(free, out)
-            self.world.parameters.compliance[rows] = 1 / stiffness
-
-    def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
-        """Lets clamps slip; turns motors against the twist of the links."""
-        from cathsim_dmc.physics import adapters  # late, as numba takes long
-
-        load = state.push_force[:, None]
-        if self._drives.slipped.shape[1] > 1:
-            load = np.stack([state.push_force, state.push_torque], axis=1)
-        control, sheathed = action.copy(), self._sheathed if self._holds else None
-        drives, steering = self._drives.bound, self._steering
-
-        def move(own: slice) -> None:
-            memory = steering
-            if memory is not None:
-                bends = Bends._make(map(np.empty_like, memory.bends))
-                memory = memory._replace(bends=bends)
-            held_ = sheathed and sheathed.of(own)
-            adapters.act(drives.of(own), held_, memory, load[own], control[own])
-
-        if len(control) < rows.MANY:
-            adapters.act(drives, sheathed, steering, load, control)
-        else:
-            rows.each(len(control), move)
-        if self._holds:
-            self._soften(slice(None))
-        return control
-
-    def pose_robot(self) -> None:
-        """Poses the robot that holds the devices."""
-        index = self.world.index
-        pose(self.world.arrays.qpos, self._base, index.robot_qpos)
-
-    def courses(self, line: np.ndarray) -> list[tuple[Device, np.ndarray]]:
-        """The devices and their points (N, n, 3) on a line (N, L + 1, 3), m.
-
-        From the innermost outwards, as far behind the base as X-rays meet them.
-        """
-        first = line[:, :1] + self._behind * (line[:, :1] - line[:, 1:2])
-        return [(self._device, np.concatenate([first, line], axis=1))]
-
-    def read(self, readings: Readings) -> CoaxialReadings | None:
-        """State of coaxial devices at some readings; None for one alone."""
-        return None
 
 
 class Positions(NamedTuple):
@@ -235,13 +80,20 @@ class SlidingDevices(SingleDevice):
         self._others = world.arrays.qfrc_applied[:, world.model.jnt_dofadr[base]]
         # Views: writing to them writes the state.
         self._insertion, self._angles = world.parameters
-        self._places = chain_fields.places_of(world.model, self._entity)
-        self._devices = devices_at(self._entity)
-        first, tables = self._places.qpos, self._stack.tables
-        self._hinges = self._qpos[:, first : first + 2 * len(self._stack.spans)]
+        tables = self._stack.tables
+        places = chain_fields.places_of(world.model, self._entity)
+        joints, model = len(self._stack.spans), world.model
+        self._hinges = self._qpos[:, places.qpos : places.qpos + 2 * joints]
         self._fields: list[Any] = [None] * total
-        self._memory = stack_memory.settling(tables)
-        self._chain = stack_memory.chain(tables)
+        self._live = chain_fields.Live(
+            devices=devices_at(self._entity),
+            scratch=stack_memory.settling(tables),
+            chain=stack_memory.chain(tables),
+            places=places,
+            fields=np.zeros((total, len(chain_fields.FIELDS)), np.int64),
+            sizes=np.array([model.njnt, model.nv, model.nq, model.ngeom, model.nbody]),
+            sheathed=self._sheathed if self._holds else None,
+        )
         # Factors of all stiffnesses, and of all loss factors.
         self._friction, self._factors = np.zeros(total), np.ones((total, 2))
         # Fraction of the friction between devices that acts, positive when the inner
@@ -266,14 +118,15 @@ class SlidingDevices(SingleDevice):
             default if value is None else value
             for value, default in zip(drawn, usual, strict=True)
         )
-        self._fields[index] = chain_fields.fields_of(
+        self._fields[index] = fields = chain_fields.fields_of(
             lambda name: self.world.field(index, name)
         )
-        state = self._state(index, gaps, np.zeros((len(gaps), len(self._stack.spans))))
-        friction = self._friction[index]
-        sliding.lay(self._devices, state, friction, self._memory, self._chain)
+        self._live.fields[index] = held.addresses(fields)
         self._find_hinges(index)
-        self._write(index)
+        total, links = len(self._insertion), len(self._stack.tables.lengths)
+        turned, force = np.zeros(self._insertion.shape), np.zeros((total, links))
+        gaps, load = np.tile(gaps, (total, 1)), np.zeros(total)
+        self._write(gaps, turned, force, load, (index, index + 1), lays=True)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Moves the devices and writes the properties of the chains.
@@ -288,8 +141,9 @@ class SlidingDevices(SingleDevice):
         Returns:
             Control (N, 1) of the chain's motor.
         """
-        reached = self._drives.resting()[:, 0]
-        before, step = self._pushed(), MAX_PUSH_SPEED * CONTROL_TIMESTEP
+        reached, step = self._drives.resting()[:, 0], MAX_PUSH_SPEED * CONTROL_TIMESTEP
+        before = self._pushed(reached)
+        self._pose(before)
         leaders = np.argmax(self._insertion, axis=1)
         told = step * action[:, 0::2]
         moved = self._clamped(told, leaders)
@@ -319,26 +173,6 @@ class SlidingDevices(SingleDevice):
         given = way * np.minimum(way * told, -excess * _GIVE)
         return np.where(excess < 0.0, told, given)
 
-    def _state(self, index: int, gaps: np.ndarray, axial: np.ndarray) -> sliding.State:
-        """State of one simulation, with gaps (K,), m, and axial forces (K, J), N."""
-        return sliding.State(
-            gaps=gaps,
-            hinges=self._hinges[index],
-            angles=self._angles[index],
-            ways=self._ways[index],
-            drag=self._drag[index],
-            slipped=self.slipped[index, 1::2],
-            axial=axial,
-        )
-
-    def _write(self, index: int) -> None:
-        """Writes the chain that a law has left into the model of one simulation."""
-        factors, fields = self._factors[index].tolist(), self._fields[index]
-        chain_fields.write(fields, self._places, self._chain, factors[0], factors[1])
-        if self._holds:
-            self._free[index] = self._held.read(self._hinged[index])
-            self._hold(index)
-
     def _settle(self, rate: np.ndarray, lead: np.ndarray, state: Readings) -> None:
         """Turns the devices, writes the chains, computes the forces of the drives."""
         nodes, turned = self._stack.nodes, MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
@@ -348,26 +182,14 @@ class SlidingDevices(SingleDevice):
         force = np.empty(outside.shape[:2])
         sliding.rubbing(outside, lead, depth, nodes, force)
         count = gaps.shape[1]
-        load, axial = np.zeros(len(gaps)), np.zeros((*gaps.shape, len(nodes) - 2))
+        load = np.zeros(len(gaps))
         if count > 1:
             # What the wall does to the links beyond; forces within are not MuJoCo's
             # state.
             beyond = -np.cumsum(outside[:, ::-1], axis=1)[:, ::-1]
             beyond = np.ascontiguousarray(beyond)
             sliding.leading_load(beyond, state.centreline, gaps, nodes, load)
-        for i in range(len(gaps)):
-            stiffness, loss = self._factors[i].tolist()
-            loads = sliding.Loads(
-                turned=turned[i],
-                force=force[i],
-                axial=load[i],
-                friction=self._friction[i],
-                stiffness=stiffness,
-                loss=loss,
-            )
-            posture = self._state(i, gaps[i], axial[i])
-            sliding.settle(self._devices, loads, posture, self._memory, self._chain)
-            self._write(i)
+        axial = self._write(gaps, turned, force, load, (0, len(gaps)))
         if count > 1:
             self._axial[:] = axial.sum(axis=-1)
             self._axial[:, :-1] += self._drag
@@ -376,11 +198,47 @@ class SlidingDevices(SingleDevice):
             leaders = np.argmin(gaps, axis=1)
             self._others[:] = -self._axial[np.arange(len(gaps)), leaders]
 
+    def _write(
+        self,
+        gaps: np.ndarray,
+        turned: np.ndarray,
+        force: np.ndarray,
+        load: np.ndarray,
+        rows: tuple[int, int],
+        lays: bool = False,
+    ) -> np.ndarray:
+        """Writes the chains of simulations, from the first to before the last of rows.
+
+        Args:
+            gaps: (N, K), as are the others as in `laws.sliding`, with an axis N.
+            lays: Whether the devices have just been laid and are not turned.
+
+        Returns:
+            Axial forces (N, K, J) at the joints, N.
+        """
+        from cathsim_dmc.physics import adapters  # late, as numba takes long
+
+        axial = np.zeros((*gaps.shape, len(self._stack.spans)))
+        stiffness, loss = self._factors[:, 0], self._factors[:, 1]
+        loads = sliding.Loads(turned, force, load, self._friction, stiffness, loss)
+        state = sliding.State(
+            gaps=gaps,
+            hinges=self._hinges,
+            angles=self._angles,
+            ways=self._ways,
+            drag=self._drag,
+            slipped=self.slipped[:, 1::2],
+            axial=axial,
+        )
+        adapters.settle(self._live, loads, state, rows, lays)
+        return axial
+
     # What others may read.
 
-    def _pushed(self) -> np.ndarray:
-        """Insertion (N, K) at which the devices come to rest, m."""
-        place = np.ascontiguousarray(self._drives.resting()[:, 0])
+    def _pushed(self, reached: np.ndarray | None = None) -> np.ndarray:
+        """Insertion (N, K) at which the devices come to rest, m, the chain at (N,)."""
+        place = self._drives.resting()[:, 0] if reached is None else reached
+        place = np.ascontiguousarray(place)
         told = np.ascontiguousarray(self._insertion)
         where = np.empty_like(told)
         sliding.held(told, place, where)
@@ -392,8 +250,12 @@ class SlidingDevices(SingleDevice):
         Of more than two devices it holds the outermost and the innermost; of one, both
         units work on the same.
         """
+        self._pose(self._pushed())
+
+    def _pose(self, pushed: np.ndarray) -> None:
+        """Poses the robot where devices come to rest at (N, K), m."""
         reached = self._qpos[:, self._index.insertion_qpos]
-        pushed = reached[:, None] - gaps_of(self._pushed())
+        pushed = reached[:, None] - gaps_of(pushed)
         turned = self._angles[..., 0]
         ends = (pushed[:, -1], turned[:, -1], pushed[:, 0], turned[:, 0])
         self._qpos[:, self._index.robot_qpos] = postures(np.array(ends))

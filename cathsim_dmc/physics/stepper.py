@@ -408,9 +408,11 @@ def _in_doubt(peak, depth, limits, motion, links):
         links: `_Links`.
     """
     hardest, deepest, timestep = limits
-    speed = _fastest(motion, links)
+    total = np.empty((len(links.parents), 6))
     for i in range(len(peak)):
-        if peak[i] > hardest or depth[i] + timestep * speed[i] > deepest:
+        if peak[i] > hardest or depth[i] > deepest:
+            return True
+        if depth[i] + timestep * _speed(motion, links, i, total) > deepest:
             return True
     return False
 
@@ -418,28 +420,34 @@ def _in_doubt(peak, depth, limits, motion, links):
 @compiled
 def _fastest(motion, links):
     """Largest velocity (N,) m/s of places of N devices, but along themselves."""
-    velocity, places, bodies = motion.qvel, motion.xpos, links.bodies
-    parents = links.parents
-    found = np.zeros(len(velocity))
-    total = np.empty((len(parents), 6))
-    for i in range(len(velocity)):
-        for dof in range(len(parents)):
-            for k in range(6):
-                total[dof, k] = motion.cdof[i, dof, k] * velocity[i, dof]
-                if parents[dof] >= 0:
-                    total[dof, k] += total[parents[dof], k]
-        for n in range(len(bodies)):
-            place, pole = places[i, bodies[n]], motion.subtree_com[i, links.roots[n]]
-            a, b, c, u, v, w = total[links.last[n]]
-            x, y, z = place[0] - pole[0], place[1] - pole[1], place[2] - pole[2]
-            u, v, w = u + b * z - c * y, v + c * x - a * z, w + a * y - b * x
-            along = 0.0
-            if n + 1 < len(bodies):
-                ahead = places[i, bodies[n + 1]]
-                x, y, z = ahead[0] - place[0], ahead[1] - place[1], ahead[2] - place[2]
-                along = (u * x + v * y + w * z) / (x * x + y * y + z * z)
-            u, v, w = u - along * x, v - along * y, w - along * z
-            speed = math.sqrt(u * u + v * v + w * w)
-            speed += links.reach[n] * math.sqrt(a * a + b * b + c * c)
-            found[i] = max(found[i], speed)
+    found, total = np.empty(len(motion.qvel)), np.empty((len(links.parents), 6))
+    for i in range(len(found)):
+        found[i] = _speed(motion, links, i, total)
+    return found
+
+
+@compiled
+def _speed(motion, links, i, total):
+    """Largest velocity of places of one device; `total` (nv, 6) is scratch."""
+    velocity, places, bodies = motion.qvel[i], motion.xpos[i], links.bodies
+    parents, found = links.parents, 0.0
+    for dof in range(len(parents)):
+        for k in range(6):
+            total[dof, k] = motion.cdof[i, dof, k] * velocity[dof]
+            if parents[dof] >= 0:
+                total[dof, k] += total[parents[dof], k]
+    for n in range(len(bodies)):
+        place, pole = places[bodies[n]], motion.subtree_com[i, links.roots[n]]
+        a, b, c, u, v, w = total[links.last[n]]
+        x, y, z = place[0] - pole[0], place[1] - pole[1], place[2] - pole[2]
+        u, v, w = u + b * z - c * y, v + c * x - a * z, w + a * y - b * x
+        along = 0.0
+        if n + 1 < len(bodies):
+            ahead = places[bodies[n + 1]]
+            x, y, z = ahead[0] - place[0], ahead[1] - place[1], ahead[2] - place[2]
+            along = (u * x + v * y + w * z) / (x * x + y * y + z * z)
+        u, v, w = u - along * x, v - along * y, w - along * z
+        speed = math.sqrt(u * u + v * v + w * w)
+        speed += links.reach[n] * math.sqrt(a * a + b * b + c * c)
+        found = max(found, speed)
     return found

@@ -21,7 +21,7 @@ from cathsim_dmc.physics import vessel as vessels
 from cathsim_dmc.physics.effects import Layout, World, of_kind
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import ModelIndex, Readings, merged, part
-from cathsim_dmc.physics.sliding import SingleDevice
+from cathsim_dmc.physics.single_device import SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, Stepper
 from cathsim_dmc.tasks import cameras, observations, physics_errors
 from cathsim_dmc.tasks.cases import Case
@@ -222,7 +222,6 @@ class Rollout(Restorable):
             )
         self._open[:] = True
         self._previous_action, self._action = self._action, action
-        self._devices.pose_robot()
         for effect in self.effects:
             action = effect.act(action, self.readings)
             if action is None:
