@@ -96,7 +96,10 @@ class CommonChain:
             )
             _continued(own, state.centreline[part], self._behind, out)
 
-        rows.each(len(force), continue_)
+        if len(force) < rows.MANY:
+            _continued(arrays, state.centreline, self._behind, found)
+        else:
+            rows.each(len(force), continue_)
         return found
 
     def tracked(self, line: np.ndarray) -> np.ndarray:

@@ -121,6 +121,9 @@ class Rollout(Restorable):
         self._cameras = cameras.opened(
             model, config.cameras, self._names, self.index.geoms, scene.catheter.coaxial
         )
+        inside = [name.startswith("endoluminal") for name in self._names]
+        self._has_endoluminal = any(inside)
+        self._has_views = self._cameras is not None or self._has_endoluminal
         self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
@@ -340,8 +343,9 @@ class Rollout(Restorable):
             sensors.capture(
                 rows, begins, points, self.shadows, handles, random, self.around, last
             )
-        for name, view in self._views(rows).items() if len(rows) else ():
-            sensors.hold(name, view, rows)
+        if self._has_views and len(rows):
+            for name, view in self._views(rows).items():
+                sensors.hold(name, view, rows)
         seen = self._at_rest(state) if self._tracking.deviation else self.resting
         self.progress.see(rows, begins, self._case_of, seen, sensors.images)
         ahead = self.progress.ahead(self._case_of, seen, devices)
@@ -356,7 +360,7 @@ class Rollout(Restorable):
         moving, state, seen = self.moving, self.readings, {}
         if self._cameras is not None:
             seen = self._cameras.see(indices, self._stepper, state)
-        if not any(name.startswith("endoluminal") for name in self._names):
+        if not self._has_endoluminal:
             return seen
         grey, distance = endoluminal.views(
             [self.case(index).scene.anatomy.lumen for index in indices],
