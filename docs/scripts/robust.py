@@ -68,7 +68,9 @@ def arches(rows):
                 f"| `{policy}` | {row['goal'].upper()} | {row['access']} "
                 f"| {pooled([row])} | {figures([row])}"
             )
-        lines.append(f"| `{policy}` | all | both | {pooled(own)} | {figures(own)}")
+        access = {row["access"] for row in own}
+        access = "both" if len(access) > 1 else access.pop()
+        lines.append(f"| `{policy}` | all | {access} | {pooled(own)} | {figures(own)}")
     return lines
 
 
