@@ -208,6 +208,7 @@ class Selection:
             default.
         max_steps: Number of control steps after which an episode is cut off; that of
             the task by default.
+        episodes: Number of episodes of a cell of `anatomies` or `changes`.
     """
 
     only: tuple[Part, ...] = ("arches", "variants", "anatomies", "changes")
@@ -216,14 +217,17 @@ class Selection:
     pair: bool = False
     pool: int | None = None
     max_steps: int | None = None
+    episodes: int = 20
 
     def cells(self):
         """The cells in turn."""
         makers = {
             "arches": lambda: arches(self.pool, self.pair),
             "variants": lambda: variants(self.pair),
-            "anatomies": lambda: anatomies(self.anatomy, self.pair, self.goals),
-            "changes": lambda: changes(self.pair),
+            "anatomies": lambda: anatomies(
+                self.anatomy, self.pair, self.goals, self.episodes
+            ),
+            "changes": lambda: changes(self.pair, self.episodes),
         }
         for cell in (cell for part in self.only for cell in makers[part]()):
             labels, options = dict(cell.labels), dict(cell.options)
