@@ -68,9 +68,7 @@ def arches(rows):
                 f"| `{policy}` | {row['goal'].upper()} | {row['access']} "
                 f"| {pooled([row])} | {figures([row])}"
             )
-        access = {row["access"] for row in own}
-        access = "both" if len(access) > 1 else access.pop()
-        lines.append(f"| `{policy}` | all | {access} | {pooled(own)} | {figures(own)}")
+        lines.append(f"| `{policy}` | all | both | {pooled(own)} | {figures(own)}")
     return lines
 
 
@@ -133,6 +131,23 @@ def weakest(rows):
     return lines if len(lines) > 2 else ["None."]
 
 
+def pairs(rows):
+    """A guidewire in a catheter: a row for each cell, those that fail most first."""
+    lines = [
+        f"| policy | anatomy | branch | success, % (95 %), episodes {_FIGURES}",
+        "|---" * 8 + "|",
+    ]
+    for row in sorted(
+        rows, key=lambda r: (r["success"] / r["episodes"], r["safe"][0] / r["episodes"])
+    ):
+        place = row.get("anatomy") or "held-out arches"
+        lines.append(
+            f"| `{row['policy']}` | {place} | {row['goal'].upper()} "
+            f"| {pooled([row])} | {figures([row])}"
+        )
+    return lines
+
+
 def changes(rows):
     """One change at a time: success of each policy."""
     names = list(dict.fromkeys(row["policy"] for row in rows))
@@ -162,6 +177,8 @@ def main():
         lines = (json.dumps(row) for row in rows.values())
         files.write_text(DATA, "\n".join(lines) + "\n")
     page = PAGE.read_text()
+    coaxial = [row for row in rows.values() if row.get("devices")]
+    rows = {key: row for key, row in rows.items() if row not in coaxial}
     makers = {"arches": arches, "anatomies": anatomies, "changes": changes}
     found = {
         name: make([row for row in rows.values() if row["part"] == name])
@@ -171,6 +188,7 @@ def main():
     found["weakest"] = weakest([r for r in varied if r["part"] == "anatomies"])
     found["devices"] = devices(varied)
     found["kinds"] = kinds([r for r in varied if r["part"] != "anatomies"])
+    found["pair"] = pairs([r for r in coaxial if r["part"] in ("arches", "anatomies")])
     for name, lines in found.items():
         block = "\n".join([f"<!-- {name} -->", *lines, f"<!-- end of {name} -->"])
         pattern = f"<!-- {name} -->.*<!-- end of {name} -->"
