@@ -30,6 +30,7 @@ class TaskOptions:
             test_variants (`arch_…`, `femoral_arch_…`).
         pool: Number of arches that episodes draw from (the same tasks).
         first: Number in the set of the first of them (the same tasks).
+        numbers: Their numbers in the set, in place of pool and first.
     """
 
     anatomy: Annotated[str | None, conf.arg(aliases=("--phantom",))] = None
@@ -38,6 +39,7 @@ class TaskOptions:
     arches: str | None = None
     pool: int | None = None
     first: int | None = None
+    numbers: tuple[int, ...] | None = None
 
     @property
     def given(self) -> dict[str, Any]:

@@ -258,6 +258,22 @@ def _fields(places, sizes):
 
 
 @compiled
+def _in_sheath(sheathed, fields, i):
+    """Takes over the hinges of a simulation as written, and holds those in the sheath.
+
+    A branch on None is dropped for an argument alone.
+    """
+    if sheathed is not None:
+        joints, free = sheathed.joints, sheathed.free[i]
+        for j in range(free.shape[1]):
+            for axis in range(2):
+                free[0, j, axis] = fields.jnt_stiffness[joints.joint[j, axis]]
+                free[1, j, axis] = fields.dof_damping[joints.dof[j, axis]]
+                free[2, j, axis] = fields.qpos_spring[joints.qpos[j, axis]]
+        hold_links(sheathed, i, i + 1)
+
+
+@compiled
 def settle(live, loads, state, rows, lays):
     """Settles coaxial devices, writes their chains, and holds the links in the sheath.
 
@@ -268,12 +284,7 @@ def settle(live, loads, state, rows, lays):
         rows: Number of the first simulation, and the number after that of the last.
         lays: Whether the devices have just been laid, see `laws.sliding.lay`.
     """
-    devices, scratch, chain, sheathed = (
-        live.devices,
-        live.scratch,
-        live.chain,
-        live.sheathed,
-    )
+    devices, scratch, chain = live.devices, live.scratch, live.chain
     for i in range(rows[0], rows[1]):
         if live.fields[i, 0] == 0:
             continue
@@ -292,14 +303,7 @@ def settle(live, loads, state, rows, lays):
             sliding.settle(devices, each, own, scratch, chain)
         fields = _fields(live.fields[i], live.sizes)
         chain_fields.write(fields, live.places, chain, stiffness, loss)
-        if sheathed is not None:
-            joints, free = sheathed.joints, sheathed.free[i]
-            for j in range(free.shape[1]):
-                for axis in range(2):
-                    free[0, j, axis] = fields.jnt_stiffness[joints.joint[j, axis]]
-                    free[1, j, axis] = fields.dof_damping[joints.dof[j, axis]]
-                    free[2, j, axis] = fields.qpos_spring[joints.qpos[j, axis]]
-            hold_links(sheathed, i, i + 1)
+        _in_sheath(live.sheathed, fields, i)
 
 
 @functools.cache

@@ -53,10 +53,10 @@ def arch_numbers(options: Mapping[str, Any]) -> tuple[int, ...]:
     Raises:
         ValueError: if numbers stand beside a pool or a first one, or are none.
     """
-    pool, first, numbers = map(options.get, ("pool", "first", "numbers"))
+    numbers, first = options.get("numbers"), options.get("first", 0)
     if numbers is None:
-        return tuple(range(first or 0, (first or 0) + (POOL if pool is None else pool)))
-    if pool is not None or first is not None:
+        return tuple(range(first, first + options.get("pool", POOL)))
+    if not {"pool", "first"}.isdisjoint(options):
         raise ValueError(
             "option numbers names the arches; leave out pool and first, which do so too"
         )
@@ -68,8 +68,8 @@ def arch_numbers(options: Mapping[str, Any]) -> tuple[int, ...]:
 
 def load_arches(
     arches: str = "train",
-    pool: int | None = None,
-    first: int | None = None,
+    pool: int = POOL,
+    first: int = 0,
     *,
     numbers: Sequence[int] | None = None,
     access: str = "ascending",
@@ -78,9 +78,8 @@ def load_arches(
 
     Args:
         arches: Name of the set: "train", "test" or "test_variants".
-        pool: Number of arches, `POOL` by default; building one takes about a second
-            and a half.
-        first: Number of the first one in the set, 0 by default.
+        pool: Number of arches; building one takes about a second and a half.
+        first: Number of the first one in the set.
         numbers: Numbers of the arches in the set, in place of pool and first.
         access: Where the device enters, "ascending" or "descending"; "any" for one and
             the other in turn, by the number in the set.
@@ -94,12 +93,13 @@ def load_arches(
 
     bounds.choice("access", access, ("any", *ACCESSES))
     seeds = arch.arch_set(bounds.choice("arches", arches, arch.SETS))
-    if numbers is None:
-        count = POOL if pool is None else pool
-        bounds.whole(f"pool of arches {arches!r}", count, 1, len(seeds))
-        bounds.whole(f"first of arches {arches!r}", first or 0, 0, len(seeds) - count)
+    chosen = {"numbers": numbers}
+    if numbers is None or (pool, first) != (POOL, 0):
+        bounds.whole(f"pool of arches {arches!r}", pool, 1, len(seeds))
+        bounds.whole(f"first of arches {arches!r}", first, 0, len(seeds) - pool)
+        chosen |= {"pool": pool, "first": first}
     found = []
-    for number in arch_numbers({"pool": pool, "first": first, "numbers": numbers}):
+    for number in arch_numbers(chosen):
         bounds.whole(f"numbers of arches {arches!r}", number, 0, len(seeds) - 1)
         way = ACCESSES[number % 2] if access == "any" else access
         anatomy = arch.build_seed(seeds[number], access=way)
@@ -111,7 +111,7 @@ def load_arches(
     if closed:
         raise ValueError(
             f"no sheath fits before the inlet of {', '.join(closed)}, whose aorta "
-            "bends back across it; give others by first or numbers, or a smaller pool"
+            "bends back across it; give another first, or a smaller pool"
         )
     return found
 
