@@ -271,9 +271,9 @@ def test_the_cells_of_the_varied_protocol_are_those_of_one_machine(nodes, tmp_pa
     lines = []
     for name, ray in (("alone", False), ("cluster", True)):
         out = tmp_path / f"{name}.jsonl"
-        options = {"anatomy": ("simple1",), "max_steps": 5, "ray": ray}
-        robust.main("random", out, only=("anatomies",), **options)
-        robust.main("random", out, only=("anatomies",), **options)  # nothing is left
+        cells = robust.Selection(only=("anatomies",), anatomy=("simple1",), max_steps=5)
+        robust.main("random", out, cells, ray=ray)
+        robust.main("random", out, cells, ray=ray)  # nothing is left
         lines.append([json.loads(line) for line in out.read_text().splitlines()])
         for line in lines[-1]:
             line.pop("seconds")

@@ -166,5 +166,6 @@ def test_a_deep_link_copies_its_own_state_only(monkeypatch):
 
     monkeypatch.setattr(type(batch.stepper), "states", count)
     depth, warned = np.full(16, 2.9e-4), np.zeros(16, bool)
-    batch.stepper._depth_at_end(depth, warned, 3e-4)
+    way, _ = batch.stepper._way(np.zeros(16), depth, 3e-4)
+    batch.stepper._depth_at_end(depth, way, warned, 3e-4)
     assert copied == [4]

@@ -35,11 +35,18 @@ def test_an_impact_in_shorter_steps_is_not_as_deep(monkeypatch):
 def test_what_goes_deep_in_the_last_physics_step_is_seen():
     batch = BatchSimulation(suite.make_task("type1_lcca"), 1, num_threads=1)
     batch.reset()
-    before, given = np.array([1e-4]), (np.array([False]), forces.DEEPEST)
+    before, calm = np.array([1e-4]), np.zeros(1)
+
+    def depth_at_end():
+        way, doubt = batch.stepper._way(calm, before, forces.DEEPEST)
+        given = way, np.array([False]), forces.DEEPEST
+        return batch.stepper._depth_at_end(before.copy(), *given), doubt
+
     batch.batch.qpos[:, batch.rollout.index.insertion_qpos] += 0.1
-    assert batch.stepper._depth_at_end(before.copy(), *given) == before
+    assert depth_at_end() == (before, False)
     batch.batch.qvel[:, batch.rollout.index.dofs.start] = 1.0
-    assert batch.stepper._depth_at_end(before.copy(), *given) > 1e-3
+    depth, doubt = depth_at_end()
+    assert depth > 1e-3 and doubt
 
 
 @pytest.mark.parametrize(

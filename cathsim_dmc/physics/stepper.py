@@ -121,13 +121,10 @@ class Stepper(abc.ABC):
         """
         warned, (force, depth) = self._warned(), self._forces()
         limit = forces.DEEPEST if self.deepest is None else self.deepest
-        limits = forces.HARDEST, limit, self._timestep
-        few = len(depth) < rows.MANY
-        if few and not _in_doubt(
-            force.peak_max, depth, limits, self._motion, self._links
-        ):
+        way, doubt = self._way(force.peak_max, depth, limit)
+        if not doubt:
             return force, warned
-        depth = self._depth_at_end(depth, warned, limit)
+        depth = self._depth_at_end(depth, way, warned, limit)
         again: list[tuple[np.ndarray, forces.WallForce]] = []
         # Half the step usually suffices for a compliant wall.
         for parts in (forces.REFINEMENT,) if self.deepest is None else (2, 8):
@@ -212,20 +209,43 @@ class Stepper(abc.ABC):
         finally:
             self._change(indices, "disableflags", lambda flags: flags & ~_ACTUATION)
 
-    def _depth_at_end(
-        self, depth: np.ndarray, warned: np.ndarray, limit: float
-    ) -> np.ndarray:
-        """Depth (N,) m of the deepest contact in a control step, and at its end.
+    def _way(
+        self, peak: np.ndarray, depth: np.ndarray, limit: float
+    ) -> tuple[np.ndarray, bool]:
+        """Largest way (N,) m of places of the devices in the last physics step.
 
-        Contacts are looked for once more where a link may have gone too deep.
+        Args:
+            peak: (N,), largest force of a contact in the control step, N.
+            depth: (N,), m, of the deepest contact in it.
+            limit: Depth above which a control step is too coarse, m.
+
+        Returns:
+            The way but along the devices themselves, and whether any of the control
+            steps was too coarse, or may end too deep.
         """
-        way = np.empty_like(depth)
+        limits, way = (forces.HARDEST, limit, self._timestep), np.empty_like(depth)
+        if len(way) < rows.MANY:
+            motion, links = self._motion, self._links
+            return way, _in_doubt(peak, depth, limits, motion, links, way)
+        doubt: list[bool] = []
 
         def measure(part: slice) -> None:
             motion = _Motion._make(each[part] for each in self._motion)
-            way[part] = self._timestep * _fastest(motion, self._links)
+            links, own = self._links, way[part]
+            found = _in_doubt(peak[part], depth[part], limits, motion, links, own)
+            doubt.append(found)
 
         rows.each(len(way), measure)
+        return way, any(doubt)
+
+    def _depth_at_end(
+        self, depth: np.ndarray, way: np.ndarray, warned: np.ndarray, limit: float
+    ) -> np.ndarray:
+        """Depth (N,) m of the deepest contact in a control step, and at its end.
+
+        Contacts are looked for once more where a link may have gone too deep on its
+        way (N,) m of the last physics step.
+        """
         suspect = (depth + way > limit) & (depth <= limit) & ~warned
         indices = np.flatnonzero(suspect)
         states = self.states(indices) if indices.size else ()
@@ -397,7 +417,7 @@ def _moving(model: mujoco.MjModel) -> _Links:
 
 
 @compiled
-def _in_doubt(peak, depth, limits, motion, links):
+def _in_doubt(peak, depth, limits, motion, links, way):
     """Whether one of N control steps was too coarse, or may end too deep.
 
     Args:
@@ -406,24 +426,15 @@ def _in_doubt(peak, depth, limits, motion, links):
         limits: Of force, N, of depth, m, and the physics step, s.
         motion: `_Motion`.
         links: `_Links`.
+        way: (N,), m, is given the largest way of places of the devices in a physics
+            step, but along themselves.
     """
     hardest, deepest, timestep = limits
-    total = np.empty((len(links.parents), 6))
+    total, doubt = np.empty((len(links.parents), 6)), False
     for i in range(len(peak)):
-        if peak[i] > hardest or depth[i] > deepest:
-            return True
-        if depth[i] + timestep * _speed(motion, links, i, total) > deepest:
-            return True
-    return False
-
-
-@compiled
-def _fastest(motion, links):
-    """Largest velocity (N,) m/s of places of N devices, but along themselves."""
-    found, total = np.empty(len(motion.qvel)), np.empty((len(links.parents), 6))
-    for i in range(len(found)):
-        found[i] = _speed(motion, links, i, total)
-    return found
+        way[i] = timestep * _speed(motion, links, i, total)
+        doubt |= peak[i] > hardest or depth[i] + way[i] > deepest
+    return doubt
 
 
 @compiled
