@@ -6,18 +6,16 @@
 
 import abc
 import functools
-import math
 import types
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from cathsim_dmc import rows
-from cathsim_dmc.compiled import compiled
 from cathsim_dmc.entities.chain import TIMESTEP
-from cathsim_dmc.physics import forces, readings
+from cathsim_dmc.physics import deep_links, forces, readings
 
 PHYSICS_TIMESTEP = TIMESTEP
 CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
@@ -56,7 +54,7 @@ class Stepper(abc.ABC):
         self._before = self._warnings_before = np.empty(0)
         self._timestep, self._scratch = model.opt.timestep, mujoco.MjData(model)
         self._wall = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "wall")
-        self._links = _moving(model)
+        self._links = deep_links.moving(model)
 
     @abc.abstractmethod
     def _model_of(self, index: int) -> mujoco.MjModel:
@@ -141,8 +139,10 @@ class Stepper(abc.ABC):
         return force, warned
 
     @functools.cached_property
-    def _motion(self) -> "_Motion":  # a batch looks for each of them every time
-        return _Motion._make(getattr(self.arrays, name) for name in _Motion._fields)
+    def _motion(self) -> deep_links.Motion:  # a batch looks for each of them every time
+        return deep_links.Motion._make(
+            getattr(self.arrays, name) for name in deep_links.Motion._fields
+        )
 
     def _forces(self) -> tuple[forces.WallForce, np.ndarray]:
         """Force on the wall over a control step, and its deepest contact (N,), m."""
@@ -226,13 +226,15 @@ class Stepper(abc.ABC):
         limits, way = (forces.HARDEST, limit, self._timestep), np.empty_like(depth)
         if len(way) < rows.MANY:
             motion, links = self._motion, self._links
-            return way, _in_doubt(peak, depth, limits, motion, links, way)
+            return way, deep_links.in_doubt(peak, depth, limits, motion, links, way)
         doubt: list[bool] = []
 
         def measure(part: slice) -> None:
-            motion = _Motion._make(each[part] for each in self._motion)
+            motion = deep_links.Motion._make(each[part] for each in self._motion)
             links, own = self._links, way[part]
-            found = _in_doubt(peak[part], depth[part], limits, motion, links, own)
+            found = deep_links.in_doubt(
+                peak[part], depth[part], limits, motion, links, own
+            )
             doubt.append(found)
 
         rows.each(len(way), measure)
@@ -374,91 +376,3 @@ class SingleStepper(Stepper):
 
     def _forward(self, indices: np.ndarray) -> None:
         mujoco.mj_forward(self._model, self._data)
-
-
-class _Motion(NamedTuple):
-    """Views (N, ...) of what moves the links of N devices, with MuJoCo's names."""
-
-    qvel: Any
-    cdof: Any
-    xpos: Any
-    subtree_com: Any
-
-
-class _Links(NamedTuple):
-    """The M links that can touch a wall.
-
-    Attributes:
-        parents: (nv,), degree of freedom before each of the model.
-        bodies: (M,), numbers of the links among all bodies.
-        last: (M,), degree of freedom that moves each last.
-        roots: (M,), first bodies of their kinematic trees.
-        reach: (M,), m, farthest places from the origins of the bodies.
-    """
-
-    parents: Any
-    bodies: Any
-    last: Any
-    roots: Any
-    reach: Any
-
-
-def _moving(model: mujoco.MjModel) -> _Links:
-    """The links of a model that can touch a wall."""
-    links = np.flatnonzero((model.geom_contype == 0) & (model.geom_conaffinity != 0))
-    bodies, last = model.geom_bodyid[links], []
-    for body in bodies:
-        while model.body_dofnum[body] == 0:
-            body = model.body_parentid[body]
-        last.append(model.body_dofadr[body] + model.body_dofnum[body] - 1)
-    reach = np.linalg.norm(model.geom_pos[links], axis=1) + model.geom_size[links, 1]
-    roots = model.body_rootid[bodies]
-    return _Links(model.dof_parentid.copy(), bodies, np.array(last), roots, reach)
-
-
-@compiled
-def _in_doubt(peak, depth, limits, motion, links, way):
-    """Whether one of N control steps was too coarse, or may end too deep.
-
-    Args:
-        peak: (N,), largest force of a contact in it, N.
-        depth: (N,), m, of the deepest one.
-        limits: Of force, N, of depth, m, and the physics step, s.
-        motion: `_Motion`.
-        links: `_Links`.
-        way: (N,), m, is given the largest way of places of the devices in a physics
-            step, but along themselves.
-    """
-    hardest, deepest, timestep = limits
-    total, doubt = np.empty((len(links.parents), 6)), False
-    for i in range(len(peak)):
-        way[i] = timestep * _speed(motion, links, i, total)
-        doubt |= peak[i] > hardest or depth[i] + way[i] > deepest
-    return doubt
-
-
-@compiled
-def _speed(motion, links, i, total):
-    """Largest velocity of places of one device; `total` (nv, 6) is scratch."""
-    velocity, places, bodies = motion.qvel[i], motion.xpos[i], links.bodies
-    parents, found = links.parents, 0.0
-    for dof in range(len(parents)):
-        for k in range(6):
-            total[dof, k] = motion.cdof[i, dof, k] * velocity[dof]
-            if parents[dof] >= 0:
-                total[dof, k] += total[parents[dof], k]
-    for n in range(len(bodies)):
-        place, pole = places[bodies[n]], motion.subtree_com[i, links.roots[n]]
-        a, b, c, u, v, w = total[links.last[n]]
-        x, y, z = place[0] - pole[0], place[1] - pole[1], place[2] - pole[2]
-        u, v, w = u + b * z - c * y, v + c * x - a * z, w + a * y - b * x
-        along = 0.0
-        if n + 1 < len(bodies):
-            ahead = places[bodies[n + 1]]
-            x, y, z = ahead[0] - place[0], ahead[1] - place[1], ahead[2] - place[2]
-            along = (u * x + v * y + w * z) / (x * x + y * y + z * z)
-        u, v, w = u - along * x, v - along * y, w - along * z
-        speed = math.sqrt(u * u + v * v + w * w)
-        speed += links.reach[n] * math.sqrt(a * a + b * b + c * c)
-        found = max(found, speed)
-    return found
