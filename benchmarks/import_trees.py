@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -23,6 +24,8 @@ from cathsim_dmc.anatomy.scan.naming import BRANCHES
 from cathsim_dmc.anatomy.scan.topology import decimated
 from cathsim_dmc.anatomy.scan.units import UNITS
 from cathsim_dmc.anatomy.surface import lumen_surface
+from cathsim_dmc.cli.options import show
+from cathsim_dmc.validation.checks import Check, Report
 
 SEED = 4_800
 SCALES = (0.7, 1.0, 1.4)  # of the usual size
@@ -308,39 +311,53 @@ def places(note: str) -> Iterator[np.ndarray]:
         yield np.array([float(x) for x in found.groups()])
 
 
-def table(rows: list[dict]) -> str:
-    """Markdown: a line for each kind, and one for all."""
-    head = (
-        "| trees | number | unit guessed | asked | wrong | refused | vessels in the "
-        "tree | in a note | in neither | arch names | word on axes |\n"
-        "|---|---|---|---|---|---|---|---|---|---|---|"
-    )
+def report(rows: list[dict]) -> Report:
+    """What was found of all trees, and a table with a line for each kind."""
     kinds = dict.fromkeys(row["kind"] for row in rows)
-    groups = [(kind, [row for row in rows if row["kind"] == kind]) for kind in kinds]
-    lines = [head]
-    for kind, group in [*groups, ("**all**", rows)]:
-        fine = [row for row in group if "found" in row]
-        cells = [kind, len(group)]
-        cells += [sum(row["units"] == word for row in group) for word in ("guessed",)]
-        cells += [sum(row["units"] == "asked" for row in group)]
-        cells += [sum(not row["scale_right"] for row in fine)]
-        cells += [sum(row.get("refused", False) for row in group)]
-        cells += [sum(len(r[k]) for r in fine) for k in ("found", "noted", "missing")]
-        cells += [sum(bool(row[key]) for row in fine) for key in ("arch", "axes")]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines)
+    groups = {kind: [row for row in rows if row["kind"] == kind] for kind in kinds}
+    groups["**all**"] = rows
+    cells = {kind: counted(group) for kind, group in groups.items()}
+    every = cells["**all**"]
+    lines = [" | ".join(["| trees", *every, ""]), "|---" * (len(every) + 1) + "|"]
+    for kind, row in cells.items():
+        lines.append(" | ".join([f"| {kind}", *map(str, row.values()), ""]))
+    none = "unit wrong", "refused", "in neither", "arch names", "word on axes"
+    checks = [Check.at_most(name, every[name], 0) for name in none]
+    text = "\n".join(line.rstrip() for line in lines)
+    return Report("trees", checks, every | {"table": text})
 
 
-def main() -> None:
+def counted(rows: list[dict]) -> dict[str, int]:
+    """Trees and vessels by what an import made of them."""
+    fine = [row for row in rows if "found" in row]
+    return {
+        "number": len(rows),
+        "unit guessed": sum(row["units"] == "guessed" for row in rows),
+        "unit asked for": sum(row["units"] == "asked" for row in rows),
+        "unit wrong": sum(not row["scale_right"] for row in fine),
+        "refused": sum(row.get("refused", False) for row in rows),
+        "vessels in the tree": sum(len(row["found"]) for row in fine),
+        "in a note": sum(len(row["noted"]) for row in fine),
+        "in neither": sum(len(row["missing"]) for row in fine),
+        "arch names": sum(bool(row["arch"]) for row in fine),
+        "word on axes": sum(bool(row["axes"]) for row in fine),
+    }
+
+
+def main() -> int:
     """Run what is not in the file yet, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="JSON lines, one per case; resumed")
     parser.add_argument("--only", default="", help="part of a case's name")
     parser.add_argument("--seed", type=int, default=SEED, help="of the first case")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     chosen = [case for case in cases(options.seed) if options.only in case.name]
-    print(table(import_cases.resumed(options.out, chosen, run)))
+    found = report(import_cases.resumed(options.out, chosen, run))
+    if not options.json:
+        print(found.findings["table"])
+    return show(found, options.json)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -18,11 +19,14 @@ from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.naming import BRANCHES
+from cathsim_dmc.cli.options import show
+from cathsim_dmc.validation.checks import Check, Report
 
 ENTRY = 20e-3  # m, distance of the inlet from the end of the descending aorta
 LONG = 22e-3  # m past its ostium: shorter branches need no name
 CLEAR = 6e-3  # m past an ostium, from which on a vessel is told from its parent
 MARGIN = 15e-3  # m at the ends of the aorta at which its radius is not compared
+WORDS = ("right", "asked", "wrong", "refused")
 
 
 def run(case: Case) -> dict:
@@ -102,35 +106,44 @@ def whose(tree: VesselTree, points: np.ndarray) -> tuple[str, str]:
     return names[int(first)], names[int(last)]
 
 
-def table(rows: list[dict]) -> str:
-    """Markdown: a line for each kind of case, and one for all."""
+def report(rows: list[dict]) -> Report:
+    """Counts of all cases and of those that show their names, and their table."""
     groups = defaultdict(list)
     for row in rows:
         groups[row["kind"]].append(row)
+    shown = [row for row in rows if row["answer"] != ASK]
+    asks = [row for row in rows if row["answer"] == ASK]
+    groups["**all that show their names**"] = shown
+    groups["**all that must be asked for**"] = asks
     head = (
         "| cases | number | names right | asked | wrong | refused | entry right | "
         "radius of the aorta, error (median, mm) |\n|---|---|---|---|---|---|---|---|"
     )
-    asks = [row for row in rows if row["answer"] == ASK]
-    rest = [row for row in rows if row["answer"] != ASK]
-    lines = [_line(kind, group) for kind, group in groups.items()]
-    lines += [_line("**all that show their names**", rest)]
-    lines += [_line("**all that must be asked for**", asks)]
-    return "\n".join([head, *lines])
+    right = 100.0 * counted(shown)["right"] / max(len(shown), 1)
+    checks = [
+        Check.at_most("cases with a wrong name", counted(rows)["wrong"], 0),
+        Check.at_least("named right, of those that show their names", right, 95, "%"),
+    ]
+    findings = {"cases": len(rows), "show their names": len(shown)} | counted(shown)
+    lines = [head, *(_line(kind, group) for kind, group in groups.items())]
+    return Report("imports", checks, findings | {"table": "\n".join(lines)})
+
+
+def counted(rows: list[dict]) -> dict[str, int]:
+    """How many cases ended in each of `WORDS`."""
+    return {word: sum(row["names"] == word for row in rows) for word in WORDS}
 
 
 def _line(kind: str, rows: list[dict]) -> str:
-    count = {word: 0 for word in ("right", "asked", "wrong", "refused")}
-    for row in rows:
-        count[row["names"]] += 1
     entered = [row["entry"] for row in rows if "entry" in row]
     errors = [row["radius_error_mm"] for row in rows if row.get("radius_error_mm")]
     radius = f"{np.median(errors):.2f}" if errors else ""
-    cells = [kind, len(rows), *count.values(), f"{sum(entered)} of {len(entered)}"]
-    return "| " + " | ".join(map(str, [*cells, radius])) + " |"
+    cells = [kind, len(rows), *counted(rows).values()]
+    cells += [f"{sum(entered)} of {len(entered)}", radius]
+    return "| " + " | ".join(map(str, cells)) + " |"
 
 
-def main() -> None:
+def main() -> int:
     """Run what is not in the file yet, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="JSON lines, one per case; resumed")
@@ -139,12 +152,16 @@ def main() -> None:
         "--seed", type=int, default=import_cases.SEED, help="of the first case"
     )
     parser.add_argument("--part", default="0/1", help="k/n: every n-th case from k on")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     files.require_file(options.out)
     first, step = map(int, options.part.split("/"))
     chosen = [c for c in import_cases.cases(options.seed) if options.only in c.name]
-    print(table(import_cases.resumed(options.out, chosen[first::step], run)))
+    found = report(import_cases.resumed(options.out, chosen[first::step], run))
+    if not options.json:
+        print(found.findings["table"])
+    return show(found, options.json)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -8,8 +8,7 @@ from typing import Annotated, Literal
 from tyro import conf
 from tyro.extras import SubcommandApp
 
-from cathsim_dmc import bounds, files, style, suite
-from cathsim_dmc.anatomy import export as exported
+from cathsim_dmc import bounds, files, style
 from cathsim_dmc.anatomy import phantoms as shipped
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch, sampler
@@ -19,6 +18,7 @@ from cathsim_dmc.anatomy.tree_file import read_tree
 from cathsim_dmc.cli.options import Json, print_json, say, show
 from cathsim_dmc.entities import devices
 from cathsim_dmc.pictures.figure import anatomy_figure
+from cathsim_dmc.tasks.anatomies import load_anatomy
 
 phantoms = SubcommandApp()
 _FIRST = ("lcca", "bca")  # goals that are tried first
@@ -206,7 +206,7 @@ def check(
         figure = Path(phantom) / _PICTURE
     if figure is not None:
         files.require_place(figure.parent)
-    anatomy = suite.load_anatomy(phantom)
+    anatomy = load_anatomy(phantom)
     report = validate_anatomy(anatomy)
     code = show(report, json)
     if not json:
@@ -232,8 +232,10 @@ def export(
         wall: Pieces of the wall: prisms on the triangles of the surface, merged or as
             they are; or those of CoACD (extra `export`), which intrude farther.
     """
+    from cathsim_dmc.anatomy import export as exported  # not needed by an import
+
     files.require_file(out)
     exported.check_wall(wall)
-    found = exported.write_mjcf(suite.load_anatomy(phantom), out, wall)
+    found = exported.write_mjcf(load_anatomy(phantom), out, wall)
     print_json({"file": str(out), **found})
     return 0

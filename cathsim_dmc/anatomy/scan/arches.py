@@ -30,6 +30,8 @@ class Arch:
     entry: LumenEntry  # at the first of them; at the last if the first is a stump
     found: list[np.ndarray]  # `centrelines` from there on
     bend: Bend  # of the aorta, from there on
+    width: np.ndarray  # (n,) m, depth along the bend's line
+    branches: list[Offshoot]  # of the arch
     heart: float  # probability that the heart is at the last end
 
     @classmethod
@@ -87,12 +89,11 @@ class Arch:
         if heart is None:
             share = _shares(bend, width, branches)
             heart = sum(value for key, value in share.items() if key.heart_last)
-        return cls(ways, (first, last), entry, found, bend, heart)
+        return cls(ways, (first, last), entry, found, bend, width, branches, heart)
 
     def _unlike(self) -> str:
         """Why the bend is no aortic arch, or nothing."""
-        start, far = (end.position for end in self.ends)
-        bend, width, found = _branches(self.ways, start, far, self.found)
+        bend, width = self.bend, self.width
         limb = third_limb(self.ways, bend, width, self.found)
         if limb is not None:
             return (
@@ -100,7 +101,7 @@ class Arch:
                 f"{shown(limb[0])}, where that bends; the branches of an arch are much "
                 "narrower than the aorta"
             )
-        count = len(found)
+        count = len(self.branches)
         if bend.turn < aorta.TURN and mm(float(np.median(width))) > aorta.ADULT:
             # Cut off past its branches, where it would turn.
             count = len(list(departures(bend, width, self.found)))
@@ -138,7 +139,9 @@ class Arch:
         if root is not None and min(np.linalg.norm(ends - root, axis=1)) < 1e-6:
             gaps = -np.linalg.norm(ends - root, axis=1)
         toward = bool(gaps[1] >= gaps[0])
-        bend, width, found = _branches(self.ways, start, ends[toward], curves)
+        bend, width, found = self.bend, self.width, self.branches
+        if curves is not self.found or not toward:
+            bend, width, found = _branches(self.ways, start, ends[toward], curves)
         if not found:
             return Naming([f"branch_{k + 1}" for k in range(len(curves))])
         if self.heart < SURE:

@@ -93,7 +93,7 @@ def stump(ways: Ways, ends: Sequence[FreeEnd]) -> FreeEnd | None:
     traces = [ways.trace(before, ways.node(end.position)) for end in ends]
     centres = np.unique(np.concatenate(traces))
     places, reach = ways.points[centres], COVER * ways.depth[centres] + 1e-3
-    near = cKDTree(ways.points).query_ball_point(places, reach)
+    near = cKDTree(ways.points).query_ball_point(places, reach, return_sorted=False)
     beyond = ways.main.copy()
     beyond[np.concatenate(near).astype(int)] = False
     label = groups(len(beyond), ways.links[beyond[ways.links].all(axis=1)])

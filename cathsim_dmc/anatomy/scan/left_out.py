@@ -33,7 +33,7 @@ def left_out(ways: Ways, tree: VesselTree) -> list[LeftOut]:
     for vessel in tree.vessels.values():
         line = vessel.centreline
         reach = REACH[0] * line.radii + REACH[1]
-        near = lookup.query_ball_point(line.points, reach)
+        near = lookup.query_ball_point(line.points, reach, return_sorted=False)
         taken[np.concatenate(near).astype(int)] = True
     beyond = ways.main & ~taken
     links = ways.links[beyond[ways.links].any(axis=1)]
