@@ -1,6 +1,6 @@
 """Every figure of the pages comes from docs/data, and prose states no other."""
 
-import importlib.util
+import importlib
 import json
 import re
 from pathlib import Path
@@ -67,14 +67,31 @@ def stated_in(page):
             for one in row}  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def script():
+@pytest.fixture
+def script(monkeypatch):
     """The module docs/scripts/figures.py."""
-    path = ROOT / "docs" / "scripts" / "figures.py"
-    spec = importlib.util.spec_from_file_location("figures", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "scripts"))
+    return importlib.import_module("figures")
+
+
+@pytest.fixture
+def history(script, monkeypatch, tmp_path):
+    """The module freshness.py over a history of a law and of a note."""
+    freshness = importlib.import_module("freshness")
+    monkeypatch.setattr(script, "ROOT", tmp_path)
+    who = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+    script.git("init", "-q")
+    commits = []
+    for name, text in [("law", "1"), ("note", "1"), ("law", "2"), ("law", "3")]:
+        (tmp_path / name).write_text(text)
+        script.git("add", ".")
+        script.git(*who, "commit", "-qm", text)
+        commits.append(script.git("rev-parse", "--short", "HEAD").stdout.strip())
+    freshness._has_moved.cache_clear()
+    table = {"parts": {"laws": ["law"], "notes": ["note"]}, "equal": []}
+    monkeypatch.setattr(freshness, "TABLE", table)
+    yield freshness, commits
+    freshness._has_moved.cache_clear()
 
 
 def test_the_pages_hold_the_figures_of_their_data(script):
@@ -82,6 +99,36 @@ def test_the_pages_hold_the_figures_of_their_data(script):
         assert page.read_text() == text, (
             f"{page.name} is out of date; run docs/scripts/figures.py"
         )
+
+
+def test_a_figure_is_older_than_a_change_of_its_files(history):
+    freshness, (first, noted, second, third) = history
+    assert freshness.moved(["laws", "notes"], first) == ["laws", "notes"]
+    assert freshness.moved(["laws", "notes"], noted) == ["laws"]
+    assert freshness.moved(["laws"], third) == []
+    assert freshness.moved(["laws"], "0123abc") == ["laws"]
+
+
+def test_equal_results_keep_a_figure_in_date(history, script):
+    freshness, (first, noted, second, third) = history
+    span = {"parts": ["laws"], "first": second, "last": third}
+    freshness.TABLE["equal"].append(span)
+    assert freshness.moved(["laws"], second) == []
+    assert freshness.moved(["laws"], noted) == ["laws"]
+    (script.ROOT / "law").write_text("4")  # not committed yet
+    freshness._has_moved.cache_clear()
+    assert freshness.moved(["laws"], second) == ["laws"]
+
+
+def test_every_quoted_figure_depends_on_known_parts(script):
+    table = json.loads((ROOT / "docs" / "data" / "depends.json").read_text())
+    known = set(table["parts"])
+    for _, parts in table["figures"]:
+        assert set(parts) <= known
+    for pattern, parts in table["files"].items():
+        assert set(parts) <= known and list(ROOT.glob(pattern)), pattern
+    for paths in table["parts"].values():
+        assert all((ROOT / path.removeprefix(":!")).exists() for path in paths)
 
 
 def test_every_figure_has_its_origin(script):

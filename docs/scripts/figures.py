@@ -167,23 +167,39 @@ def written() -> dict[Path, str]:
             lines = [since(report), "", *table(report["checks"])]
             text = between(text, f"report {name}", "\n".join(lines))
         texts[page] = text
+    import freshness  # late: it imports this module
+
     page = ROOT / "docs" / "figures.md"
-    texts[page] = between(texts[page], "figures", sources(known))
+    if freshness.has_history():
+        texts[page] = between(texts[page], "figures", sources(known))
     return texts
 
 
+def quoted() -> set[str]:
+    """Names of the figures that some page quotes."""
+    return {m[1] for page in pages() for m in QUOTED.finditer(page.read_text())}
+
+
 def sources(known: dict[str, dict]) -> str:
-    """The table of the figures that some page quotes, with their origin."""
-    rows = ["| figure | value | command | date | commit |", "|---|---|---|---|---|"]
-    quoted = {m[1] for page in pages() for m in QUOTED.finditer(page.read_text())}
-    for name in sorted(quoted):
+    """The table of the figures that some page quotes, with their origin and age."""
+    import freshness  # late: it imports this module
+
+    names = sorted(quoted())
+    rows = [
+        *freshness.summary(names, known),
+        "",
+        "| figure | value | command | date | commit | changed since |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name in names:
         one = known[name]
         value = one["value"]
         form = ",.0f" if not isinstance(value, str) and value >= 1000 else ".3g"
         shown = value if isinstance(value, str) else format(value, form)
         rows.append(
             f"| {name} | {shown} {one['unit']} | `{one['command']}` | {one['date']} "
-            f"| {one['commit']} |"
+            f"| {one['commit']} "
+            f"| {', '.join(freshness.moved(freshness.parts_of(name), one['commit']))} |"
         )
     return "\n".join(rows)
 

@@ -1,0 +1,119 @@
+"""Whether anything that a figure depends on has changed since it was measured.
+
+    python docs/scripts/freshness.py  # lists what has; exits with 1 if there is any
+
+`docs/data/depends.json` says which files of the package each figure depends on, and
+between which commits a part of them gave the same results although its files changed.
+The files as they are now are compared with those of the commit of the figure.
+"""
+
+import fnmatch
+import functools
+import json
+import sys
+
+import figures
+
+TABLE = json.loads((figures.DATA / "depends.json").read_text())
+
+
+def parts_of(name: str) -> list[str]:
+    """Parts of the package that a figure depends on; the first pattern counts."""
+    patterns = TABLE["figures"]
+    return next(parts for one, parts in patterns if fnmatch.fnmatchcase(name, one))
+
+
+def moved(parts: list[str], commit: str) -> list[str]:
+    """Those parts whose results may differ from those at a commit.
+
+    Args:
+        parts: Names of parts.
+        commit: Of the measurement; with "+" where files differed from it.
+
+    Returns:
+        All parts where the commit is not in the history.
+    """
+    return [part for part in parts if _has_moved(part, commit.rstrip("+"))]
+
+
+@functools.cache
+def _has_moved(part: str, commit: str) -> bool:
+    for span in TABLE["equal"]:
+        inside = _is_before(span["first"], commit) and _is_before(commit, span["last"])
+        if part in span["parts"] and inside:
+            commit = span["last"]
+    changed = figures.git("diff", "--quiet", commit, "--", *TABLE["parts"][part])
+    return changed.returncode != 0
+
+
+def _is_before(first: str, last: str) -> bool:
+    return not figures.git("merge-base", "--is-ancestor", first, last).returncode
+
+
+def has_history() -> bool:
+    """Whether the commits of the table are here: not in an archive or shallow clone."""
+    ends = {span[key] for span in TABLE["equal"] for key in ("first", "last")}
+    return all(_is_before(end, "HEAD") for end in ends)
+
+
+def files() -> dict[str, list[str]]:
+    """Parts that have moved since each file of results was written."""
+    found = {}
+    for pattern, parts in TABLE["files"].items():
+        for path in sorted(figures.ROOT.glob(pattern)):
+            name = str(path.relative_to(figures.ROOT))
+            found[name] = moved(parts, _commit(path))
+    return found
+
+
+def _commit(path) -> str:
+    """Commit that a file names, else the one that brought it."""
+    if path.suffix == ".json" and "commit" in (own := json.loads(path.read_text())):
+        return own["commit"]
+    return figures.git("log", "-1", "--format=%h", "--", str(path)).stdout.strip()
+
+
+def summary(names: list[str], known: dict[str, dict]) -> list[str]:
+    """What the page of the figures says of their age, by the parts that moved."""
+    old = {name: moved(parts_of(name), known[name]["commit"]) for name in names}
+    count = sum(map(bool, old.values()))
+    lines = [
+        f"Of {len(names)} figures {count} are older than the last change of what they "
+        "depend on (last column; `docs/data/depends.json` says what that is). Files of "
+        "results older than such a change:",
+        "",
+        "| files | older | changed since |",
+        "|---|---|---|",
+    ]
+    groups = {}
+    for name, parts in files().items():
+        groups.setdefault(name.rpartition("/")[0], []).append((name, parts))
+    for folder, rows in groups.items():
+        for name, parts in rows if len(rows) < 10 else ():
+            lines.append(f"| `{name}` | {'yes' if parts else 'no'} | {_shown(parts)} |")
+        if len(rows) >= 10:
+            parts = sorted({part for _, each in rows for part in each})
+            older = sum(bool(each) for _, each in rows)
+            lines.append(f"| `{folder}` | {older} of {len(rows)} | {_shown(parts)} |")
+    return lines
+
+
+def _shown(parts: list[str]) -> str:
+    return ", ".join(parts) or "–"
+
+
+def main() -> int:
+    """Prints what is older than a change, and returns the exit status."""
+    old = {
+        name: moved(parts_of(name), one["commit"])
+        for name, one in figures.figures().items()
+        if name in figures.quoted()
+    } | files()
+    for name, parts in old.items():
+        if parts:
+            print(f"{name}: {_shown(parts)}")
+    return int(any(old.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
