@@ -127,7 +127,7 @@ def build(
 
     Args:
         tree: Vessel tree in JSON: centrelines, radii, parents, inlets, goals
-            (docs/anatomies.md has the format).
+            (docs/anatomy_files.md has the format).
         out: Directory of the anatomy.
         access: Inlet of the file that the device enters by; the first if left out.
     """

@@ -1,4 +1,4 @@
-"""Writes the tables and pictures of docs/anatomies.md.
+"""Writes the tables and pictures of docs/anatomies.md and docs/arches.md.
 
 python docs/scripts/anatomies.py
 """
@@ -20,7 +20,7 @@ from cathsim_dmc.pictures.figure import anatomy_figure, draw_anatomy
 from cathsim_dmc.validation import wall
 
 ROOT = Path(__file__).parents[1]
-PAGE, IMAGES = ROOT / "anatomies.md", ROOT / "images"
+PAGE, ARCHES, IMAGES = ROOT / "anatomies.md", ROOT / "arches.md", ROOT / "images"
 MEASUREMENTS = ROOT.parent / "tests/data/measured"
 MAIN = ("bca", "lcca", "lsa")
 
@@ -194,9 +194,9 @@ def main():
         "shapes": shapes(anatomies),
         "fields": fields(anatomies),
         "against measured": against_measured(),
-        "distributions": distributions(),
     }
     figures.put(PAGE, **blocks)
+    figures.put(ARCHES, distributions=distributions())
 
 
 if __name__ == "__main__":
