@@ -19,7 +19,10 @@ FORMULAS = sorted(page.name for page in DOCS.glob("*.md") if "$`" in page.read_t
                   or "```math" in page.read_text())  # fmt: skip
 _BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 # Pages whose Python blocks run one after the other in one interpreter.
-SNIPPETS = ["README.md", "docs/index.md", "docs/concepts.md", "docs/how-to.md"]
+SNIPPETS = [
+    "README.md",
+    *(f"docs/{name}.md" for name in ("index", "concepts", "how-to", "gymnasium")),
+]
 
 
 def run(arguments, folder):
