@@ -92,7 +92,7 @@ def test_a_policy_draws_the_same_for_each_device():
 
 def test_the_plan_follows_from_the_measured_costs():
     report = json.loads(cluster_plan.DATA.read_text())
-    page = (cluster_plan.DATA.parents[1] / "cluster.md").read_text()
+    page = (cluster_plan.DATA.parents[1] / "cluster_costs.md").read_text()
     for table in cluster_plan.tables(report["findings"]):
         assert "\n".join(table) in page, "run docs/scripts/cluster.py --write"
     usual = cluster_plan.Assumptions()

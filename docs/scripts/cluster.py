@@ -1,4 +1,4 @@
-"""Measures the costs of a cluster for docs/cluster.md and writes its tables.
+"""Measures the costs of a cluster for docs/cluster_costs.md and writes its tables.
 
 python docs/scripts/cluster.py          (with nothing else running)
 python docs/scripts/cluster.py --write  (the tables alone, from docs/data)
@@ -13,7 +13,7 @@ import figures
 sys.path.insert(0, str(figures.ROOT / "benchmarks"))
 import cluster_plan  # noqa: E402
 
-PAGE = figures.ROOT / "docs" / "cluster.md"
+PAGE = figures.ROOT / "docs" / "cluster_costs.md"
 COMMAND = "benchmarks/cluster_costs.py"
 
 
