@@ -1,4 +1,4 @@
-"""Drives a device over TCP with nothing but the standard library (docs/robots.md).
+"""Drives a device over TCP by the standard library alone (docs/robot_messages.md).
 
     cathsim serve type1_lcca --observation tracking   # in one terminal
     python examples/drive_by_socket.py                # in another

@@ -1,7 +1,7 @@
 """Messages between a device and its driver: JSON objects over TCP, length first.
 
 A frame is the number of bytes that follow, unsigned, 4 bytes, big-endian, and a JSON
-object in UTF-8 with a "kind" (docs/robots.md). Numbers are finite.
+object in UTF-8 with a "kind" (docs/robot_messages.md). Numbers are finite.
 """
 
 import base64

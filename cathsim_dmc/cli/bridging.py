@@ -41,7 +41,7 @@ def serve(
 ) -> int:
     """Serve a task as a device over TCP, for a driver in another program.
 
-    The messages are in docs/robots.md. One driver after the other; there is no
+    The messages are in docs/robot_messages.md. One driver after the other; there is no
     password, so other machines are let in by --host alone.
 
     Args:
