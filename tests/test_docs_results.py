@@ -57,6 +57,9 @@ def test_ours_stands_beside_the_published(page, tmp_path):
     ]
     theirs = [ours[place].split(" / ")[1] for place in (2, 4, 7, 8)]
     assert theirs == ["53 %", "-70 ± 28", "11 ± 21", "121 ± 95"]
+    # What falls short stands first.
+    assert line_of(main, "PPO-Internal (2)", " of ")[3] == "90 %"
+    assert main.index("PPO-Internal (2)") < main.index("## Success")
     assert "2 of the 38 cells" in text or re.search(r"\n2 of the \d+ cells", text)
     missing = line_of(text, "- PPO-Internal: type1_lcca (seed 0, 1, 2)")[0]
     assert "type1_bca (seed 2)" in missing
