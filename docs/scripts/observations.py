@@ -25,9 +25,9 @@ PAIR_TASK = "type1_bca_pair"
 
 INTRODUCTION = f"""# Observations
 
-`docs/scripts/observations.py` generates this page from the specs of `{TASK}`.
-
-A name or a list of names selects the observation:
+This page lists what a policy can observe: entries with shape, type, range and unit, the
+options of images and cameras, and what can be randomised. A name or a list of names
+selects the observation:
 
 ```python
 from cathsim_dmc import suite
@@ -38,16 +38,17 @@ env = suite.load("cathsim", "{TASK}", task_kwargs={{
 }})
 ```
 
-The world frame is that of the patient (LPS): +x to the patient's left, +y posterior,
-+z superior. Joints and links run from proximal to distal. Positions and velocities of
-joints are those at the end of the control step, all other values those of its last
-physics step.
+- **Frames.** The world frame is that of the patient (LPS): +x to the patient's left, +y
+  posterior, +z superior. Joints and links run from proximal to distal.
+- **Time.** Positions and velocities of joints are those at the end of the control step,
+  wall forces its means, all other values those of its last physics step.
+- **Length.** A task simulates what can leave the sheath (`working_length`, 0.14 to
+  0.32 m). Observations show a device of {COMMON_LENGTH:g} m, so their shapes depend
+  on the device and `shaft_link` alone: behind the simulated links the device is
+  straight and moves with its base, its hinges are 0 and nothing touches it. Of a longer
+  device they show the distal part.
 
-A task simulates what can leave the sheath (`working_length`, 0.14 to 0.32 m).
-Observations show a device of {COMMON_LENGTH:g} m, so their shapes depend on the device
-and `shaft_link` alone: behind the simulated links the device is straight and moves with
-its base, its hinges are 0 and nothing touches it. Of a longer device they show the
-distal part.
+Shapes are those of `{TASK}`. `docs/scripts/observations.py` writes this page.
 """
 
 COAXIAL = f"""
@@ -78,17 +79,20 @@ C-arm follow those of the first.
 
 ![Views and modes](images/observation_views.png)
 
-`biplane` has the entries of `route`, reconstructed from what an angiography suite has:
-the live images and the roadmaps of two planes with known geometry, and the goal marker
-in both (`cathsim_dmc/imaging/biplane.py`). The device is what a live image shows and
-the mask image of the empty vessel does not: the marker at its tip is dark in both
-planes, and the shaft is followed from there. The vessel is the set of points that both
-roadmaps show inside, of two planes or also of a `third` view without live images. The
-route through it is found when an episode begins. `roadmap_errors` has the fields
-`noise`, `erosion` and `gaps` (missing segments), in pixels and number, and
-`calibration`, the largest error of the angles in degrees. From the
-drive come the last action and the roll of the handle, by which the frame of the tip is
-known.
+`biplane` has the entries of `route`, reconstructed (`cathsim_dmc/imaging/biplane.py`)
+from what an angiography suite has:
+
+- *live images and mask*: the device is what a live image shows and the mask image of
+  the empty vessel does not; the marker at its tip is dark in both planes, and the shaft
+  is followed from there;
+- *roadmaps* of two planes with known geometry, and of a `third` view without live
+  images: the vessel is the set of points that all show inside, and the route through it
+  is found when an episode begins. `roadmap_errors` has the fields `noise`, `erosion`
+  and `gaps` (missing segments), in pixels and number, and `calibration`, the largest
+  error of the angles in degrees;
+- *goal marker* in both planes;
+- *drive*: the last action, and the roll of the handle, by which the frame of the tip is
+  known.
 
 A cannulation of the left common carotid artery by the scripted expert:
 
