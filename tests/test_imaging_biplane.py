@@ -101,6 +101,23 @@ def test_a_third_roadmap_tells_branches_apart(anatomy, planes, machine):
     assert farthest(anatomy, Biplane(planes, third, mild, 1)) < 8e-3
 
 
+@pytest.mark.parametrize("name", ["type1", "type2"])
+def test_a_device_on_the_true_route_is_inside_that_of_roadmaps_with_errors(name):
+    options = FluoroscopyOptions(view=(60, 0), biplane=(-30, 0), third="AP")
+    anatomy, outside = phantoms.load(name), []
+    line = anatomy.route("lcca").resampled(1e-3).points[20:]
+    machines = Angiograph(anatomy.surface, options)
+    for seed in range(6):
+        errors = RoadmapErrors(noise=0.5, erosion=0.25)
+        machine = Biplane(machines.planes(), machines.third(), errors, seed)
+        found = machine.route(line[0], line[-1])
+        apart = np.linalg.norm(line[-60:, None] - found, axis=-1)
+        # A policy takes a device so far outside for lost.
+        outside.append(((apart / machine.radii(found)).min(axis=1) > 1.25).mean())
+    assert np.mean(outside) < 0.08
+    assert np.max(outside) < 0.4
+
+
 def test_roadmaps_have_the_errors_that_are_asked_for(planes, machine):
     eroded = Biplane(planes, errors=RoadmapErrors(erosion=0.5))
     np.testing.assert_allclose(eroded._walls, machine._walls - 0.5, atol=1e-5)

@@ -3,6 +3,9 @@
 The device is followed backwards from the marker at its tip in what the live images show
 and the mask images do not (digital subtraction). The vessel is the visual hull of its
 outlines in both roadmaps; the route to the goal marker keeps to the middle of the hull.
+Outlines with errors leave a hull that is thin and broken in narrow branches: the route
+goes on through the gaps, is centred on what the views together show round it, and the
+lumen is pooled along it.
 """
 
 from dataclasses import replace
@@ -46,6 +49,13 @@ _WIDE = 12e-3
 _SHAFT = 1.6e-3  # m, width of a usual device
 # From a pixel at the outline to the outline, px, on average.
 _EDGE = 0.25
+# Where outlines have errors. A route is centred so many times; round each of its points
+# in a disc of so many radii of the hull, and between these limits, m. What the views
+# show is pooled along the route over these deviations, m, for its middle and its lumen.
+_CENTRINGS, _DISC_RADII, _DISC = 3, 1.3, (4e-3, 12e-3)
+_POOLED_MIDDLE, _POOLED_LUMEN = 3e-3, 6e-3
+_LEAST_ERROR = 0.2  # px
+_LEAST_LUMEN = 1e-3, 2e-3  # m, of outlines without and with errors
 
 
 class Biplane:
@@ -128,10 +138,31 @@ class Biplane:
 
     def depth(self, points: ArrayLike) -> np.ndarray:
         """Signed distance (...), m, of points (..., 3) from the outlines, + inside."""
+        return self._depths(points).min(axis=0)
+
+    def radii(self, line: np.ndarray) -> np.ndarray:
+        """Radii (P,) of the lumen along a route (P, 3), m."""
+        from scipy.ndimage import gaussian_filter1d
+
+        depths, least = self._depths(line), _LEAST_LUMEN[self._errors.any]
+        if self._errors.any:
+            width = _POOLED_LUMEN / ROUTE_SPACING
+            depths = gaussian_filter1d(depths, width, axis=1, mode="nearest")
+            depths += 0.5 * self._error  # the least of several is too small
+        return np.maximum(depths.min(axis=0), least)
+
+    def _depths(self, points: ArrayLike) -> np.ndarray:
+        """Signed distances (views, ...), m, of points (..., 3) from each outline."""
         points = np.asarray(points, dtype=np.float64)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         found = loops.depths(flat, self._views, self._walls, self._focal)
-        return found.reshape(points.shape[:-1])
+        return found.reshape(-1, *points.shape[:-1])
+
+    @property
+    def _error(self) -> float:
+        """Error of the outlines, a part of its deviation that tells places apart, m."""
+        arm, noise = self._planes[0].carm, self._errors.noise
+        return max(0.7 * noise, _LEAST_ERROR) * arm.source_isocentre / arm.focal_length
 
     @cached_property
     def _walls(self) -> np.ndarray:
@@ -189,20 +220,39 @@ class Biplane:
             start: (3,) world frame, m.
             goal: (3,) world frame, m.
         """
-        from scipy.ndimage import gaussian_filter1d
-
         start, goal = (np.asarray(end, dtype=np.float64) for end in (start, goal))
         found = self._path(start, goal)
-        line = np.vstack([start, found[1:-1], goal])
-        way = arc_lengths(line)
-        fine = np.arange(0.0, way[-1], ROUTE_SPACING)
-        line = interpolate(fine, way, line)
-        # The ends stay where they are: the line continues beyond them, point reflected.
-        beyond = min(round(3 * _SMOOTHING / ROUTE_SPACING), len(line) - 1)
-        around = ((beyond, beyond), (0, 0))
-        whole = np.pad(line, around, "reflect", reflect_type="odd")
-        smooth = gaussian_filter1d(whole, _SMOOTHING / ROUTE_SPACING, axis=0)
-        return smooth[beyond : beyond + len(line)]
+        line = _smoothed(np.vstack([start, found[1:-1], goal]))
+        for _ in range(_CENTRINGS if self._errors.any else 0):
+            line = _smoothed(self._centred(line))
+        return line
+
+    def _centred(self, line: np.ndarray) -> np.ndarray:
+        """A route (P, 3) each of whose points is in the middle of what is round it.
+
+        Places count by how probable it is that they are in the vessel, and how deep.
+        """
+        from scipy.ndimage import gaussian_filter1d
+        from scipy.special import ndtr
+
+        ways = np.gradient(line, axis=0)
+        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+        across = np.eye(3)[np.abs(ways).argmin(axis=1)]
+        across = np.cross(ways, across)
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        disc = np.stack([across, np.cross(ways, across)], axis=1)
+        wide = np.clip(_DISC_RADII * self.depth(line) + 1e-3, *_DISC)
+        shifts = wide[:, None, None] * (_disc() @ disc)
+        depths, error = self._depths(line[:, None] + shifts), self._error
+        weights = ndtr(depths / error).prod(axis=0)
+        weights *= np.maximum(depths.min(axis=0) + error, 0.1 * error)
+        width = _POOLED_MIDDLE / ROUTE_SPACING
+        weights = gaussian_filter1d(weights + 1e-9, width, axis=0)[..., None]
+        # Both ends stay where they are.
+        number = np.arange(len(line))
+        ends = np.clip(np.minimum(number, number[::-1]) * ROUTE_SPACING / 1e-2, 0, 1)
+        mean = (weights * shifts).sum(axis=1) / weights.sum(axis=1)
+        return line + ends[:, None] * mean
 
     def _path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Points of the grid from the start to the goal, the cheapest way."""
@@ -222,7 +272,29 @@ class Biplane:
     @property
     def _limit(self) -> float:
         """Depth, m, from which on places are part of ways."""
-        return _THROUGH if self._errors.gaps else _OUTSIDE
+        return _THROUGH if self._errors.any else _OUTSIDE
+
+
+def _smoothed(line: np.ndarray) -> np.ndarray:
+    """A line (n, 3) smooth and in steps of `ROUTE_SPACING`, from end to end."""
+    from scipy.ndimage import gaussian_filter1d
+
+    way = arc_lengths(line)
+    line = interpolate(np.arange(0.0, way[-1], ROUTE_SPACING), way, line)
+    # The ends stay where they are: the line continues beyond them, point reflected.
+    beyond = min(round(3 * _SMOOTHING / ROUTE_SPACING), len(line) - 1)
+    around = ((beyond, beyond), (0, 0))
+    whole = np.pad(line, around, "reflect", reflect_type="odd")
+    smooth = gaussian_filter1d(whole, _SMOOTHING / ROUTE_SPACING, axis=0)
+    return smooth[beyond : beyond + len(line)]
+
+
+@cache
+def _disc(across: int = 9) -> np.ndarray:
+    """Points (n, 2) in the unit disc."""
+    number = np.linspace(-1.0, 1.0, across)
+    points = np.stack(np.meshgrid(number, number), axis=-1).reshape(-1, 2)
+    return points[np.hypot(*points.T) < 1.01]
 
 
 @cache

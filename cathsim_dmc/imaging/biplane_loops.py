@@ -34,19 +34,18 @@ def _place(matrix, x, y, z):
 
 @compiled
 def depths(points, matrices, walls, focal):
-    """Signed distances (n,) to the outlines of the vessel, the least of all planes, m.
+    """Signed distances (P, n) to the outlines of the vessel in P planes, m.
 
     Walls (P, rows, columns) are those of pixels, > 0 inside, and focal lengths (P,)
     in px.
     """
-    found = np.empty(len(points))
-    for n in range(len(points)):
-        x, y, z = points[n]
-        found[n] = math.inf
-        for plane in range(len(walls)):
+    found = np.empty((len(walls), len(points)))
+    for plane in range(len(walls)):
+        for n in range(len(points)):
+            x, y, z = points[n]
             row, column, depth = _place(matrices[plane], x, y, z)
-            wall = _sampled(walls[plane], row, column) * depth / focal[plane]
-            found[n] = min(found[n], wall)
+            wall = _sampled(walls[plane], row, column)
+            found[plane, n] = wall * depth / focal[plane]
     return found
 
 

@@ -24,7 +24,6 @@ _FEWEST = 7
 # The direction of the head is that of the chord to this point behind the marker.
 _CHORD = 2
 _OUT = -1e-3  # m from the outline; behind, the device is in its sheath
-_LEAST_RADIUS = 1e-3  # m, of the route
 
 
 class BiplaneSight:
@@ -119,8 +118,7 @@ def _route(machine: Biplane, line: np.ndarray, goal: np.ndarray) -> Route:
     out = np.flatnonzero(machine.depth(line) < _OUT)
     first = max(int(out[0]) - 1, 0) if len(out) else len(line) - 1
     points = machine.route(line[first], goal)
-    radii = np.maximum(machine.depth(points), _LEAST_RADIUS)
-    return Route(points, radii, arc_lengths(points))
+    return Route(points, machine.radii(points), arc_lengths(points))
 
 
 def _seen(
