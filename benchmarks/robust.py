@@ -14,9 +14,11 @@ import dataclasses
 import json
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
+import numpy as np
 import torch
 import tyro
 
@@ -26,7 +28,11 @@ from cathsim_dmc.agents import evaluation, protocols  # isort: skip
 from cathsim_dmc import cluster, files, suite
 from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.agents.results import SAFE_FORCES
+from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.arch.tree import arch_tree
+from cathsim_dmc.anatomy.builder import GOAL_DEPTH, VesselPlace
+from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.tasks.anatomies import load_anatomy
 
 GOALS = ("bca", "lcca", "lsa")
@@ -45,7 +51,10 @@ CHANGES = {
     },
     "goal": {"goal_shift": (-5e-3, 5e-3)},
 }
-Part = Literal["arches", "variants", "anatomies", "changes"]
+# Radii of a branch that is too narrow for one device or all, m, from so far behind its
+# ostium on; between them the lumen tapers.
+NARROW, TAPER = (0.6e-3, 0.8e-3, 1.0e-3, 1.2e-3), 10e-3
+Part = Literal["arches", "variants", "anatomies", "changes", "narrow"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +62,7 @@ class Cell:
     """Episodes that are counted together."""
 
     part: str
-    labels: dict[str, str | None]
+    labels: Mapping[str, str | None]
     task: str
     options: dict
     episodes: int
@@ -102,6 +111,33 @@ def anatomies(names, pair=False, wanted=GOALS, episodes=20):
                 options = {key: value for key, value in where.items() if value}
                 options |= driven
                 yield Cell("anatomies", where, "navigate", options, episodes)
+
+
+def narrowed(seed: arch.ArchSeed, branch: str, radius: float) -> Anatomy:
+    """An arch entered from the groin, one of whose branches narrows to a radius, m."""
+    tree = arch_tree(seed.parameters())
+    vessel, line = tree.vessel(branch), tree.vessel(branch).centreline
+    ways = np.linalg.norm(np.diff(line.points, axis=0), axis=1)
+    behind = (np.append(0.0, ways.cumsum()) - vessel.ostium) / TAPER
+    left = np.clip(1.0 - behind, 0.0, 1.0)
+    radii = np.minimum(line.radii, radius + left * (line.radii - radius))
+    vessel = dataclasses.replace(
+        vessel, centreline=dataclasses.replace(line, radii=radii)
+    )
+    tree = VesselTree({**tree.vessels, branch: vessel})
+    goal = VesselPlace(branch, GOAL_DEPTH, past_ostium=True)
+    inlet = VesselPlace(tree.root.name, np.inf)
+    return Anatomy.from_tree(tree, seed.name, inlet=inlet, goals={branch: goal})
+
+
+def narrow(pair=False, episodes=2, branch="lcca"):
+    """Held-out arches with a branch that is too narrow; with each device."""
+    for radius in NARROW:
+        for seed in arch.arch_set("test")[:3]:
+            where = {"arch": seed.name, "radius": f"{1e3 * radius:g}"}
+            options = {"anatomy": narrowed(seed, branch, radius), "goal": branch}
+            options |= {"give_up": True, **({"devices": PAIR} if pair else {})}
+            yield Cell("narrow", where, "navigate", options, episodes)
 
 
 def changes(pair=False, episodes=20):
@@ -211,7 +247,7 @@ class Selection:
         episodes: Number of episodes of a cell of `anatomies` or `changes`.
     """
 
-    only: tuple[Part, ...] = ("arches", "variants", "anatomies", "changes")
+    only: tuple[Part, ...] = get_args(Part)
     anatomy: tuple[str, ...] = PHANTOMS
     goals: tuple[str, ...] = GOALS
     pair: bool = False
@@ -228,6 +264,7 @@ class Selection:
                 self.anatomy, self.pair, self.goals, self.episodes
             ),
             "changes": lambda: changes(self.pair, self.episodes),
+            "narrow": lambda: narrow(self.pair),
         }
         for cell in (cell for part in self.only for cell in makers[part]()):
             labels, options = dict(cell.labels), dict(cell.options)

@@ -32,6 +32,17 @@ def test_a_pair_is_driven_from_the_groin_in_every_part():
     assert [cell.labels["goal"] for cell in wanted] == ["lsa"]
 
 
+def test_a_branch_narrows_behind_its_ostium_to_the_radius_that_is_asked_for():
+    cells = [*robust.narrow()]
+    assert len(cells) == 12 and sum(cell.episodes for cell in cells) == 24
+    for cell in cells[::5]:
+        assert set(cell.options) <= set(suite.task_options(cell.task))
+        anatomy, radius = cell.options["anatomy"], 1e-3 * float(cell.labels["radius"])
+        route = anatomy.route("lcca")
+        assert route.radii[-10:].max() < radius + 1e-6
+        assert route.radii.min() > radius - 1e-6
+
+
 def test_an_episode_is_counted_for_the_kind_of_its_arch():
     kinds = [robust._kind(cell, {}) for cell in robust.variants()]
     assert kinds[:4] == [

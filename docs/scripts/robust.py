@@ -18,6 +18,7 @@ DOCS = Path(__file__).parents[1]
 DATA, PAGE = DOCS / "data" / "robust.jsonl", DOCS / "robustness.md"
 _FIGURES = "| safe, 0.5 N | steps | mean force, mN | largest sum, N |"
 _KEYS = ("policy", "part", "goal", "access", "anatomy", "change", "arch", "devices")
+_KEYS += ("radius",)
 
 
 def key(row):
@@ -165,6 +166,28 @@ def changes(rows):
     return lines
 
 
+def narrow(rows):
+    """Branches that are too narrow: what became of the episodes, for each radius."""
+    lines = [
+        "| policy | radius, mm | arches | episodes | reached | ended by giving up "
+        "| steps | largest sum, N |",
+        "|---" * 8 + "|",
+    ]
+    for policy, radius in dict.fromkeys((r["policy"], r["radius"]) for r in rows):
+        own = [r for r in rows if (r["policy"], r["radius"]) == (policy, radius)]
+        total = {
+            name: sum(row[name] for row in own)
+            for name in ("episodes", "success", "given_up")
+        }
+        steps = sum(row["steps"] * row["episodes"] for row in own) / total["episodes"]
+        lines.append(
+            f"| `{policy}` | {radius} | {len(own)} | {total['episodes']} "
+            f"| {total['success']} | {total['given_up']} | {steps:.0f} "
+            f"| {max(row['largest_sum'] for row in own):.2f} |"
+        )
+    return lines
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="*", type=Path)
@@ -180,11 +203,12 @@ def main():
     coaxial = [row for row in rows.values() if row.get("devices")]
     rows = {key: row for key, row in rows.items() if row not in coaxial}
     makers = {"arches": arches, "anatomies": anatomies, "changes": changes}
+    makers |= {"narrow": narrow}
     found = {
         name: make([row for row in rows.values() if row["part"] == name])
         for name, make in makers.items()
     }
-    varied = [row for row in rows.values() if row["part"] != "changes"]
+    varied = [r for r in rows.values() if r["part"] not in ("changes", "narrow")]
     found["weakest"] = weakest([r for r in varied if r["part"] == "anatomies"])
     found["devices"] = devices(varied)
     found["kinds"] = kinds([r for r in varied if r["part"] != "anatomies"])
