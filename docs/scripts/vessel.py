@@ -1,4 +1,6 @@
-"""Measures what a living vessel costs, breaks and does to policies, for docs/vessel.md.
+"""Measures what a living vessel costs, breaks and does to policies.
+
+The tables are those of docs/vessel_results.md.
 
     python docs/scripts/vessel.py cost soak policies [--policy NAME ...] [--episodes 10]
 
@@ -23,7 +25,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.pictures.figure import Picture
 from cathsim_dmc.simulation.batch import BatchSimulation
 
-PAGE = Path(__file__).parents[1] / "vessel.md"
+PAGE = Path(__file__).parents[1] / "vessel_results.md"
 PICTURE = PAGE.parent / "images" / "vessel_policies.png"
 DATA = figures.DATA / "vessel.json"
 HEART, BREATH = {"phase": (0, 1)}, {"breath_phase": (0, 1)}
