@@ -1,4 +1,4 @@
-"""Rewrites docs/bench.md: simulated guidewires against measured ones.
+"""Rewrites docs/bench.md and bench_sensitivity.md: simulated and measured guidewires.
 
 ``python docs/scripts/bench.py REPORT``
 
@@ -20,6 +20,7 @@ from cathsim_dmc.validation.bench import BASELINES, WAYS
 from cathsim_dmc.validation.checks import Check, Report
 
 PAGE = figures.ROOT / "docs" / "bench.md"
+PAGES = {"frames": PAGE, "sensitivity": PAGE.with_name("bench_sensitivity.md")}
 FIGURE = PAGE.parent / "images" / "validation_bench.png"
 SHOWN = (*WAYS, "centreline", "nearest")
 
@@ -31,8 +32,8 @@ def main(report):
     command = "python benchmarks/wires.py"
     figures.keep("validation_bench", measured.as_dict(), command)
     found = tables(measured).items()
-    for name, (title, rows) in zip(("frames", "sensitivity"), found, strict=True):
-        figures.put(PAGE, **{name: f"{title}:\n\n{markdown(rows)}"})
+    for (name, page), (title, rows) in zip(PAGES.items(), found, strict=True):
+        figures.put(page, **{name: f"{title}:\n\n{markdown(rows)}"})
     figures.main([])
     style.save(figure(measured.findings["frames"]), FIGURE)
 
