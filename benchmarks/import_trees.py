@@ -215,12 +215,7 @@ def truth(case: Case) -> VesselTree:
     """The tree of a case, m."""
     grower = _Grower(np.random.default_rng(case.seed), 1.0)
     KINDS[case.kind](grower)
-    vessels = {}
-    for name, vessel in grower.vessels.items():
-        line = vessel.centreline
-        line = Centreline(case.scale * line.points, case.scale * line.radii)
-        vessels[name] = Vessel(name, line, vessel.parent, case.scale * vessel.ostium)
-    return VesselTree(vessels)
+    return VesselTree(grower.vessels).scaled(case.scale)
 
 
 def surface(case: Case, tree: VesselTree) -> Surface:

@@ -23,15 +23,6 @@ def tube(points, radii):
     return line.resampled(0.5e-3)
 
 
-def resized(tree, factor):
-    vessels = {}
-    for key, vessel in tree.vessels.items():
-        line = vessel.centreline
-        line = Centreline(factor * line.points, factor * line.radii)
-        vessels[key] = Vessel(key, line, vessel.parent, factor * vessel.ostium)
-    return VesselTree(vessels)
-
-
 def imported(folder, tree, spacing, **options):
     """The anatomy of a tree's surface, and what was noted."""
     notes = []
@@ -157,7 +148,7 @@ def test_short_head_branches_are_named(tmp_path):
 @pytest.mark.slow
 def test_a_childs_arch_is_one_by_its_shape(tmp_path):
     case = import_cases.Case("remeshed", "I", 7)
-    anatomy, notes = imported(tmp_path, resized(import_cases.truth(case), 0.4), 0.8e-3)
+    anatomy, notes = imported(tmp_path, import_cases.truth(case).scaled(0.4), 0.8e-3)
     assert {"aorta", "bca", "lcca", "lsa"} == set(anatomy.tree.vessels)
     assert "--axes" not in notes
 

@@ -191,10 +191,17 @@ def test_branches_that_leave_in_one_lumen_are_one(bend):
 
 def test_a_vertebral_artery_of_its_own_and_an_aberrant_subclavian(bend):
     assert named(bend, BCA, LCCA, THIN, LSA)[0] == ["bca", "lcca", "lva", "lsa"]
+    aside = (1.9, (1.8, [(20, 30, 95)]))  # as no other artery between LCCA and LSA
+    assert named(bend, BCA, LCCA, aside, LSA)[0] == ["bca", "lcca", "lva", "lsa"]
     carotid = (3.9, (3.6, [(-30, 0, 95)]))
     last = (4.8, (4.4, [(20, 20, 85)]))
     found = named(bend, carotid, LCCA, LSA, last)[0]
     assert found == ["rcca", "lcca", "lsa", "rsa"]
+
+
+def test_a_thin_last_branch_is_the_subclavian_more_than_a_vertebral_artery(bend):
+    thin = (2.0, (2.0, [(40, 0, 95)]))
+    assert named(bend, BCA, LCCA, thin)[0] == ["bca", "lcca", "lsa"]
 
 
 @pytest.mark.parametrize("first", [5.4, 6.0])

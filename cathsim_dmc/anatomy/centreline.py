@@ -260,6 +260,15 @@ class VesselTree:
         """Vessel called `name`; ValueError lists those that there are."""
         return self.vessels[bounds.choice("vessel", name, self.vessels)]
 
+    def scaled(self, factor: float) -> "VesselTree":
+        """The tree `factor` times as large."""
+        vessels = {}
+        for key, vessel in self.vessels.items():
+            line = vessel.centreline
+            line = Centreline(factor * line.points, factor * line.radii)
+            vessels[key] = Vessel(key, line, vessel.parent, factor * vessel.ostium)
+        return VesselTree(vessels)
+
     def depths(self, points: ArrayLike) -> dict[str, Array]:
         """Radius less distance (m) of `points` (..., 3) in each vessel's own tube.
 

@@ -9,8 +9,8 @@ and commit by name. A report of a command (`--json`) is a file of its own there,
 the last four beside its checks and findings; its figures are called `FILE: CHECK` and
 `FILE: FINDING: …`. `{.1f}` behind a name is the format of its value.
 
-Where a page has the marker `report FILE`, the checks stand as a table: a row for all
-checks whose names differ in numbers or devices alone, with the worst.
+Where a page has the marker `report FILE`, the report's own `table` stands, or else its
+checks: a row for all whose names differ in numbers or devices alone, with the worst.
 """
 
 import datetime
@@ -164,7 +164,8 @@ def written() -> dict[Path, str]:
         text = filled(page.read_text(encoding="utf-8"), known)
         for name in REPORT.findall(text):
             report = json.loads((DATA / f"{name}.json").read_text())
-            lines = [since(report), "", *table(report["checks"])]
+            own = report.get("findings", {}).get("table")
+            lines = [since(report), "", own or "\n".join(table(report["checks"]))]
             text = between(text, f"report {name}", "\n".join(lines))
         texts[page] = text
     import freshness  # late: it imports this module

@@ -29,7 +29,7 @@ LEG = 80e-3  # m of each leg that are compared, from 10 mm past the branches on
 # m of a limb from the bend on, at most half, that has no direction yet; its length from
 # which on its direction counts, and what more makes that as sure as the branches'.
 LIMB, COUNTS, FULL = 50e-3, 40e-3, 60e-3
-BRANCH = 60e-3  # m of a branch over which its direction is taken
+CHORD = 60e-3  # m of a branch over which its direction is taken
 UPRIGHT = 0.9  # cosine between the limbs of the aorta and +z of a scan that stands
 # Longest usual ascending aorta, m, and what more makes it e times less likely.
 ASCENDING, LONGER = 70e-3, 18e-3
@@ -234,7 +234,7 @@ def _facing(azimuth: float) -> float:
 
 def chord(row: np.ndarray) -> np.ndarray:
     """Direction (3,), unit, of what a row (n, 3) m of points first leads to."""
-    return _unit(row[arc_lengths(row) <= BRANCH][-1] - row[0])
+    return _unit(row[arc_lengths(row) <= CHORD][-1] - row[0])
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -143,7 +143,7 @@ class Arch:
         if curves is not self.found or not toward:
             bend, width, found = _branches(self.ways, start, ends[toward], curves)
         if not found:
-            return Naming([f"branch_{k + 1}" for k in range(len(curves))])
+            return Naming(naming.neutral_names(curves))
         if self.heart < SURE:
             names = naming.neutral_names(curves)
             share = {

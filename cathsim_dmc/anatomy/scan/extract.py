@@ -24,7 +24,7 @@ STARTS = 30e-3  # m along the lumen; curves that start nearer to an end start th
 BRANCH, WIDTHS = 15e-3, 1.5
 EVEN = 0.6  # of the wider one's width: two branches of a fork that share its trunk
 EVEN_PART = (1.5, 4.0)  # radii of the trunk past the fork, between which they compare
-TRUNK = 3.0  # of its radii, least length of a trunk
+TRUNK_LENGTH = 3.0  # of its radii, least
 FITS = 0.5  # of the length of the vessels, that a device must pass to be the default
 
 
@@ -288,7 +288,7 @@ def trunk(
             _width(s - s[at], depth, radius),
             _width(arc_lengths(other) - arc_lengths(other)[at], beside, radius),
         ]
-        if s[at] > TRUNK * radius and min(wide) > EVEN * max(wide):
+        if s[at] > TRUNK_LENGTH * radius and min(wide) > EVEN * max(wide):
             forks.append(at)
     if not forks:
         return main[-1], others

@@ -28,7 +28,10 @@ CUT = 0.03  # probability that the scan shows nothing of a branch
 SHORT = 0.04  # that it is cut short
 # Of thin arteries without a name: radius, m, and log deviation of a wider one.
 EXTRA_RADIUS, EXTRA_SPREAD = 2.0e-3, 0.8
-BETWEEN = 0.2  # of these, how many leave between LCCA and LSA, where vertebral ones do
+# Of these, how many leave between LCCA and LSA, as vertebral arteries do: others, such
+# as a lowest thyroid artery, leave before the LCCA.
+BETWEEN = 0.05
+ALONE = 0.3  # that a vertebral artery is seen where the wider LSA beside it is not
 BUMP = 0.02  # that one that looks cut short is none
 # Of each: radius beyond the ostium, m (`arch.sampler`, vertebral: 1.9), for an aorta as
 # wide as `AORTA` (`SPREAD`: deviation of its logarithm); its share in the distance
@@ -186,6 +189,8 @@ def _labellings(seen: Sequence[Offshoot], right: Sequence[np.ndarray], scale: fl
                     )
                     weight += _spacings(seen, pattern, whole, at, scale)
                     weight += np.log(BETWEEN) * _between(seen, labels)
+                    if "lva" in labels and "lsa" not in labels:
+                        weight += np.log(ALONE)
                     yield pattern, tuple(labels), float(weight)
 
 

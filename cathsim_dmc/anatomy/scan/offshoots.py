@@ -13,7 +13,7 @@ from scipy.special import softmax
 from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.scan.aorta import (
     ARM,
-    BRANCH,
+    CHORD,
     TAPERED,
     THIRD,
     THIRD_OF_TAPERED,
@@ -272,7 +272,7 @@ def _look(ways: Ways, bend: Bend, row: np.ndarray, shared: int) -> tuple[float, 
     """Radius (m) and angle (degrees) from the head of what a curve has for its own."""
     own = row[min(shared, len(row) - 3) :]
     s = arc_lengths(own)
-    part = own[(s >= min(8e-3, 0.4 * s[-1])) & (s <= BRANCH)]
+    part = own[(s >= min(8e-3, 0.4 * s[-1])) & (s <= CHORD)]
     cosine = chord(part if len(part) > 1 else own) @ bend.head
     radius = float(np.median(depth_of(ways, part)))
     return radius, float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))

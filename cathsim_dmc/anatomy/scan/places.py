@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
 from cathsim_dmc.anatomy.scan.topology import adjacent, groups
 from cathsim_dmc.anatomy.scan.units import shown
@@ -154,16 +154,11 @@ def resized(
     """A tree, its inlet and its surface, `factor` times as large."""
     if factor == 1.0:
         return tree, inlet, surface
-    vessels = {}
-    for key, vessel in tree.vessels.items():
-        line = vessel.centreline
-        line = Centreline(factor * line.points, factor * line.radii)
-        vessels[key] = Vessel(key, line, vessel.parent, factor * vessel.ostium)
     inlet = Inlet(
         inlet.vessel, factor * inlet.position, inlet.direction, factor * inlet.radius
     )
     surface = Surface(factor * surface.vertices, surface.faces)
-    return VesselTree(vessels), inlet, surface
+    return tree.scaled(factor), inlet, surface
 
 
 def describe(anatomy: Anatomy, device: float = DEVICE_RADIUS) -> dict[str, Any]:

@@ -21,7 +21,7 @@ END_TRIM = 8e-3  # m, most that is cut off where a curve runs into its end
 TRUNKS = ("rsa", "lsa")  # keep what they share with others, such as vertebral arteries
 STEMS = ("bca", "lcca", "rcca")  # keep what they share with what has no name
 MIN_RADIUS = 0.1e-3  # m, floor of a centreline's radius where it scrapes the wall
-TRUNK = "bca"  # name of the common trunk of the right branches
+BCA = "bca"  # the common trunk of the right branches
 # Branches of which the brachiocephalic artery is the trunk.
 _RIGHT = re.compile(
     r"(r|right_?)(cca|ica|eca|va|sa|sca|aa|(common_)?carotid\w*|vertebral\w*|subclavian\w*)(_\d+)?"
@@ -174,7 +174,7 @@ def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
     bovine arch, which leaves it before.
     """
     root = tree.root.name
-    if TRUNK in tree.vessels:
+    if BCA in tree.vessels:
         return tree
     for name, vessel in tree.vessels.items():
         names = [name, *(key for key, v in tree.vessels.items() if v.parent == name)]
@@ -194,11 +194,11 @@ def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
         vessels = {}
         for key, other in tree.vessels.items():
             if key == name:
-                vessels[TRUNK] = Vessel(TRUNK, trunk, root, vessel.ostium)
-                vessels[key] = Vessel(key, rest, TRUNK, ostium_of(rest, trunk))
+                vessels[BCA] = Vessel(BCA, trunk, root, vessel.ostium)
+                vessels[key] = Vessel(key, rest, BCA, ostium_of(rest, trunk))
             elif other.parent == name and tree.origin(key) < split + STEP:
                 ostium = ostium_of(other.centreline, trunk)
-                vessels[key] = Vessel(key, other.centreline, TRUNK, ostium)
+                vessels[key] = Vessel(key, other.centreline, BCA, ostium)
             else:
                 vessels[key] = other
         return VesselTree(vessels)
