@@ -135,10 +135,47 @@ def test_the_thinnest_device_is_that_of_the_library():
     assert thinnest.name in THINNEST.name
 
 
+def basilar_tip():
+    """An intracranial tree, 20 mm across."""
+    sides = [[(0, 0, 11.6), (side * 3, 1, 13), (side * 6, 3, 13)] for side in (1, -1)]
+    vessels = {"basilar": Vessel("basilar", tube([(0, 0, 0), (0, 0, 12)], [1.65] * 2))}
+    for name, way in zip(("left", "right"), sides, strict=True):
+        vessels[name] = Vessel(name, tube(way, [1.2] * 3), "basilar")
+    return VesselTree(vessels)
+
+
+def test_the_unit_of_a_small_intracranial_tree_is_asked_for(tmp_path):
+    """In cm it would be as wide as an aneurysm of the aorta."""
+    with pytest.raises(ValueError, match=r"several units: mm makes .*; cm makes"):
+        imported(tmp_path, basilar_tip(), 0.4e-3)
+
+
 @pytest.mark.slow
-def test_short_head_branches_are_named(tmp_path):
-    """They are cut 18 mm past the aorta's wall, as models for flow are."""
-    change = tuple((name, 18e-3) for name in ("bca", "lcca", "lsa"))
+def test_a_small_intracranial_tree_has_neutral_names(tmp_path):
+    anatomy, notes = imported(tmp_path, basilar_tip(), 0.4e-3, units="mm")
+    assert set(anatomy.tree.vessels) == {"trunk", "branch_1", "branch_2"}
+    assert {"branch_1", "branch_2"} <= set(anatomy.goals)
+    assert "axes" not in notes and "bovine" not in notes
+
+
+@pytest.mark.slow
+def test_winding_iliacs_are_no_arch_and_stand_upright(tmp_path):
+    vessels = {"aorta": Vessel("aorta", tube([(0, 0, 120), (0, 0, 0)], [9, 8.5]))}
+    for name, side in (("left", 1), ("right", -1)):
+        way = [(0, 0, 2), (25, 5, -30), (45, 30, -20), (40, 45, -60), (36, 32, -100)]
+        way = [(side * x, y, z) for x, y, z in way]
+        vessels[name] = Vessel(name, tube(way, [5, 4.5, 4.5, 4.5, 4.5]), "aorta")
+    anatomy, notes = imported(tmp_path, VesselTree(vessels), 1.5e-3)
+    assert set(anatomy.tree.vessels) == {"trunk", "branch_1", "branch_2"}
+    assert {"branch_1", "branch_2"} <= set(anatomy.goals)
+    assert "axes" not in notes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [18e-3, 26e-3])
+def test_short_head_branches_are_named(length, tmp_path):
+    """They are cut past the aorta's wall, as models for flow are."""
+    change = tuple((name, length) for name in ("bca", "lcca", "lsa"))
     case = import_cases.Case("branch cut short", "I", 7, change=change)
     anatomy, _ = imported(tmp_path, import_cases.truth(case), 1.6e-3)
     assert {"aorta", "bca", "lcca", "lsa"} == set(anatomy.tree.vessels)
