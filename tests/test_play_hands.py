@@ -270,7 +270,10 @@ def by_hand(tmp_path_factory):
     return folder
 
 
-def test_episodes_of_a_hand_are_demonstrations(by_hand, tmp_path, cathsim):
+def test_episodes_of_a_hand_are_demonstrations(by_hand, tmp_path, cathsim, monkeypatch):
+    for missing in ("gymnasium", "minari"):  # of the extra gym, which hands lacks
+        monkeypatch.setitem(sys.modules, missing, None)
+    monkeypatch.delitem(sys.modules, "cathsim_dmc.simulation.gymnasium", raising=False)
     from cathsim_dmc import agents
     from cathsim_dmc.agents.demonstrations import load_transitions
     from cathsim_dmc.agents.networks import NetworkShapes

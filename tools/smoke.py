@@ -1,5 +1,6 @@
-"""Smoke test of an installed package: a task, an image, a network, the command line."""
+"""Smoke test of an installed package: a task, images, the command line, an episode."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,14 @@ import torchrl  # noqa: F401  goes before dm_control
 import cathsim_dmc
 from cathsim_dmc import suite
 from cathsim_dmc.simulation.environments import VECTOR, make_env
+
+
+def command_line(*words: str) -> str:
+    """What `cathsim` prints, as a command of this environment."""
+    program = Path(sys.executable).with_name("cathsim")
+    done = subprocess.run([program, *words], stdout=subprocess.PIPE, text=True)
+    assert done.returncode == 0, f"cathsim {words}: {done.returncode}"
+    return done.stdout
 
 
 def main() -> None:
@@ -26,13 +35,11 @@ def main() -> None:
     rollout = env.rollout(3)
     assert rollout[VECTOR].isfinite().all()
     assert rollout["pixels"].float().std() > 0
-    done = subprocess.run(
-        [sys.executable, "-m", "cathsim_dmc.cli", "list", "--json"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "type1_lcca" in done.stdout
+    lists = command_line("list", "--json")
+    assert "type1_lcca" in lists
+    push = ("push", "--task", "type1_bca", "--episodes", "1", "--no-baseline")
+    evaluated = json.loads(command_line("eval", *push, "--json"))
+    assert evaluated["policy"]["summary"]["success"] == 1.0
     print(f"cathsim-dmc {cathsim_dmc.__version__} works: {home.parent}")
 
 

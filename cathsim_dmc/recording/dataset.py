@@ -4,13 +4,14 @@ import contextlib
 import json
 import os
 import re
+import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import bounds, extras
+from cathsim_dmc import bounds, extras, suite
 from cathsim_dmc.files import (
     atomic_directory,
     naming,
@@ -199,6 +200,8 @@ def export(
     """
     check_free(Path(path))
     extras.require("gym", "gymnasium", "minari", "h5py")
+    from minari.data_collector import EpisodeBuffer
+
     from cathsim_dmc.simulation import gymnasium
 
     episodes = [bounds.instance("an episode", each, Episode) for each in episodes]
@@ -207,15 +210,15 @@ def export(
     if observation is not None:
         options["observation"] = observation
     single = all((e.action == e.action.astype(np.float32)).all() for e in episodes)
-    options["dtype"] = "float32" if single else "float64"
-    environment = gymnasium.CathSimEnv(task, **options)
-    with contextlib.closing(environment):
+    kind = np.dtype("float32" if single else "float64")
+    with contextlib.closing(suite.load(suite.DOMAIN, task, options)) as environment:
+        seen = environment.task.observation_specs
         return write(
             path,
-            [_repeated(environment, episode) for episode in episodes],
-            env_spec=gymnasium.env_spec(task, **options),
-            observation_space=environment.observation_space,
-            action_space=environment.action_space,
+            [EpisodeBuffer(**_repeated(environment, e, kind)) for e in episodes],
+            env_spec=gymnasium.env_spec(task, **options, dtype=kind.name),
+            observation_space=gymnasium.space_of(seen, kind),
+            action_space=gymnasium.space(environment.action_spec(), kind),
             algorithm="recorded episodes",
             description=f"{len(episodes)} recorded episodes of the task {task} of "
             "cathsim_dmc",
@@ -240,11 +243,7 @@ def repeat_episodes(
     Raises:
         DatasetError: a file is damaged, was recorded with other options, or does not
             repeat.
-        ModuleNotFoundError: gymnasium or minari is not installed.
     """
-    extras.require("gym", "gymnasium", "minari")
-    from cathsim_dmc.simulation import gymnasium
-
     environment, made = None, None
     for file in recordings_in(path):
         try:
@@ -255,9 +254,10 @@ def repeat_episodes(
                     raise ValueError(f"its {name} is {found!r}, not {value!r}")
             wanted = task, {**own, "observation": observation}
             if environment is None or made != wanted:
-                environment = gymnasium.CathSimEnv(task, **wanted[1])
+                environment = suite.load(suite.DOMAIN, task, wanted[1])
                 made = wanted
-            yield _repeated(environment, episode)
+            columns = _repeated(environment, episode, np.dtype("float32"))
+            yield types.SimpleNamespace(**columns)
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             line = " ".join(str(error).split())
             raise DatasetError(f"{file} is no demonstration: {line}") from error
@@ -282,40 +282,49 @@ def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:
     return tasks[0], {k: v for k, v in given[0].items() if k != "random"}
 
 
-def _repeated(environment: Any, episode: Episode) -> Any:
-    """Minari's buffer of an episode that is done again; ValueError if it differs."""
-    from minari.data_collector import EpisodeBuffer
-
+def _repeated(environment: Any, episode: Episode, kind: np.dtype) -> dict[str, Any]:
+    """Columns of an episode that is done again; ValueError if it differs."""
     name = f"episode with seed {episode.seed}"
-    actions = episode.action.astype(environment.action_space.dtype)
-    seen, ends = [environment.reset(seed=episode.seed)], []
+    actions = episode.action.astype(kind)
+
+    def shown(timestep: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        row = {
+            key: np.array(value, value.dtype if value.dtype == np.uint8 else kind)
+            for key, value in timestep.observation.items()
+        }
+        return row, environment.task.info()
+
+    environment.random_state.seed(episode.seed)
+    seen, ends = [shown(environment.reset())], []
     for step, action in enumerate(actions):
-        observation, reward, *end, info = environment.step(action)
-        seen.append((observation, info))
-        ends.append(end)
+        timestep = environment.step(action)
+        seen.append(shown(timestep))
+        ends.append(timestep.last())
+        reward = float(timestep.reward)
         if abs(reward - episode.reward[step]) > _SAME_REWARD:
             raise ValueError(
                 f"{name} does not repeat: reward {reward} instead of "
                 f"{episode.reward[step]} at step {step}; it was recorded with "
                 f"{episode.meta.get('versions')}"
             )
-        if any(end) and step + 1 < episode.steps:
+        if ends[-1] and step + 1 < episode.steps:
             raise ValueError(
                 f"{name} ends at step {step} instead of {episode.steps - 1}; export it "
                 "with the options it was recorded with"
             )
-    terminated, truncated = np.array(ends).T
-    truncated[-1] |= not terminated[-1]  # where the operator has stopped
+    terminated = np.array(ends) & (timestep.discount == 0)
+    truncated = np.arange(1, episode.steps + 1) == episode.steps
     observations, infos = (
         {key: np.array([row[key] for row in rows]) for key in rows[0]}
         for rows in zip(*seen, strict=True)
     )
-    return EpisodeBuffer(
-        seed=episode.seed,
-        observations=observations,
-        actions=actions,
-        rewards=episode.reward.tolist(),
-        terminations=terminated.tolist(),
-        truncations=truncated.tolist(),
-        infos=infos,
-    )
+    return {
+        "seed": episode.seed,
+        "observations": observations,
+        "actions": actions,
+        "rewards": episode.reward.tolist(),
+        "terminations": terminated.tolist(),
+        # Also where the operator has stopped.
+        "truncations": (truncated & ~terminated).tolist(),
+        "infos": infos,
+    }
