@@ -3,7 +3,8 @@
     python docs/scripts/sizes.py
 
 Counts files of the environment that runs it, and of those whose site-packages stand in
-PYTHONPATH; a package that is installed in none of them is named. Writes the table between the markers of the page.
+PYTHONPATH; a package that is installed in none of them is named. Writes the table
+between the markers of the page.
 """
 
 from __future__ import annotations
