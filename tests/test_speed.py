@@ -22,6 +22,23 @@ def test_a_pace_has_a_time_for_every_control_step(environment):
     assert run.factor == pytest.approx(20 * 0.04 / run.seconds.sum())
 
 
+@pytest.mark.parametrize("policy", ["random", "push"])
+def test_bare_steps_do_the_physics_of_the_control_steps(environment, policy):
+    """They once took the action as the control, which drives compute of it."""
+    stepper, begun, after = environment.task.stepper, [], []
+    act = speed.in_environment(speed.make_policy(policy, 0), environment)
+    timestep, repeated = environment.reset(), stepper.repeated.sum()
+    for _ in range(30):
+        timestep = environment.step(act(timestep))
+        begun.append(speed.Begun.last(environment))
+        after.append(stepper.states()[0])
+    assert stepper.repeated.sum() == repeated
+    seconds, found = speed.bare_steps(environment, begun)
+    np.testing.assert_array_equal(found, after)
+    np.testing.assert_array_equal(stepper.states()[0], after[-1])
+    assert seconds > 0.0
+
+
 @pytest.mark.slow
 def test_the_account_adds_up_and_leaves_nothing_behind(environment):
     # The last part is a difference of two measurements: the median of several runs.

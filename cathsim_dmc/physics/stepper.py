@@ -32,6 +32,8 @@ class Stepper(abc.ABC):
             `readings.ModelIndex.FIELDS` says which are there. `qpos`, `ctrl` and
             `userdata` are written.
         warnings: (N, ...) int, how often MuJoCo has warned, a view.
+        before: (N, nstate), states before the physics steps of the last control step,
+            with its control, mjSTATE_INTEGRATION.
         repeated: (N,) int, control steps done again in shorter physics steps.
         deepest: Depth of a contact, m, from which a control step is done again; None
             for `forces.DEEPEST`.
@@ -51,7 +53,7 @@ class Stepper(abc.ABC):
         self._shortened = False  # whether a time step has ever been
         self.deepest: float | None = None
         self._contacts = readings.sensor(model, "wall_contacts")
-        self._before = self._warnings_before = np.empty(0)
+        self.before = self._warnings_before = np.empty(0)
         self._timestep, self._scratch = model.opt.timestep, mujoco.MjData(model)
         self._wall = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "wall")
         self._links = deep_links.moving(model)
@@ -108,7 +110,7 @@ class Stepper(abc.ABC):
     def begin(self, control: np.ndarray) -> None:
         """Begins a control step with the control (N, U) of all its physics steps."""
         self.arrays.ctrl[:] = control
-        self._before = self.states()
+        self.before = self.states()
         self._warnings_before = self.warnings.copy()
 
     def end(self) -> tuple[forces.WallForce, np.ndarray]:
@@ -264,7 +266,7 @@ class Stepper(abc.ABC):
     def _refine(self, indices: np.ndarray, parts: int) -> np.ndarray:
         """Does the control step of some simulations again, in steps so much shorter."""
         self.repeated[indices] += 1
-        self.set_states(indices, self._before[indices])
+        self.set_states(indices, self.before[indices])
         self._shortened = True
         try:
             self._change(indices, "timestep", lambda _: self._timestep / parts)

@@ -7,11 +7,13 @@ Every figure is the median of repeated runs after a warm-up. `speed.py` measures
 threads, images, stages, memory; it is a script of the source tree, in benchmarks.
 """
 
+import copy
 import dataclasses
 import functools
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -140,31 +142,72 @@ def suite_overhead(policy: str, steps: int = STEPS) -> list[float]:
     return [ours / bare for ours, bare in pairs[1:]]
 
 
+class Begun(NamedTuple):
+    """What the physics steps of a control step begin with.
+
+    Attributes:
+        state: (nstate,), with the control, see `Stepper.before`.
+        fields: Fields of the model that are written at every control step, by name.
+    """
+
+    state: np.ndarray
+    fields: Mapping[str, np.ndarray]
+
+    @classmethod
+    def last(cls, environment: composer.Environment) -> "Begun":
+        """Of the last control step of a suite environment."""
+        task = environment.task
+        names = {name for effect in task.effects for name in effect.step_fields}
+        fields = {name: task.stepper.field(0, name).copy() for name in names}
+        return cls(task.stepper.before[0], fields)
+
+
 def against_bare_steps(
     environment: composer.Environment, policy: str, steps: int, seed: int
 ) -> tuple[float, float]:
-    """CPU seconds of an episode, and of bare `mj_step` calls with the same controls.
+    """CPU seconds of an episode, and of the bare `mj_step` calls of its control steps.
 
     The two take turns by episodes: by steps each would find the caches full of the
-    other's data.
+    other's data. Control steps that are done again are part of the episode alone.
     """
-    substeps = environment.task.substeps
-    timestep = environment.reset()
+    timestep, seconds = environment.reset(), 0.0
     # None of these policies looks at the observation.
     act = in_environment(make_policy(policy, seed), environment)
-    actions = [act(timestep) for _ in range(steps)]
-    model, data = environment.physics.model.ptr, environment.physics.data.ptr
-    bare = mujoco.MjData(model)
-    mujoco.mj_copyData(bare, model, data)
-    start = time.process_time()
+    actions, begun = [act(timestep) for _ in range(steps)], []
     for action in actions:
+        start = time.process_time()
         environment.step(action)
-    middle = time.process_time()
-    for action in actions:
-        bare.ctrl[:] = action
-        for _ in range(substeps):
-            mujoco.mj_step(model, bare)
-    return middle - start, time.process_time() - middle
+        seconds += time.process_time() - start
+        begun.append(Begun.last(environment))
+    return seconds, bare_steps(environment, begun)[0]
+
+
+def bare_steps(
+    environment: composer.Environment, begun: Sequence[Begun]
+) -> tuple[float, np.ndarray]:
+    """Does the physics steps of control steps again, and nothing but them.
+
+    Args:
+        environment: Suite environment of the control steps.
+        begun: What each of them began with.
+
+    Returns:
+        CPU seconds of the `mj_step` calls, and states (T, nstate) after each control
+        step.
+    """
+    model = copy.copy(environment.physics.model.ptr)
+    data, kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION.value
+    seconds, after = 0.0, np.array([each.state for each in begun])
+    for one, state in zip(begun, after, strict=True):
+        for name, values in one.fields.items():
+            getattr(model, name)[:] = values
+        mujoco.mj_setState(model, data, one.state, kind)
+        start = time.process_time()
+        for _ in range(environment.task.substeps):
+            mujoco.mj_step(model, data)
+        seconds += time.process_time() - start
+        mujoco.mj_getState(model, data, state, kind)
+    return seconds, after
 
 
 def humanoid_step(steps: int = 2000) -> float:
