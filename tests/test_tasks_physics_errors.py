@@ -1,6 +1,9 @@
+import contextlib
 import json
 import logging
+import types
 
+import mujoco
 import numpy as np
 import pytest
 from conftest import twin
@@ -8,7 +11,7 @@ from conftest import twin
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.simulation import batch, error_files
-from cathsim_dmc.tasks import physics_errors
+from cathsim_dmc.tasks import physics_errors, start
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +39,24 @@ def test_a_device_in_lumen_and_sheath_has_not_escaped():
     straight = inlet.position + way * inlet.direction
     both = np.stack([straight, straight + [0.03, 0, 0]])
     assert physics_errors.escaped(anatomy, both, inlet.direction).tolist() == [0, 1]
+
+
+def test_a_device_beside_the_sheath_may_neither_escape_nor_settle(task):
+    """Both once counted nodes by rules of their own."""
+    scene = task.scene
+    line = scene.placement.inlet - 0.02 * scene.placement.direction + [[0, 0, 0]] * 2
+    aside = line + [0.05, 0.0, 0.0]
+    index = types.SimpleNamespace(links=slice(0, 1), head_site=0, walls=np.zeros(0))
+    for nodes, outside in ((line, False), (aside, True)):
+        data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
+        data = types.SimpleNamespace(
+            xpos=nodes, site_xpos=nodes, contact=data.contact, warning=data.warning
+        )
+        along = scene.placement.direction
+        assert physics_errors.escaped(scene.anatomy, nodes, along) == outside
+        expected = pytest.raises(ValueError, match="mm outside the lumen")
+        with expected if outside else contextlib.nullcontext():
+            start._refuse_outside(scene, None, index, data)
 
 
 def test_exploding_force_ends_the_episode_in_both_paths(

@@ -35,9 +35,8 @@ class SingleDevice(Effect):
     """One device, whose own motors move it.
 
     Attributes:
-        slipped: Way by which the clamps have slipped in the episode, m and rad: (N, 1)
-            or, with rotation, (N, 2) of a single device; (N, 2 K) of coaxial devices,
-            translation and rotation of each.
+        slipped: (N, D), way by which the clamp of each of the drives has slipped in the
+            episode, m and rad.
     """
 
     data_fields: tuple[str, ...] = ("act",)

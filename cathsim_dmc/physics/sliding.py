@@ -55,7 +55,12 @@ class Positions(NamedTuple):
 
 
 class SlidingDevices(SingleDevice):
-    """Coaxial devices, each moved along and about its axis by its actions."""
+    """Coaxial devices, each moved along and about its axis by its actions.
+
+    Attributes:
+        slipped: (N, 2 K), way by which the clamps of each of the K devices have slipped
+            in the episode, along and about its axis, m and rad.
+    """
 
     data_fields = ("cfrc_int", "act", "qfrc_applied")
     model_fields = step_fields = chain_fields.FIELDS

@@ -6,6 +6,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.placement import past_sheath
 
 DIVERGED = "diverged"
 ESCAPED = "escaped through the wall"
@@ -16,8 +17,6 @@ ESCAPE_INTERVAL = 50
 # Deeper outside the lumen than this, m, the axis of the device is behind the wall:
 # the wall is 4 mm thick, and penetration stays below 1 mm.
 _ESCAPE_DEPTH = 2e-3
-# Within this way of the plane of the inlet, m, the sheath holds the device.
-_MOUTH = 2e-3
 # No contact of a device that is pushed with 5 N at most is harder than this, N.
 MAX_FORCE = 50.0
 
@@ -32,14 +31,7 @@ def escaped(anatomy: Anatomy, centreline: np.ndarray, along: np.ndarray) -> np.n
     Returns:
         (...) bool: some node past the inlet lies more than 2 mm outside the lumen.
     """
-    inlet = anatomy.inlet
-    beyond = (centreline - inlet.position) @ along > _MOUTH
-    # Farther from the inlet than the sheath reaches, a node may also lie behind the
-    # plane of the inlet, in a vessel that turns back.
-    aside = np.linalg.norm(centreline - inlet.position, axis=-1) > _MOUTH
-    axis = np.cross(centreline - inlet.position, along)
-    in_sheath = ~beyond & (np.linalg.norm(axis, axis=-1) < inlet.radius)
-    outside = aside & ~in_sheath
+    outside = past_sheath(anatomy, centreline, along)
     outside[outside] = anatomy.lumen(centreline[outside]) < -_ESCAPE_DEPTH
     return outside.any(-1)
 

@@ -31,6 +31,8 @@ _LINE_SPACING = 1e-3  # m
 # The wall is 4 mm thick; nearer to the inlet the sheath touches the inlet's own.
 _CLEAR_OF_LUMEN = 5.5e-3  # m
 _NEAR_INLET = 0.015  # m
+# Within this way of the plane of the inlet, m, the sheath holds the device.
+_MOUTH = 2e-3
 # Tilts of the sheath that are tried where the straight one crosses a vessel; 20 degrees
 # were enough for the first 40 arches of the set "test".
 _TILT_STEP, _LARGEST_TILT = np.radians(2.5), np.radians(30.0)
@@ -235,3 +237,21 @@ def _frame(direction: np.ndarray) -> np.ndarray:
     # Half turn: the axis is the eigenvector of eigenvalue 1.
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.concatenate([[0.0], vectors[:, np.argmax(values)]])
+
+
+def past_sheath(anatomy: Anatomy, nodes: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Which nodes (..., n, 3) of devices, m, world frame, are in the vessel.
+
+    Args:
+        along: (3,) unit vector of the sheath, which need not stand as the vessel does.
+
+    Returns:
+        (..., n) bool: False in the sheath and within 2 mm of its mouth.
+    """
+    inlet = anatomy.inlet
+    way = nodes - inlet.position
+    # Beside the sheath, a node may also lie behind the plane of the inlet, in a vessel
+    # that turns back.
+    before = way @ along <= _MOUTH
+    beside = np.linalg.norm(np.cross(way, along), axis=-1) >= inlet.radius
+    return (np.linalg.norm(way, axis=-1) > _MOUTH) & (~before | beside)

@@ -18,6 +18,7 @@ from cathsim_dmc.physics.held import Held
 from cathsim_dmc.physics.randomisation import START_JITTER, start_displacement
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.placement import past_sheath
 from cathsim_dmc.tasks.scene import AROUND_SHEATH, Scene
 
 _SETTLING_TIME = 2.0  # s, after which the device rests
@@ -327,8 +328,7 @@ def _refuse_outside(
     """Raises ValueError if a settled device stands outside the lumen or in the wall."""
     nodes = np.vstack([data.xpos[index.links], data.site_xpos[index.head_site]])
     place, anatomy = scene.placement, scene.anatomy
-    # Those behind the mouth lie in the sheath, and touch the wall where that does.
-    entered = (nodes - place.inlet) @ place.direction > 0.0
+    entered = past_sheath(anatomy, nodes, place.direction)
     out = -float(anatomy.lumen(nodes[entered]).min(initial=0.0))
     touching = np.isin(data.contact.geom, index.walls).any(axis=-1)
     deepest = -float(data.contact.dist[touching].min(initial=0.0))
