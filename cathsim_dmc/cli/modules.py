@@ -16,7 +16,8 @@ from cathsim_dmc.cli.options import say
 
 GROUP = "cathsim.tasks"
 # Commands that name a task.
-COMMANDS = ("train", "list", "eval", "record", "demos", "play")
+COMMANDS = ("train", "list", "eval", "record", "demos", "play", "serve", "export")
+COMMANDS += ("replay-error",)
 
 
 class Own(NamedTuple):
@@ -41,7 +42,7 @@ class Own(NamedTuple):
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         parser.add_argument("--import", action="append", nargs="?", dest="names")
         named = parser.parse_known_args(arguments)[0].names or []
-        names = [one for one in named if one]  # the parser of all refuses none
+        names = [one for one in named if one is not None]  # refused by the other parser
         own = cls(tuple(names), tuple(metadata.entry_points(group=GROUP)))
         if any(own):
             # They may import torchrl, which goes before dm_control.
