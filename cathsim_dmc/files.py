@@ -117,17 +117,38 @@ def require_place(folder: str | os.PathLike[str]) -> Path:
     return Path(folder)
 
 
-def require_file(path: str | os.PathLike[str], make: bool = False) -> Path:
+def require_file(
+    path: str | os.PathLike[str], make: bool = False, later: bool = False
+) -> Path:
     """The path of a file that can be written, or replaced; see `require_folder`.
+
+    Args:
+        make: Whether to make its folder where it is missing.
+        later: Whether its folder may also be missing, and is made when it is written.
 
     Raises:
         OSError: as of `require_folder`; IsADirectoryError if `path` is a directory.
+        ValueError: `path` is a device or a pipe, which a new file would replace.
     """
     path = Path(path)
-    require_folder(path.parent, make)
+    require_place(path.parent) if later else require_folder(path.parent, make)
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a directory; give a file name in it")
+    _refuse_special(path)
     return path
+
+
+def _refuse_special(path: str | os.PathLike[str]) -> None:
+    """Raises ValueError if a path is a device, whose zeros may never end, or a pipe."""
+    path = Path(path)
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise ValueError(f"{path} is a device or a pipe; give the name of a file")
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """The UTF-8 text of a file; ValueError for a device or a pipe."""
+    _refuse_special(path)
+    return Path(path).read_text(encoding="utf-8")
 
 
 @contextlib.contextmanager
@@ -206,6 +227,7 @@ def read_arrays(
             more than it holds, see `require_room`.
     """
     try:
+        _refuse_special(path)
         with open(path, "rb") as stream, zipfile.ZipFile(stream) as archive:
             wanted = [f"{name}.npy" for name in names or ()] or archive.namelist()
             held = [archive.getinfo(name) for name in wanted]

@@ -18,6 +18,7 @@ from cathsim_dmc.agents import ConfigError, evaluate, evaluation, submission, tr
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.training_log import read_metrics
 from cathsim_dmc.analysis import heatmap
+from cathsim_dmc.anatomy.tree_file import read_tree
 from cathsim_dmc.cli import phantoms
 from cathsim_dmc.cli.agents import record
 from cathsim_dmc.cli.task_options import TaskOptions
@@ -124,6 +125,47 @@ def test_a_read_only_folder_is_refused_before_the_work_in_python(
             call()
             raise AssertionError(name)
     assert not list(read_only.iterdir())
+
+
+def test_a_device_or_pipe_is_neither_read_nor_replaced(tmp_path):
+    """`/dev/zero` has no end, and a file renamed to `/dev/null` would replace it."""
+    pipe = tmp_path / "a.npz"
+    os.mkfifo(pipe)
+    for call in (
+        lambda: files.require_file(pipe),
+        lambda: files.write_text(pipe, "x"),
+        lambda: files.read_arrays("/dev/null"),
+        lambda: read_tree("/dev/null"),
+    ):
+        with pytest.raises(ValueError, match=r"is a device or a pipe; give the name"):
+            call()
+    assert pipe.is_fifo()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "eval push --task type1_bca --friction 3 --out OUT/run",
+        "submit push --task type1_bca --episodes 0 --out OUT/new/a.json",
+        "record push --task type1_bca --friction 3 --out OUT/new/a.npz",
+        "play type1_bca --friction 3 --out OUT/new",
+    ],
+)
+def test_a_refused_command_leaves_no_folder(tmp_path, monkeypatch, capsys, line):
+    words = line.replace("OUT", str(tmp_path)).split()
+    monkeypatch.setattr(sys, "argv", ["cathsim", *words])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    said = capsys.readouterr().err
+    assert ended.value.code == 2 and said.count("\n") == 1, said
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_error_with_a_long_name_stays_short(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["cathsim", "replay", "x" * 5000])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert len(capsys.readouterr().err) < 2000
 
 
 def test_a_folder_in_the_place_of_a_file_is_refused_before_the_work(tmp_path):

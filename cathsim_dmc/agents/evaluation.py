@@ -102,6 +102,7 @@ def evaluate(
         outcomes = [one for group in groups for one in _play(group, observer)]
     result = plan.result(name, outcomes, start is not None)
     if out_dir is not None:
+        files.require_folder(out_dir, make=True)
         files.write_json(Path(out_dir) / "evaluation.json", result.to_dict())
     return result
 
@@ -166,7 +167,7 @@ class _Plan:
         errors = None
         if out_dir is not None:
             # Now: an evaluation that cannot be written would be lost.
-            files.require_folder(out_dir, make=True)
+            files.require_place(out_dir)
             errors = Path(out_dir).absolute() / "errors"
         make = functools.partial(
             _recorded, make_env, errors, self.task, observation=self.observation

@@ -67,10 +67,11 @@ def submit(
         player.require(bounds.choice("task", player.task, suite.SUITE), episodes)
     elif not ships(policy):
         player = _Recorder(load_policy(policy, evaluation.EVALUATION_SEED))
-    files.require_file(out, make=True)
+    files.require_file(out, later=True)
     result = evaluation.evaluate(
         player, task, episodes, protocol=PROTOCOL, num_threads=num_threads
     )
+    files.require_file(out, make=True)
     ours: dict[str, Any] = {"policy_sha256": weights, "package": __version__}
     ours |= {"commit": _commit(), "versions": versions()}
     if not isinstance(player, str):

@@ -5,12 +5,11 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import bounds
+from cathsim_dmc import bounds, files
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.curves import Curve
@@ -47,7 +46,7 @@ class TreeFile:
 def read_tree(path: str | os.PathLike[str]) -> TreeFile:
     """Read a tree file; ValueError names the entry that is not as described."""
     try:
-        return parse_tree(json.loads(Path(path).read_text(encoding="utf-8")))
+        return parse_tree(json.loads(files.read_text(path)))
     except (ValueError, RecursionError) as error:  # of JSON, or of its entries
         raise ValueError(f"{path}: {error}") from error
 

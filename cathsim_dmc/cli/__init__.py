@@ -17,6 +17,7 @@ _DESCRIPTION = (
     "Autonomous endovascular navigation: train, evaluate, record, validate. "
     "`cathsim COMMAND --help` explains a command, `cathsim --version` names it."
 )
+_LONGEST = 1500  # characters of an error
 # Where each command is, and what it does.
 COMMANDS = {
     "train": ("training:command", "Train an agent."),
@@ -59,6 +60,8 @@ def main() -> None:
             MemoryError) as error:  # fmt: skip
         # Errors with a message for the user; anything else is ours, with traceback.
         text = " ".join(str(error).split()) or "no message"
+        if len(text) > _LONGEST:  # as a name of thousands of characters makes it
+            text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
         print(f"cathsim: {type(error).__name__}: {text}", file=sys.stderr)
         code = BAD_INPUT
     sys.exit(code)

@@ -216,8 +216,10 @@ def record(
     suite.known(task)
     # Now: an episode that cannot be written would be lost.
     for path in targets:
-        files.require_file(path, make=True)
+        files.require_file(path, later=True)
     episode, env = _played(player, task, task_kwargs, seed)
+    for path in targets:
+        files.require_file(path, make=True)
     if out is not None:
         recorded.write(episode, env, out, fluoroscopy)
         if out.suffix == ".rrd":

@@ -59,7 +59,7 @@ def play(
     bounds.choice("hands", hands, HANDS)
     options = bounds.options("task_kwargs", task_kwargs)
     if out is not None:
-        files.require_folder(out, make=True)
+        files.require_place(out)
     held = hand(hands)
     with contextlib.closing(held) if held else contextlib.nullcontext():
         seeds = (
@@ -82,6 +82,8 @@ def _play(
     env = suite.load(suite.DOMAIN, task, {"observation": observation, **options})
     controls = Controls.of(env.task.scene, watching=policy is not None, hand=held)
     window = FluoroscopyWindow(env.task, controls)
+    if out is not None:
+        files.require_folder(out, make=True)
     chosen = policy and in_environment(policy, env)
     due = time.monotonic()
 
