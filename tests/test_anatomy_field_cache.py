@@ -1,6 +1,7 @@
 """The cache of fields: found by content, whole or not at all."""
 
 import copy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -55,6 +56,14 @@ def test_a_cached_field_lies_in_its_file(folder):
         np.testing.assert_array_equal(copied(points), built(points))
         np.testing.assert_array_equal(field(points), built(points))
         assert with_hole.digest == built.with_hole(1e-3).digest != field.digest
+
+
+def test_a_user_without_a_home_keeps_no_fields(built, monkeypatch):
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(field_cache.Path, "home", lambda: Path("~none").expanduser())
+    for _ in range(2):
+        assert field_cache.field_of(tube()).pages is None
+    assert len(built) == 2
 
 
 @pytest.mark.parametrize("access", ACCESSES)

@@ -1,6 +1,7 @@
 """The command line: what it prints, where, and with which exit code."""
 
 import dataclasses
+import io
 import json
 import re
 import shlex
@@ -12,7 +13,7 @@ import time
 import pytest
 from conftest import TASKS
 
-from cathsim_dmc import __version__, suite
+from cathsim_dmc import __version__, cli, suite
 from cathsim_dmc.agents import LEARNERS, Checkpoint
 from cathsim_dmc.agents.checkpoint import checkpoints_in
 from cathsim_dmc.agents.policies import FunctionPolicy
@@ -32,6 +33,25 @@ def test_list_shows_every_task_with_a_line_and_variants_once(cathsim):
         assert name in out
     assert out.count("_pair") == out.count("_wire") == 1
     assert "brachiocephalic" in out
+
+
+def test_signs_that_an_encoding_lacks_are_spelt(monkeypatch):
+    out = io.TextIOWrapper(io.BytesIO(), "ascii")
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "argv", ["cathsim", "list", "--devices"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 0
+    assert rb"EI tip N\xb7mm\xb2" in out.buffer.getvalue()
+
+
+def test_a_deleted_folder_is_named(cathsim, tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    code, out, err = cathsim("phantom", "generate", "type1", "--out", "here")
+    assert (code, out) == (2, "")
+    assert "the present folder has been deleted; change to another" in err
 
 
 def test_list_as_json(cathsim):

@@ -40,21 +40,24 @@ def cache_folder() -> Path:
 def field_of(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Field:
     """As `Field.of`, mapped from its file in the cache if it was built before.
 
-    A damaged file is built again; nothing is kept in a folder that is read-only.
+    A damaged file is built again; nothing is kept in a folder that is read-only, nor
+    without a home.
 
     Raises:
         ValueError: if the box around the lumen is larger than `MOST_ROOM`.
     """
     _require_size(lumen)
     digest = hashlib.sha256(_name(lumen, ends).encode() + _code()).hexdigest()
-    path = cache_folder() / f"{digest[:32]}{_SUFFIX}"
+    name, path = f"{digest[:32]}{_SUFFIX}", None
     try:
+        path = cache_folder() / name
         field = _read(path)
-    except (OSError, ValueError):
+    except (OSError, ValueError, RuntimeError):  # of a user without a home
         field = _shipped(shipped_name(lumen, ends)) or Field.of(lumen, ends)
         with contextlib.suppress(OSError, ValueError):
-            _keep(field, path)
-            field = _read(path)
+            if path is not None:
+                _keep(field, path)
+                field = _read(path)
     else:
         with contextlib.suppress(OSError):
             os.utime(path)

@@ -1,5 +1,6 @@
 """The command `cathsim`: the module of a command is imported when it is called."""
 
+import io
 import os
 import sys
 from collections.abc import Callable
@@ -46,7 +47,12 @@ COMMANDS = {
 
 def main() -> None:
     """Run the command line."""
+    if isinstance(
+        sys.stdout, io.TextIOWrapper
+    ):  # its encoding may lack signs such as µ
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
+        _require_here()
         code = _run(sys.argv[1:])
         sys.stdout.flush()
     except BrokenPipeError:
@@ -65,6 +71,15 @@ def main() -> None:
         print(f"cathsim: {type(error).__name__}: {text}", file=sys.stderr)
         code = BAD_INPUT
     sys.exit(code)
+
+
+def _require_here() -> None:
+    """Raises FileNotFoundError if the present folder has been deleted."""
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:
+        text = "the present folder has been deleted; change to another one (cd)"
+        raise FileNotFoundError(text) from error
 
 
 def _run(arguments: list[str]) -> int:
