@@ -19,7 +19,7 @@ from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.training_log import read_metrics
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.anatomy.tree_file import read_tree
-from cathsim_dmc.cli import phantoms
+from cathsim_dmc.cli import bridging, phantoms
 from cathsim_dmc.cli.agents import record
 from cathsim_dmc.cli.task_options import TaskOptions
 from cathsim_dmc.pictures import animation
@@ -56,6 +56,9 @@ WRITERS = {
     "play type1_bca --out OUT": (suite, "load"),
     "dataset OUT": (image_set, "_shards"),
     "dataset OUT/set": (image_set, "_shards"),
+    "export type1_bca --out OUT/a": (suite, "load"),
+    "serve type1_bca --log OUT/a.jsonl": (suite, "load"),
+    "drive push --connect h:1 --log OUT/a.jsonl": (bridging, "connect"),
     "phantom import a.stl --out OUT": (phantoms, "import_scan"),
     "phantom build a.json --out OUT/a/b": (phantoms, "read_tree"),
     "phantom generate type1 --out OUT": (phantoms.shipped, "load"),

@@ -27,6 +27,12 @@ class Log:
         if path is not None:
             self._file = open(files.require_file(path, make=True), "x")
 
+    @staticmethod
+    def require(path: str | Path | None) -> None:
+        """Raises OSError if there can be no new log; called before the work."""
+        if path is not None and files.require_file(path, later=True).exists():
+            raise FileExistsError(f"{path} exists; give a new file (--log)")
+
     def write(self, event: str, **values: Any) -> None:
         """Add a line."""
         if self._file is not None:

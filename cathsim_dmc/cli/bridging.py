@@ -54,6 +54,7 @@ def serve(
     """
     if episodes is not None:
         bounds.whole("episodes", episodes, 1)
+    bridge.Log.require(log)
     env = suite.load(suite.DOMAIN, suite.known(task), options.given)
     env.reset()  # compiles what a first reset compiles
     device = bridge.SimulatedDevice(env, task)
@@ -89,6 +90,7 @@ def drive(
         how: How the device is driven.
     """
     bounds.whole("episodes", episodes, 1)
+    bridge.Log.require(log)
     player = agents.load_policy(policy)
     if not isinstance(player, FunctionPolicy):
         raise ValueError(
