@@ -71,7 +71,15 @@ def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary.mkdir()
     try:
         yield temporary
-        os.rename(temporary, path)
+        try:
+            os.rename(temporary, path)
+        except OSError as error:
+            if not path.exists():
+                raise
+            raise FileExistsError(
+                f"{path} has been made by another process meanwhile; remove it, or "
+                "choose another directory"
+            ) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

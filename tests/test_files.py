@@ -49,6 +49,10 @@ def test_a_directory_appears_whole_or_not_at_all(tmp_path):
     with files.atomic_directory(tmp_path / "data") as path:
         (path / "whole").write_text("whole")
     assert names(tmp_path) == ["data"] and names(tmp_path / "data") == ["whole"]
+    with pytest.raises(FileExistsError, match="data has been made by another process"):
+        with files.atomic_directory(tmp_path / "data") as path:
+            (path / "other").write_text("other")
+    assert names(tmp_path) == ["data"] and names(tmp_path / "data") == ["whole"]
 
 
 def test_arrays_from_outside_run_nothing(tmp_path):
