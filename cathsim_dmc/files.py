@@ -70,7 +70,8 @@ def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = _temporary(path)
     temporary.mkdir()
     try:
-        yield temporary
+        with naming(path):
+            yield temporary
         try:
             os.rename(temporary, path)
         except OSError as error:

@@ -125,6 +125,11 @@ def test_an_episode_is_driven_and_every_action_applied(lockstep, tmp_path):
     assert text.count('"applied"') == 10
 
 
+def test_an_empty_host_does_not_let_all_machines_in():
+    with pytest.raises(ValueError, match="host is ''; it must be"):
+        device_module.listen("", 0)
+
+
 def test_a_log_is_never_overwritten(tmp_path):
     (tmp_path / "a.jsonl").write_text("old")
     with pytest.raises(FileExistsError):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import files
+from cathsim_dmc.bridge import Log
 
 
 def names(folder):
@@ -53,6 +54,16 @@ def test_a_directory_appears_whole_or_not_at_all(tmp_path):
         with files.atomic_directory(tmp_path / "data") as path:
             (path / "other").write_text("other")
     assert names(tmp_path) == ["data"] and names(tmp_path / "data") == ["whole"]
+
+
+def test_a_full_disk_names_what_was_being_written(tmp_path, small_disk):
+    with small_disk(1000), pytest.raises(OSError, match=r"File too large: .*data'"):
+        with files.atomic_directory(tmp_path / "data") as path:
+            (path / "half").write_bytes(bytes(2000))
+    log = Log(tmp_path / "log")
+    with small_disk(10), pytest.raises(OSError, match=r"File too large: .*log'"):
+        log.write("event")
+    assert names(tmp_path) == ["log"]
 
 
 def test_arrays_from_outside_run_nothing(tmp_path):

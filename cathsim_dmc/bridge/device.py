@@ -197,7 +197,12 @@ def serve(
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens; OSError if the port is taken, 0 takes a free one."""
+    """A socket that listens; OSError if the port is taken, 0 takes a free one.
+
+    Raises:
+        ValueError: the port is none, or the host is empty, which would let all in.
+    """
+    bounds.text("host", host)
     bounds.whole("port", port, 0, 65535)
     try:
         return socket.create_server((host, port), backlog=8)

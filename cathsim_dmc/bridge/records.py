@@ -37,8 +37,9 @@ class Log:
         """Add a line."""
         if self._file is not None:
             line = {"t": round(time.monotonic() - self._began, 6), "event": event}
-            self._file.write(json.dumps({**line, **values}) + "\n")
-            self._file.flush()
+            with files.naming(self._file.name):  # on a full disk
+                self._file.write(json.dumps({**line, **values}) + "\n")
+                self._file.flush()
 
     def __enter__(self) -> "Log":
         """The log itself."""

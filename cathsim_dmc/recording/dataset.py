@@ -14,7 +14,6 @@ import numpy as np
 from cathsim_dmc import bounds, extras, suite
 from cathsim_dmc.files import (
     atomic_directory,
-    naming,
     require_folder,
     require_room,
 )
@@ -70,7 +69,7 @@ def write(
         "description": description,
         "minari_version": minari.__version__,
     }
-    with atomic_directory(path) as temporary, naming(path):
+    with atomic_directory(path) as temporary:
         _check_space(temporary / "space", buffers)
         # Minari looks for the files of a relative path beneath that path again.
         data = temporary.absolute() / "data"
