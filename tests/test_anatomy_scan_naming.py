@@ -179,6 +179,15 @@ def test_a_vertebral_artery_far_along_the_subclavian_is_no_twin_of_it(bend):
     assert named(bend, BCA, LCCA, long)[0] == ["bca", "lcca", "lsa", "lva"]
 
 
+def test_a_vertebral_artery_that_leaves_with_the_carotid_parts_at_once(bend):
+    def led(z):
+        way, up = [(0, 0, z)], (3.8, [(0, 0, z), (-4, 0, 150)])
+        return named(bend, BCA, (4.2, up, (1.9, [*way, (14, 0, 110)])), LSA)[0]
+
+    assert led(50) == ["bca", "lcca", "lva", "lsa"]
+    assert led(80) == ["bca", "lcca", "branch_1", "lsa"]
+
+
 def test_branches_that_leave_in_one_lumen_are_one(bend):
     """They part where they leave, as in a bovine arch with a common ostium."""
     root = bend.line[: bend.apex]

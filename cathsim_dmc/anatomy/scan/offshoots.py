@@ -54,7 +54,9 @@ LEADS = {
     "bovine": ("lcca", "bca", "rcca", "rsa", "rva"),
     "lsa": ("lsa", "lva"),
     "rsa": ("rsa", "rva"),
+    "lcca": ("lcca", "lva"),  # only where they part `AT_ONCE`
 }
+AT_ONCE = 8e-3  # m past the ostium; what leaves a carotid artery later is no vertebral
 TWINS = 85e-3  # m that two curves share after all others have left: one vessel
 
 
@@ -204,7 +206,8 @@ def leads(
     aorta by that of a usual one, `heart_last` whether its last point is at the heart.
     """
     label, sure = called
-    kept = without_twins(one.rows) if label in LEADS else [0]
+    single = label == "lcca" and (one.fork or 0.0) >= AT_ONCE
+    kept = without_twins(one.rows) if label in LEADS and not single else [0]
     rows, numbers = [one.rows[k] for k in kept], [one.curves[k] for k in kept]
     if len(rows) == 1:
         return {numbers[0]: ("bca" if label == "bovine" else label, sure)}
@@ -294,8 +297,11 @@ def _assignment(order, label, seen, share, aside, scale) -> float:
         if vertebral in place and artery in place:
             own = share[place[vertebral]]
             weight -= 5.0 if own[place[artery]] < max(own) else 0.0
-        elif vertebral in place:
+        elif vertebral in place and label != "lcca":
             weight -= 3.0
+    if label == "lcca" and "lva" in place:  # the thinner of the two
+        wider = seen[place["lva"]][0] > min(radius for radius, _ in seen)
+        weight -= 3.0 if wider else 0.0
     if {"rcca", "rva", "rsa"} <= set(place):
         arm = share[place["rsa"]]
         weight -= 6.0 if arm[place["rva"]] < arm[place["rcca"]] else 0.0
@@ -303,7 +309,7 @@ def _assignment(order, label, seen, share, aside, scale) -> float:
         weight -= 1.0 if "rsa" not in place else 0.0
         weight -= 4.0 if "rcca" not in place else 0.0
     missing = "lcca" if label == "bovine" else label
-    if label in ("lsa", "rsa", "bovine") and missing not in place:
+    if label in ("lcca", "lsa", "rsa", "bovine") and missing not in place:
         weight -= 4.0
     elif label == "bovine":
         # It leaves the trunk first, on the side of the descending aorta.
