@@ -94,7 +94,7 @@ def require_folder(folder: str | os.PathLike[str], make: bool = False) -> Path:
     Raises:
         FileNotFoundError: there is no such folder, and it is not to be made.
         NotADirectoryError: it, or one around it, is a file.
-        PermissionError: it is read-only.
+        PermissionError: it is read-only, or takes no new file for another reason.
     """
     folder = Path(folder)
     if make:
@@ -110,6 +110,13 @@ def require_folder(folder: str | os.PathLike[str], make: bool = False) -> Path:
             f"{folder} cannot be written to: it is read-only for this user; choose "
             f"another directory, or allow it (chmod u+wx {folder})"
         )
+    try:  # the bits of a network folder or of /proc do not tell
+        probe = _temporary(folder / "probe")
+        open(probe, "xb").close()
+        probe.unlink()
+    except OSError as error:
+        text = f"{folder} cannot be written to: {error.strerror}; choose another one"
+        raise PermissionError(text) from error
     return folder
 
 

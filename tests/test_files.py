@@ -1,5 +1,7 @@
 """Files that appear whole or not at all, whoever writes or dies meanwhile."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,14 @@ def test_wrong_paths_are_refused_before_the_work(tmp_path):
     with pytest.raises(FileNotFoundError, match="no directory"):
         with files.atomic_path(tmp_path / "missing" / "a.txt"):
             raise AssertionError
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
+def test_a_folder_that_takes_no_file_is_refused_whatever_its_bits_say(tmp_path):
+    with pytest.raises(PermissionError, match="/proc cannot be written to: "):
+        files.require_place("/proc/missing")
+    files.require_folder(tmp_path)
+    assert names(tmp_path) == []
 
 
 def test_writers_of_one_path_all_succeed(tmp_path):
