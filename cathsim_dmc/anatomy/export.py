@@ -159,6 +159,7 @@ def _merged(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
 def _coacd(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
     """Pieces by convex decomposition (CoACD) of patches of the wall."""
     import coacd
+    from tqdm import tqdm
 
     del anatomy
     coacd.set_log_level("error")
@@ -172,7 +173,9 @@ def _coacd(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
     label = kmeans2(features, count, minit="++", seed=0)[1]
     solid, size = 1e3 * np.concatenate([inner, outer]), len(inner)
     pieces = []
-    for patch in (faces[label == k] for k in np.unique(label)):
+    # Minutes: on a terminal a bar says so.
+    for k in tqdm(np.unique(label), "CoACD", unit=" patches", disable=None):
+        patch = faces[label == k]
         edges = patch[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         paired = (edges[:, None] == edges[:, ::-1]).all(axis=-1).any(axis=1)
         a, b = edges[~paired].T
