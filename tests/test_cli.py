@@ -45,6 +45,14 @@ def test_signs_that_an_encoding_lacks_are_spelt(monkeypatch):
     assert rb"EI tip N\xb7mm\xb2" in out.buffer.getvalue()
 
 
+@pytest.mark.parametrize("kind", [("type1",), ("test", "--index", 3)])
+def test_a_variant_that_would_change_nothing_is_refused(cathsim, tmp_path, kind):
+    out = "--out", tmp_path / "x"
+    code, _, err = cathsim("phantom", "generate", *kind, "--variant", "aberrant", *out)
+    assert code == 2 and "which I, II and III take alone" in err
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_deleted_folder_is_named(cathsim, tmp_path, monkeypatch):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")

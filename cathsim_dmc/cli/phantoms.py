@@ -168,6 +168,8 @@ def generate(
         if (value is not None) != (option == needs[kind]):
             wanted = f"--{needs[kind]}" if needs[kind] else "neither --seed nor --index"
             raise ValueError(f"{kind!r} takes {wanted}; --{option} is {value}")
+    if variant != "normal" and needs[kind] != "seed":
+        raise ValueError(f"--variant is {variant!r}, which I, II and III take alone")
     files.require_place(out)
     if seed is not None:
         anatomy = arch.build_seed(arch.ArchSeed(seed, kind, variant), access=access)
