@@ -57,7 +57,8 @@ def variants() -> dict[str, dict[str, Any]]:
     }
     found |= {f"friction {value:g}": {"friction": value} for value in (0.0, 0.15, 0.3)}
     found |= {f"mesh × {value:g}": {"scale": value} for value in (0.985, 1.015)}
-    found["10 mm too far, pulled back"] = {"overshoot": 10e-3}
+    for far in (10, 20, 40, 60):
+        found[f"{far} mm too far, pulled back"] = {"overshoot": 1e-3 * far}
     found["no gravity"] = {"down": "none"}
     return found
 
@@ -100,7 +101,7 @@ def main(folder: str) -> int:
     found: dict[str, dict[str, float]] = {}
     for name, changes in variants().items():
         rms: dict[str, list[float]] = {}
-        for way in ("pushed", "led"):
+        for way in ("pushed", "steered", "led"):
             for row in report.findings["frames"]:
                 if not row["folded"]:
                     turn, wire = (row[way]["turn"],), wires[row["frame"]]

@@ -102,3 +102,35 @@ def test_a_wire_has_its_weight_in_blood(folder):
     # The device lies along +z of its frame, across gravity.
     np.testing.assert_allclose(np.linalg.norm(weight), expected, rtol=0.01)
     assert abs(weight[2]) < 1e-9
+
+
+def test_an_operator_pulls_back_and_turns_where_the_tip_is_astray(folder):
+    path, _, _, lumen = folder
+    experiment = bench.Experiment(bench_data.read(path))
+    wire, seen = experiment.bench.wires[0], []
+
+    def astray(tip):
+        seen.append(tip[2])
+        return len(seen) == 5
+
+    held = experiment.held(wire, lumen, overshoot=5e-3)
+    shape = held.steer(astray)
+    back = np.diff(seen).min()
+    assert back < -0.015 and len(seen) > 13  # an advance of 65 mm once takes 13 looks
+    turned = held.rig.data.joint(f"{held.rig.name}/rotation").qpos[0]
+    assert turned == pytest.approx(np.radians(137.5), abs=0.02)
+    # A straight wire is none the worse for it, at the length that was measured.
+    np.testing.assert_allclose(shape[-1], wire.points[-1], atol=1e-3)
+
+
+def test_a_tip_is_in_a_branch_past_its_ostium_alone():
+    pieces = 1e-3 * np.array(
+        [[[0, 0, 0], [0, 0, 40]], [[0, 0, 40], [30, 0, 70]]], dtype=float
+    )
+    branch = bench_data.Branch(pieces, 3e-3)
+    for point, inside in [
+        ((0, 0, 3), False), ((0, 0, 10), True), ((11, 0, 20), True),
+        ((13, 0, 20), False), ((20, 0, 60), True), ((40, 0, 90), False),
+        ((0, 0, -10), False),
+    ]:  # fmt: skip
+        assert branch.has(1e-3 * np.array(point)) is inside, point

@@ -24,10 +24,12 @@ from cathsim_dmc.validation.checks import Check, Report
 # Median RMS distance, mm, of straight wires, and of angled ones at their best turn.
 STRAIGHT, ANGLED = 2.0, 3.0
 TURNS = 12  # of an angled wire about its axis, evenly spread
-# How a wire comes to its place: pushed from the entry without steering; laid along
-# another measured wire and let go, so that it is on the side of each branch to which
-# the operator has steered it; laid along the measured wire itself.
-WAYS = ("pushed", "led", "laid")
+# How a wire comes to its place: pushed from the entry without steering; steered, turned
+# where it enters a wrong branch, pushed too far and pulled back; laid along another
+# measured wire and let go, so that it is on the side of each branch to which the
+# operator has steered it; laid along the measured wire itself.
+WAYS = ("pushed", "steered", "led", "laid")
+TOO_FAR = 40e-3  # m, of steered wires; fitted among 20, 40 and 60 mm (docs/bench.md)
 EITHER = "pushed or led"  # the better of two histories, since the true one is unknown
 BASELINES = ("centreline", "nearest", "hull")
 
@@ -95,9 +97,19 @@ class Experiment:
                 of the wire.
         """
         start, shapes = {"led": self._nearest(wire), "laid": wire}.get(way), []
-        for turn in turns if way == "pushed" or start is not None else ():
+        if way == "steered":
+            changes = {"overshoot": TOO_FAR} | changes
+        elif way != "pushed" and start is None:
+            return _result(wire, [])
+        for turn in turns:
             held = self.held(wire, self.field(scale), turn, **changes)
-            shapes.append(held.push() if start is None else held.release(start.points))
+            if start is not None:
+                shape = held.release(start.points)
+            elif way == "steered":
+                shape = held.steer(functools.partial(self.bench.is_astray, wire))
+            else:
+                shape = held.push()
+            shapes.append(shape)
         return _result(wire, shapes)
 
     def centreline(self, wire: Wire) -> Result:
@@ -192,13 +204,15 @@ def _checks(rows: Sequence[dict[str, Any]]) -> Iterator[Check]:
         chosen = [row for row in rows if row["wire"] == kind and not row["folded"]]
         if not chosen:
             continue
-        rms = {key: [row[key]["rms"] for row in chosen] for key in BASELINES}
-        baseline = {key: float(np.median(each)) for key, each in rms.items()}
+        found = {key: [row[key]["rms"] for row in chosen] for key in BASELINES}
+        baseline = {key: float(np.median(each)) for key, each in found.items()}
         note = ", ".join(f"{key} {value:.2f} mm" for key, value in baseline.items())
         least = min(value for value in baseline.values() if np.isfinite(value))
-        for way in ("pushed", EITHER, "laid"):
-            each = [row[way]["rms"] for row in chosen]
-            tested = [row[way]["rms"] for row in chosen if row["half"] == "test"]
+        for way in ("pushed", "steered", EITHER, "laid"):
+            # Steering makes a choice of the turn unnecessary.
+            rms = "median_rms" if way == "steered" else "rms"
+            each = [row[way][rms] for row in chosen]
+            tested = [row[way][rms] for row in chosen if row["half"] == "test"]
             largest = max(row[way]["largest"] for row in chosen)
             name, value = f"{kind} wires, {way}: median RMS", float(np.median(each))
             behind = f"of {len(each)} frames, largest distance {largest:.1f} mm"

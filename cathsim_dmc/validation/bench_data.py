@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,8 @@ ARCH = "arch"  # tip region of a wire that is in no branch
 FOLDED = np.radians(150.0)
 _CHORD = 6e-3  # m, over which directions are taken
 _STEP = 1e-3  # m
+_WITHIN = 6e-3  # m past an ostium, from which on an operator sees a tip in the branch
+_AROUND = 3e-3  # m beyond three radii and the ends of a branch: landmarks are coarse
 _CUTS = (0.0, 0.5e-3, 1e-3, 1.5e-3, 2e-3, 3e-3)  # m into the lumen, tried in turn
 _SIDES = {"superior": "inferior", "left_about": "right", "posterior_about": "front"}
 
@@ -57,6 +59,24 @@ class Wire:
         return bool(np.arccos(cosine).sum() > FOLDED)
 
 
+class Branch(NamedTuple):
+    """A branch of the phantom, by landmarks."""
+
+    pieces: np.ndarray  # (n, 2, 3) m, straight ones; the first from the ostium
+    radius: float  # m
+
+    def has(self, point: np.ndarray) -> bool:
+        """Whether a place (3,), m, is in the branch, `_WITHIN` past its ostium."""
+        start, way = self.pieces[:, 0], np.diff(self.pieces, axis=1)[:, 0]
+        length = np.linalg.norm(way, axis=1)
+        along_it = np.vecdot(point - start, way) / length
+        foot = start + (along_it / length)[:, None] * way
+        near = np.linalg.norm(point - foot, axis=1) < 3.0 * self.radius + _AROUND
+        first = np.where(np.arange(len(length)) == 0, _WITHIN, 0.0)
+        inside = (first < along_it) & (along_it < length + _AROUND)
+        return bool((near & inside).any())
+
+
 @dataclass(frozen=True, eq=False)
 class Bench:
     """A phantom and the wires that were measured in it."""
@@ -64,8 +84,15 @@ class Bench:
     surface: Surface  # of the lumen, m, cut off and flat at the entry
     entry: End  # where the wires enter; its direction points out
     ends: Mapping[str, np.ndarray]  # (3,) m, of each vessel by a tip's region
+    branches: Mapping[str, Branch]
     down: Mapping[str, np.ndarray]  # (3,) by name, among them gravity's
     wires: tuple[Wire, ...]  # as measured
+
+    def is_astray(self, wire: Wire, tip: np.ndarray) -> bool:
+        """Whether a tip (3,), m, is in a branch that the measured one is not in."""
+        return any(
+            one.has(tip) for name, one in self.branches.items() if name != wire.vessel
+        )
 
     def field(self, scale: float = 1.0) -> Field:
         """Depth in the lumen, larger by a factor about the entry."""
@@ -89,7 +116,8 @@ def read(folder: str | Path) -> Bench:
     "inserted_length_mm", "entry_point_mm", "entry_direction" and "centreline_mm",
     points from the tip on and beyond the entry; and "landmarks": "entry" (point_mm,
     outward_normal, radius_mm), the far end "ascending_aorta_root_mm", the
-    "patient_axes", and branches (ostium_mm, end_mm or fork_mm).
+    "patient_axes", and branches (ostium_mm, radius_mm, end_mm or fork_mm, and what
+    ends in _end_mm beyond a fork).
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -111,10 +139,12 @@ def read(folder: str | Path) -> Bench:
         radius = 1e-3 * float(entry["radius_mm"])
         surface, where = _opened(vertices, faces, Inlet("entry", where, -out, radius))
         ends = {ARCH: _vector(marks, "ascending_aorta_root_mm") / 1e3}
+        branches = {}
         for name, mark in marks.items():
             if isinstance(mark, Mapping) and "ostium_mm" in mark:
                 end = "end_mm" if "end_mm" in mark else "fork_mm"
                 ends[name] = _vector(mark, end) / 1e3
+                branches[name] = _branch(mark, ends[name])
         # Directions to the patient's six sides, and none.
         down = {"none": np.zeros(3)}
         for key, opposite in _SIDES.items():
@@ -126,7 +156,13 @@ def read(folder: str | Path) -> Bench:
             f"{folder / WIRES} is not as `bench_data.read` describes: {error!r}"
         ) from error
     end = End("entry", where, out, 2.0 * radius, True)
-    return Bench(surface, end, ends, down, wires)
+    return Bench(surface, end, ends, branches, down, wires)
+
+
+def _branch(mark: Mapping[str, Any], end: np.ndarray) -> Branch:
+    beyond = [_vector(mark, key) / 1e3 for key in mark if key.endswith("_end_mm")]
+    pieces = [(_vector(mark, "ostium_mm") / 1e3, end), *((end, one) for one in beyond)]
+    return Branch(np.array(pieces), 1e-3 * float(mark["radius_mm"]))
 
 
 def _opened(

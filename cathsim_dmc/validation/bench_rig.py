@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import mujoco
@@ -12,7 +13,7 @@ from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY
-from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.contact import FRICTION, wall_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.devices import Discretisation
@@ -26,6 +27,10 @@ from cathsim_dmc.validation.rig import Rig
 _LINK = 7e-3  # m, longest of the shaft
 # At rest no node moves by more than this, m, in a time, s; not later than another, s.
 _REST, _WHILE, _LONGEST = 0.1e-3, 0.4, 20.0
+_SPEEDS = {"insertion": MAX_PUSH_SPEED, "rotation": MAX_ROTATION_SPEED}
+# An operator looks after each such advance, m; where the tip is astray, it pulls
+# back, m, and turns by the golden angle, so many times at most.
+_LOOK, _BACK, _TURN, _ATTEMPTS = 5e-3, 30e-3, np.pi * (3.0 - 5.0**0.5), 12
 
 
 class Held:
@@ -73,7 +78,8 @@ class Held:
         # n - 1/2 links of the shaft are in.
         first = shaft / (np.ceil(shaft / _LINK) - 0.5)
         fine = Discretisation(reach + first / 2, shaft_link=first * (1 + 1e-6))
-        rig = Rig(device, fine, stroke=reach + 1e-3, friction=friction)
+        stroke = reach + 1e-3
+        rig = Rig(device, fine, stroke=stroke, friction=friction, rotation=True)
         self.rig = rig
         axis = wire.direction
         across = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
@@ -103,7 +109,26 @@ class Held:
             RuntimeError: if the simulation diverges.
         """
         self.rig.data.qpos[:] = 0.0
-        return self._advance(0.0)
+        return self._to_rest()
+
+    def steer(self, astray: Callable[[np.ndarray], bool]) -> np.ndarray:
+        """Pushes the wire in as an operator does who sees its tip; see `push`.
+
+        Where the tip is astray, the wire is pulled back and turned before it goes on.
+
+        Args:
+            astray: Whether a place (3,) of the tip, m, is in a wrong vessel.
+        """
+        self.rig.data.qpos[:] = 0.0
+        place, attempts = 0.0, 0
+        while place < self._reach:
+            place = min(place + _LOOK, self._reach)
+            self._go("insertion", place)
+            if attempts < _ATTEMPTS and astray(self._nodes()[-1]):
+                attempts, place = attempts + 1, max(place - _BACK, 0.0)
+                self._go("insertion", place)
+                self._go("rotation", attempts * _TURN)
+        return self._to_rest()
 
     def release(self, points: np.ndarray) -> np.ndarray:
         """Lays the wire along a line and lets it go; see `push`.
@@ -121,29 +146,42 @@ class Held:
         steps /= np.linalg.norm(steps, axis=1)[:, None]
         rig.data.qpos[:] = 0.0
         rig.data.joint(f"{rig.name}/insertion").qpos = self.length
+        rig.data.act[self._servo("insertion")] = self.length / MAX_PUSH_SPEED
         rig.bend(bends_of(np.vstack([[0.0, 0.0, 1.0], steps])))
-        return self._advance(self.length)
+        return self._to_rest()
 
-    def _advance(self, place: float) -> np.ndarray:
+    def _to_rest(self) -> np.ndarray:
         """Moves the carriage to the inserted length; the shape of `push`."""
         rig = self.rig
-        actuator = rig.model.actuator(f"{rig.name}/insertion").id
-        servo = rig.model.actuator_actadr[actuator]
-        step = MAX_PUSH_SPEED * rig.model.opt.timestep
-        rig.data.act[servo] = place / MAX_PUSH_SPEED
         for goal in (self._reach, self.length):
-            while place != goal:
-                place += np.clip(goal - place, -step, step)
-                rig.data.act[servo] = place / MAX_PUSH_SPEED
-                rig.step()
+            self._go("insertion", goal)
         mujoco.mj_forward(rig.model, rig.data)
-        before, nodes = np.inf, np.vstack([rig.joints, rig.head_position])
+        before, nodes = np.inf, self._nodes()
         end = rig.data.time + _LONGEST
         while np.abs(nodes - before).max() > _REST and rig.data.time < end:
             rig.run(_WHILE)
-            before, nodes = nodes, np.vstack([rig.joints, rig.head_position])
+            before, nodes = nodes, self._nodes()
         if rig.data.warning.number.any():
             raise RuntimeError("the wire in the phantom diverges")
         total = float(rig.lengths.sum())
         arcs = np.append(np.arange(total - self.length, total, 1e-3), total)
-        return self._entry + along(nodes, arcs) @ self._frame.T
+        return along(nodes, arcs)
+
+    def _go(self, motion: str, goal: float) -> None:
+        """Moves the base at full speed, m or rad."""
+        servo, speed = self._servo(motion), _SPEEDS[motion]
+        data, step = self.rig.data, speed * self.rig.model.opt.timestep
+        place = data.act[servo] * speed
+        while place != goal:
+            place += np.clip(goal - place, -step, step)
+            data.act[servo] = place / speed
+            self.rig.step()
+
+    def _servo(self, motion: str) -> int:
+        rig = self.rig
+        return rig.model.actuator_actadr[rig.model.actuator(f"{rig.name}/{motion}").id]
+
+    def _nodes(self) -> np.ndarray:
+        """Joints and head (n, 3) in the frame of the mesh, m."""
+        nodes = np.vstack([self.rig.joints, self.rig.head_position])
+        return self._entry + nodes @ self._frame.T
