@@ -75,11 +75,19 @@ class _Flags(Flags):
 class PackageCompiler(Compiler):
     """Compiler of all functions of the package."""
 
-    def __init__(self, typingctx: Any, targetctx: Any, *others: Any):
+    def __init__(
+        self,
+        typingctx: Any,
+        targetctx: Any,
+        library: Any,
+        args: Any,
+        return_type: Any,
+        flags: Any,
+        locals: Any,  # noqa: A002  # numba's name
+    ):
         """Takes what `Compiler` takes."""
-        library, args, return_type, flags, *rest = others
-        own = (library, args, return_type, _Flags(flags), *rest)
-        super().__init__(_remembering(typingctx), targetctx, *own)
+        known, own = _remembering(typingctx), _Flags(flags)
+        super().__init__(known, targetctx, library, args, return_type, own, locals)
 
 
 class PartCompiler(PackageCompiler):

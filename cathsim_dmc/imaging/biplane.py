@@ -241,7 +241,7 @@ class Biplane:
         across = np.cross(ways, across)
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         disc = np.stack([across, np.cross(ways, across)], axis=1)
-        wide = np.clip(_DISC_RADII * self.depth(line) + 1e-3, *_DISC)
+        wide = np.clip(_DISC_RADII * self.depth(line) + 1e-3, _DISC[0], _DISC[1])
         shifts = wide[:, None, None] * (_disc() @ disc)
         depths, error = self._depths(line[:, None] + shifts), self._error
         weights = ndtr(depths / error).prod(axis=0)
@@ -294,7 +294,7 @@ def _disc(across: int = 9) -> np.ndarray:
     """Points (n, 2) in the unit disc."""
     number = np.linspace(-1.0, 1.0, across)
     points = np.stack(np.meshgrid(number, number), axis=-1).reshape(-1, 2)
-    return points[np.hypot(*points.T) < 1.01]
+    return points[np.linalg.norm(points, axis=1) < 1.01]
 
 
 @cache
