@@ -1,6 +1,7 @@
 """Files that appear whole or not at all."""
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -42,10 +43,10 @@ def atomic_path(
     path = Path(path)
     if suffix is not None and path.suffix != suffix:
         raise ValueError(f"the file name must end in {suffix}, got {path.name!r}")
-    require_file(path)
+    _check_folder(path.parent)
+    _check_target(path)
     temporary = _temporary(path)
-    # Before the work. Not tempfile, whose files only their owner may read.
-    open(temporary, "xb").close()
+    _create(temporary)  # before the work
     try:
         with naming(path):
             yield temporary
@@ -101,6 +102,15 @@ def require_folder(folder: str | os.PathLike[str], make: bool = False) -> Path:
         require_place(folder)
         with contextlib.suppress(FileExistsError):  # a file, see below
             folder.mkdir(parents=True, exist_ok=True)
+    _check_folder(folder)
+    probe = _temporary(folder / "probe")
+    _create(probe)  # the bits of a network folder or of /proc do not tell
+    probe.unlink()
+    return folder
+
+
+def _check_folder(folder: Path) -> None:
+    """Raises an error of `require_folder` that the state of a folder tells."""
     if not folder.is_dir():
         if folder.exists():
             raise NotADirectoryError(f"{folder} is a file; give a directory (--out)")
@@ -110,14 +120,17 @@ def require_folder(folder: str | os.PathLike[str], make: bool = False) -> Path:
             f"{folder} cannot be written to: it is read-only for this user; choose "
             f"another directory, or allow it (chmod u+wx {folder})"
         )
-    try:  # the bits of a network folder or of /proc do not tell
-        probe = _temporary(folder / "probe")
-        open(probe, "xb").close()
-        probe.unlink()
+
+
+def _create(path: Path) -> None:
+    """Creates an empty file; PermissionError if its folder takes none."""
+    try:  # not tempfile, whose files only their owner may read
+        open(path, "xb").close()
     except OSError as error:
-        text = f"{folder} cannot be written to: {error.strerror}; choose another one"
-        raise PermissionError(text) from error
-    return folder
+        if error.errno == errno.ENAMETOOLONG:  # no fault of the folder
+            raise
+        text = f"{path.parent} cannot be written to: {error.strerror}"
+        raise PermissionError(f"{text}; choose another one") from error
 
 
 def require_place(folder: str | os.PathLike[str]) -> Path:
@@ -148,10 +161,15 @@ def require_file(
     """
     path = Path(path)
     require_place(path.parent) if later else require_folder(path.parent, make)
+    _check_target(path)
+    return path
+
+
+def _check_target(path: Path) -> None:
+    """Raises an error of `require_file` that tells of the file itself."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a directory; give a file name in it")
     _refuse_special(path)
-    return path
 
 
 def _refuse_special(path: str | os.PathLike[str]) -> None:

@@ -47,9 +47,8 @@ COMMANDS = {
 
 def main() -> None:
     """Run the command line."""
-    if isinstance(
-        sys.stdout, io.TextIOWrapper
-    ):  # its encoding may lack signs such as µ
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Its encoding may lack signs such as µ.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         _require_here()

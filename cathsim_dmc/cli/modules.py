@@ -16,8 +16,7 @@ from cathsim_dmc.cli.options import say
 
 GROUP = "cathsim.tasks"
 # Commands that name a task.
-COMMANDS = ("train", "list", "eval", "record", "demos", "play", "serve", "export")
-COMMANDS += ("replay-error",)
+COMMANDS = tuple("train list eval record demos play serve export replay-error".split())
 
 
 class Own(NamedTuple):

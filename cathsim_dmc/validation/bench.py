@@ -96,21 +96,24 @@ class Experiment:
             **changes: of the setting: `friction`, `down`, `overshoot`; `device` by kind
                 of the wire.
         """
-        start, shapes = {"led": self._nearest(wire), "laid": wire}.get(way), []
+        arrive, shapes = self._arrival(wire, way), list[np.ndarray]()
         if way == "steered":
             changes = {"overshoot": TOO_FAR} | changes
-        elif way != "pushed" and start is None:
-            return _result(wire, [])
-        for turn in turns:
-            held = self.held(wire, self.field(scale), turn, **changes)
-            if start is not None:
-                shape = held.release(start.points)
-            elif way == "steered":
-                shape = held.steer(functools.partial(self.bench.is_astray, wire))
-            else:
-                shape = held.push()
-            shapes.append(shape)
+        if arrive is not None:
+            field = self.field(scale)
+            held = (self.held(wire, field, turn, **changes) for turn in turns)
+            shapes = [arrive(each) for each in held]
         return _result(wire, shapes)
+
+    def _arrival(self, wire: Wire, way: str) -> Callable[[Held], np.ndarray] | None:
+        """How a wire comes to its place; None if it is led and there is no other."""
+        if way == "pushed":
+            return Held.push
+        if way == "steered":
+            astray = functools.partial(self.bench.is_astray, wire)
+            return lambda held: held.steer(astray)
+        start = wire if way == "laid" else self._nearest(wire)
+        return None if start is None else lambda held: held.release(start.points)
 
     def centreline(self, wire: Wire) -> Result:
         """The vessel's centreline from the entry to the vessel that the tip is in."""
