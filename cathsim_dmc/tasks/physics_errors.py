@@ -33,7 +33,7 @@ def escaped(anatomy: Anatomy, centreline: np.ndarray, along: np.ndarray) -> np.n
     """
     outside = past_sheath(anatomy, centreline, along)
     outside[outside] = anatomy.lumen(centreline[outside]) < -_ESCAPE_DEPTH
-    return outside.any(-1)
+    return np.logical_or.reduce(outside, axis=-1)
 
 
 def found(
