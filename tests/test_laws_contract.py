@@ -16,6 +16,8 @@ from cathsim_dmc import laws, suite
 from cathsim_dmc.compiled import _Compiled, for_cuda, law
 from cathsim_dmc.laws import (
     bore,
+    coaxial,
+    coaxial_forces,
     compliance,
     contact,
     device,
@@ -28,6 +30,7 @@ from cathsim_dmc.laws import (
     planes,
     sheath,
     springs,
+    torsion,
     vectors,
     wall,
 )
@@ -231,6 +234,35 @@ def signatures():
     }
 
 
+def coaxial_signatures():
+    """The same of devices in each other, called by `sliding` on the host."""
+    one, two, three = (rows(REAL, axes) for axes in (1, 2, 3))
+    bent, bends = rows(types.complex128, 1), rows(types.complex128, 2)
+    tables = named(coaxial.Tables, *[one] * 2, *[two] * 3)
+    overlap = named(coaxial.Overlap, one, *[two] * 6)
+    posture = named(coaxial.Posture, one, bent, two)
+    sections = named(coaxial.Sections, one, one, two)
+    links = named(coaxial.Links, *[one] * 4, two)
+    memory = named(coaxial.Scratch, one, two, bent, bends)
+    lumen = named(coaxial_forces.Lumen, one, one, REAL, REAL)
+    rods = named(torsion.Rods, two, one)
+    scratch = named(torsion.Scratch, *[one] * 8)
+    return {
+        coaxial.overlap: (one, tables, memory, overlap),
+        coaxial.rest_angles: (two, two, bent),
+        coaxial.links: (overlap, one, REAL, sections, links),
+        coaxial_forces.restoring: (overlap, posture, memory, two, two),
+        coaxial_forces.axial: (tables, overlap, posture, two, memory, two),
+        coaxial_forces.pressure: (
+            *(tables, overlap, posture, two, lumen, memory, two, one),
+        ),
+        coaxial_forces.wall_friction: (one, two, one, REAL, two),
+        torsion.at_joints: (two, one, one, two),
+        torsion.at_nodes: (three, one, one, three),
+        torsion.turned: (two, one, rods, REAL, three, scratch, two),
+    }
+
+
 def laws_of_the_package():
     found = {}
     for module in pkgutil.iter_modules(laws.__path__):
@@ -261,7 +293,7 @@ def cuda(monkeypatch):
 @pytest.mark.slow
 def test_every_law_compiles_for_a_gpu(cuda):
     """To PTX, which needs the compilers of the extra gpu and no GPU."""
-    for root, arguments in signatures().items():
+    for root, arguments in (signatures() | coaxial_signatures()).items():
         made = for_cuda(root).py_func
         options = {"device": True, "cc": (9, 0), "abi": "numba"}
         ptx, _ = cuda.compile_ptx(made, arguments, **options)

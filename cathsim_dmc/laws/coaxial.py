@@ -131,11 +131,16 @@ def _weight(place, joint, nodes, lengths):
 @compiled
 def _breaks(gaps, edges, places):
     """Writes the places, m from the end, where a piece begins, in order."""
+    count = 0
     for k in range(edges.shape[0]):
         for e in range(edges.shape[1]):
-            places[k * edges.shape[1] + e] = min(gaps[k] + edges[k, e], _FAR)
-    places[-1] = _FAR
-    places.sort()
+            place, rank = min(gaps[k] + edges[k, e], _FAR), count
+            while rank > 0 and places[rank - 1] > place:
+                places[rank] = places[rank - 1]
+                rank -= 1
+            places[rank] = place
+            count += 1
+    places[count] = _FAR
 
 
 @compiled
