@@ -4,7 +4,7 @@
 
 Asks uv for versions that suit all Pythons and systems within constraints.txt. Two kinds
 of packages are left out, so `pip install --no-deps` installs the file: labmaze, which
-dm-control asks for and nothing here imports, and what torch needs for CUDA.
+dm-control asks for and nothing here imports, and what is for CUDA.
 """
 
 import re
@@ -21,7 +21,7 @@ HEAD = """\
 # and, where the index has torch with CUDA, with its CPU build before:
 #   --extra-index-url https://download.pytorch.org/whl/cpu
 """
-LEFT_OUT = re.compile(r"(labmaze|nvidia-|cuda-|triton)")
+LEFT_OUT = re.compile(r"(labmaze|nvidia-|cuda-|numba-cuda|triton)")
 
 
 def main() -> None:
