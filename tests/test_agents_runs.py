@@ -63,6 +63,8 @@ def test_a_run_without_its_replay_goes_on_if_asked(tmp_path, trained):
     lost = "replay of 768 transitions is lost: .*--without-replay"
     with pytest.raises(ReplayError, match=lost):
         run(config, tmp_path / "run", resume=True)
+    with pytest.raises(ConfigError, match="without_replay=True .* is for a run that"):
+        run(config, tmp_path / "run", without_replay=True)
     before = Checkpoint.open(tmp_path / "run").learning_state()["learner"]
     result = run(config, tmp_path / "run", resume=True, without_replay=True)
     assert result.metrics["replay_frames"] == 1_536 - 768

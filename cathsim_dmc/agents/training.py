@@ -97,12 +97,17 @@ def train(
     Raises:
         ConfigError: the directory holds a run that was not to be resumed, or one with
             other settings, or none that could be resumed; another process trains in
-            it; or the torch device cannot be used.
+            it; the torch device cannot be used; or `without_replay` comes alone.
         CheckpointError: the checkpoint to continue from is damaged.
         ReplayError: the files of its replay are missing or damaged.
         FloatingPointError: a loss is not finite; the last checkpoint stays.
         OSError: the disk is full, or the directory cannot be written to.
     """
+    if without_replay and not resume:
+        raise ConfigError(
+            "without_replay=True (--without-replay) is for a run that is resumed; give "
+            "resume=True (--resume) too, or leave it out"
+        )
     run = Path(out_dir)
     if config.modules:
         suite.known(config.task, config.modules)

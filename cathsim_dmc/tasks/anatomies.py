@@ -109,9 +109,10 @@ def load_arches(
         found.append(anatomy)
     closed = [a.name for a in found if placement.sheath_direction(a) is None]
     if closed:
+        instead = "other numbers" if numbers else "another first, or a smaller pool"
         raise ValueError(
             f"no sheath fits before the inlet of {', '.join(closed)}, whose aorta "
-            "bends back across it; give another first, or a smaller pool"
+            f"bends back across it; give {instead}"
         )
     return found
 
