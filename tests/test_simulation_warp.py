@@ -75,6 +75,41 @@ def test_worlds_follow_the_batch():
     assert len(at_wall) == pytest.approx(two.contacts().present[0].sum(), abs=1)
 
 
+@pytest.mark.slow
+@needs_warp
+@pytest.mark.parametrize(
+    ("task", "options"),
+    [
+        ("femoral_type1_lcca", {}),
+        ("type1_lcca", {"device": "berenstein_5f", "rotation": True}),
+        ("arch_lcca", {"pool": 2, "observation": ["route", "force"]}),
+    ],
+)
+def test_other_scenes_follow_the_batch(task, options):
+    """Accesses, shaped devices, and an anatomy of its own in each world."""
+    one, two = both(task, **options)
+    one.reset(), two.reset()
+    scenes = {id(two.rollout.case(index).scene) for index in range(4)}
+    assert len(scenes) == options.get("pool", 1)
+    random, forces, equal = np.random.RandomState(0), [], 0
+    for step in range(16):
+        if step == 4:  # into the next anatomy
+            one.reset(np.array([0, 1])), two.reset(np.array([0, 1]))
+        action = random.uniform(-1, 1, (4, one.num_actions))
+        action[:, -1] = 1.0
+        here, there = one.step(action), two.step(action)
+        tips = here.readings.head - there.readings.head
+        assert np.linalg.norm(tips, axis=1).max() < 0.1e-3
+        for key, value in here.observation.items():
+            np.testing.assert_allclose(there.observation[key], value, atol=0.02)
+        counts = [each.contacts().present.sum(axis=1) for each in (one, two)]
+        equal += int((counts[0] == counts[1]).sum())
+        forces.append((here.wall_force.sum, there.wall_force.sum))
+    totals = np.array(forces).sum(axis=(0, 2))
+    assert totals[1] == pytest.approx(totals[0], rel=0.01) and totals[0] > 0.0
+    assert equal >= 0.9 * 4 * 16
+
+
 @needs_warp
 @pytest.mark.parametrize(
     ("task", "options", "named"),

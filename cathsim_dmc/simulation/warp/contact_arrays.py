@@ -42,6 +42,9 @@ class Walls(NamedTuple):
         is_bore: (F,) whether a wall is a bore.
         middle: (F, 3) m, place of the carrier's middle in the frame of the wall.
         of_world: (N, C) wall of a carrier in each world.
+        places: (N, C, 3) m, of a carrier in each world. Warp has the same places of
+            what stands still in all worlds.
+        turns: (N, C, 3, 3), the axes of a carrier in columns.
     """
 
     head: Any
@@ -53,6 +56,8 @@ class Walls(NamedTuple):
     is_bore: Any
     middle: Any
     of_world: Any
+    places: Any
+    turns: Any
 
 
 class Fields(NamedTuple):

@@ -58,7 +58,7 @@ def _wall(walls, number):
 
 @compiled
 def _matrix(turns, world, geom):
-    """The nine numbers of a matrix of Warp, row by row, float64."""
+    """The nine numbers of a matrix, row by row, float64."""
     m = turns[world, geom]
     return (
         float(m[0, 0]), float(m[0, 1]), float(m[0, 2]),
@@ -130,13 +130,12 @@ def pair_of(thread, links, walls, fields, motion):
     count, worlds = len(links.geoms), len(walls.of_world)
     link, world = thread % count, (thread // count) % worlds
     which = thread // (count * worlds)
-    geom, carrier = links.geoms[link], links.carriers[which]
-    number = walls.of_world[world, which]
+    geom, number = links.geoms[link], walls.of_world[world, which]
     wall, middle = _wall(walls, number), walls.middle[number]
-    frame = _matrix(motion.geom_xmat, world, carrier)
+    frame = _matrix(walls.turns, world, which)
     turned = _matrix(motion.geom_xmat, world, geom)
     centre = _vector(motion.geom_xpos, world, geom)
-    origin = _vector(motion.geom_xpos, world, carrier)
+    origin = _vector(walls.places, world, which)
     axis = (turned[2], turned[5], turned[8])
     apart = (centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2])
     seen = into(frame, apart)

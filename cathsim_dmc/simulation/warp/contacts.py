@@ -58,29 +58,37 @@ class WallContacts:
         self._links = Links._make(map(device.constant, self._host))
         self._numbers: dict[tuple[float, ...], int] = {}
         self._parts: list[tuple[bool, np.ndarray, list[np.ndarray]]] = []
-        self._of_world = np.zeros((num_worlds, len(self.carriers)), np.int32)
-        self.enter(np.arange(num_worlds), model.geom_user[self.carriers])
+        shape = num_worlds, len(self.carriers)
+        self._of_world = np.zeros(shape, np.int32)
+        self._places, self._turns = np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
         self._walls: Walls | None = None
+        self.enter(np.arange(num_worlds), model, mujoco.MjData(model))
         self._scene: Scene | None = None
         self._written: Written | None = None
 
-    def enter(self, worlds: Sequence[int] | np.ndarray, users: np.ndarray) -> None:
-        """Gives some worlds the walls that their carriers name.
+    def enter(
+        self, worlds: Sequence[int] | np.ndarray, model: mujoco.MjModel,
+        data: mujoco.MjData,
+    ) -> None:  # fmt: skip
+        """Puts some worlds into an anatomy.
 
         Args:
             worlds: (K,) numbers of worlds.
-            users: (C, 4) `geom_user` of the carriers.
+            model: With the walls that the carriers name, and their places.
+            data: Of the model, in any posture; changes.
         """
-        for which, user in enumerate(users):
-            key = tuple(user.tolist())
+        mujoco.mj_kinematics(model, data)
+        for which, carrier in enumerate(self.carriers):
+            key = tuple(model.geom_user[carrier].tolist())
             wall = None if key in self._numbers else registered(key)
             if wall is not None:
                 self._numbers[key] = len(self._parts)
                 self._parts.append(wall)
                 self._walls = None
             self._of_world[worlds, which] = self._numbers[key]
-        if self._walls is not None:
-            self._device.write(self._walls.of_world, self._of_world)
+            self._places[worlds, which] = data.geom_xpos[carrier]
+            self._turns[worlds, which] = data.geom_xmat[carrier].reshape(3, 3)
+        self._entered = True
 
     @property
     def is_bound(self) -> bool:
@@ -110,8 +118,8 @@ class WallContacts:
         self._overflow = device.constant(np.zeros(self.num_worlds, np.int32))
         self._scene = Scene(self._links, self._walls, fields, motion, found)
         contacts = Contacts._make([*arrays, view(data.nacon)])
-        self._places = tuple(device.zeros(self.num_worlds) for _ in range(2))
-        self.counts, self.starts = map(view, self._places)
+        self._sums = tuple(device.zeros(self.num_worlds) for _ in range(2))
+        self.counts, self.starts = map(view, self._sums)
         self._written = Written(
             self._links, fields, found, contacts, self.counts, self.starts,
             self._overflow,
@@ -119,6 +127,11 @@ class WallContacts:
 
     def begin(self) -> None:
         """Begins a control step."""
+        if self._entered and self._walls is not None:
+            self._device.write(self._walls.of_world, self._of_world)
+            self._device.write(self._walls.places, self._places)
+            self._device.write(self._walls.turns, self._turns)
+            self._entered = False
         self._device.write(self._overflow, np.zeros(self.num_worlds, np.int32))
 
     def overflowed(self) -> np.ndarray:
@@ -131,7 +144,7 @@ class WallContacts:
         device, threads = self._device, self.num_worlds * self._host.dims.size
         device.launch(find, threads, SCRATCH, self._scene)
         device.launch(count, self.num_worlds, NONE, self._written)
-        device.sum_before(self._places[0], self._places[1])
+        device.sum_before(*self._sums)
         device.launch(place, threads, NONE, self._written)
 
     def _made(self) -> Walls:
@@ -155,7 +168,7 @@ class WallContacts:
             constant(starts),
             constant(np.array([part[0] for part in self._parts])),
             constant(np.array([part[1] for part in self._parts], np.float64)),
-            constant(self._of_world),
+            *map(constant, (self._of_world, self._places, self._turns)),
         )
         return Walls._make([*map(constant, joined), *rest])
 

@@ -119,9 +119,8 @@ class WarpStepper(Stepper):
         for name, value in case.fields.items():
             self._own[name][index, : len(value)] = value
             self._dirty.add(name)
-        users = self._own.get("geom_user")
-        if users is not None:
-            self.contacts.enter([index], users[index, self.contacts.carriers])
+        if case.fields:
+            self.contacts.enter([index], self._model_of(index), self._mine()[1])
 
     def _model_of(self, index: int) -> mujoco.MjModel:
         """A model of this thread with the fields of one simulation."""

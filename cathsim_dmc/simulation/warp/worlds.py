@@ -23,9 +23,8 @@ CONTACTS, ROWS = 48, 128
 SPARSE = True
 _WRITTEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl")
 _ALWAYS = ("qpos", "act", "ctrl")
-# Fields of a model that Warp's lacks or does not read: walls are found by `geom_user`,
-# boxes and bounding volumes serve MuJoCo's own collision.
-_HOST_ONLY = ("geom_user", "geom_aabb", "geom_rbound", "bvh_", "oct_", "mesh_", "name")
+# Fields of a model that Warp does not read here: boxes serve MuJoCo's own collision.
+_HOST_ONLY = ("geom_aabb", "geom_rbound", "mesh_")
 
 
 class Worlds:
@@ -75,8 +74,9 @@ class Worlds:
             entries = ROWS * model.nv
             sizes = {"nconmax": CONTACTS, "njmax": ROWS, "njmax_nnz": entries}
             self.data = self._mjwarp.make_data(prepared, nworld=count, **sizes)
-            for name in own:
-                self._expand(name, own[name])
+            # Those that do not collide are drawn, and Warp does not read them.
+            self._colliding = (model.geom_contype | model.geom_conaffinity) != 0
+            self._fields = {name for name in own if self._expand(name, own[name])}
             contacts.bind(self.model, self.data)
             self._contacts = contacts
             self.model.callback.contactfilter = contacts
@@ -88,21 +88,32 @@ class Worlds:
         self._graph: Any = None
         self.seconds: dict[str, float] = {}
 
-    def _expand(self, name: str, values: np.ndarray) -> None:
-        if name.startswith(_HOST_ONLY):
-            return
+    def _expand(self, name: str, values: np.ndarray) -> bool:
+        """Gives each world values (N, ...) of its own; False where none are needed."""
+        array = getattr(self.model, name, None)
         if name.startswith("opt."):
             raise NotImplementedError(f"{name} is the same in all worlds of Warp")
-        array = getattr(self.model, name, None)
-        if array is None or array.shape[0] != 1:
-            raise NotImplementedError(
-                f"{name} cannot differ between worlds of Warp; "
-                "take simulation_device='cpu'"
-            )
+        if name.startswith(_HOST_ONLY) or array is None:  # Warp does not read it
+            return False
+        if array.shape[0] != 1:
+            self._check_shared(name, values)
+            return False
         made = self._warp.array(
             self._shaped(values, array), dtype=array.dtype, device=self._device.name
         )
         setattr(self.model, name, made)
+        return True
+
+    def _check_shared(self, name: str, values: np.ndarray) -> None:
+        """Refuses a field that Warp has once, and whose values (N, ...) differ."""
+        if name.startswith("geom_"):
+            values = values[:, self._colliding]
+        # The same in another frame is the same but for rounding.
+        if not np.allclose(values, values[:1], rtol=1e-6, atol=1e-12):
+            raise NotImplementedError(
+                f"{name} cannot differ between worlds of Warp; "
+                "take simulation_device='cpu'"
+            )
 
     @staticmethod
     def _shaped(values: np.ndarray, array: Any) -> np.ndarray:
@@ -115,9 +126,11 @@ class Worlds:
     def write_model(self, own: Mapping[str, np.ndarray], names: Iterable[str]) -> None:
         """Writes fields of the model that have changed."""
         for name in names:
-            if not name.startswith(_HOST_ONLY):
-                array = getattr(self.model, name)
+            array = getattr(self.model, name, None)
+            if name in self._fields:
                 self._put(name, array, own[name])
+            elif array is not None and not name.startswith(_HOST_ONLY):
+                self._check_shared(name, own[name])
 
     def write(self, arrays: Any, whole: bool) -> None:
         """Writes the state of all worlds, or what the host changes in every step.
