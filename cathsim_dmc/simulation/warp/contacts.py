@@ -144,7 +144,7 @@ class WallContacts:
         device, threads = self._device, self.num_worlds * self._host.dims.size
         device.launch(find, threads, SCRATCH, self._scene)
         device.launch(count, self.num_worlds, NONE, self._written)
-        device.sum_before(*self._sums)
+        device.sum_before(self._sums[0], self._sums[1])
         device.launch(place, threads, NONE, self._written)
 
     def _made(self) -> Walls:
