@@ -6,6 +6,8 @@ import pytest
 from cathsim_dmc import suite
 from cathsim_dmc.imaging.biplane_loops import carried
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks import biplane_sight
+from cathsim_dmc.tasks.route import Route
 
 TASK = "type1_lcca"
 OPTIONS = {
@@ -66,6 +68,20 @@ def test_every_episode_has_errors_of_its_own_which_a_snapshot_keeps():
         found = batch.step(action).observation
         for key, value in one.items():
             np.testing.assert_array_equal(found[key], value, key)
+
+
+@pytest.mark.parametrize(
+    ("aside", "least", "deviation"), [(4, 0, 1.0), (4, 6, 1 / 3), (1, 6, -0.5)]
+)
+def test_a_narrow_route_with_errors_has_a_wider_tube(aside, least, deviation):
+    along = 1e-3 * np.arange(100)
+    points = np.stack([0 * along, 0 * along, along], axis=1)
+    route = Route(points, np.full(100, 2e-3), along)
+    line = points[50:10:-5] + [1e-3 * aside, 0.0, 0.0]
+    seen = biplane_sight._seen(
+        line, np.eye(3), route, points[-1], np.full(1, np.nan), 1e-3 * least
+    )
+    assert seen["deviation"] == pytest.approx(deviation)
 
 
 def test_one_plane_is_not_enough():

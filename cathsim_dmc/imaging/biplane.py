@@ -42,8 +42,9 @@ _ALONG, _GAP = 4.0, 3.0
 # Rays of the same place miss each other by less, px; where calibration matters most is
 # this far from the isocentre, m.
 _WIDEST, _FAR = 2.0, 0.1
-# The route is smoothed by a Gaussian of this deviation, m: three points of the hull.
-_SMOOTHING = 4e-3
+# The route is smoothed by a Gaussian of this deviation, m: three points of the hull. It
+# cuts corners, so between centrings less of it has to do.
+_SMOOTHING, _SLIGHTLY = 4e-3, 2e-3
 # Farther than this from its outlines, m, no place of a vessel is better than another.
 _WIDE = 12e-3
 _SHAFT = 1.6e-3  # m, width of a usual device
@@ -52,8 +53,8 @@ _EDGE = 0.25
 # Where outlines have errors. A route is centred so many times; round each of its points
 # in a disc of so many radii of the hull, and between these limits, m. What the views
 # show is pooled along the route over these deviations, m, for its middle and its lumen.
-_CENTRINGS, _DISC_RADII, _DISC = 3, 1.3, (4e-3, 12e-3)
-_POOLED_MIDDLE, _POOLED_LUMEN = 3e-3, 6e-3
+_CENTRINGS, _DISC_RADII, _DISC = 8, 1.3, (4e-3, 12e-3)
+_POOLED_MIDDLE, _POOLED_LUMEN = 2e-3, 6e-3
 _LEAST_ERROR = 0.2  # px
 _LEAST_LUMEN = 1e-3, 2e-3  # m, of outlines without and with errors
 
@@ -222,9 +223,9 @@ class Biplane:
         """
         start, goal = (np.asarray(end, dtype=np.float64) for end in (start, goal))
         found = self._path(start, goal)
-        line = _smoothed(np.vstack([start, found[1:-1], goal]))
+        line = _smoothed(np.vstack([start, found[1:-1], goal]), _SMOOTHING)
         for _ in range(_CENTRINGS if self._errors.any else 0):
-            line = _smoothed(self._centred(line))
+            line = _smoothed(self._centred(line), _SLIGHTLY)
         return line
 
     def _centred(self, line: np.ndarray) -> np.ndarray:
@@ -275,17 +276,17 @@ class Biplane:
         return _THROUGH if self._errors.any else _OUTSIDE
 
 
-def _smoothed(line: np.ndarray) -> np.ndarray:
-    """A line (n, 3) smooth and in steps of `ROUTE_SPACING`, from end to end."""
+def _smoothed(line: np.ndarray, width: float) -> np.ndarray:
+    """A line (n, 3) smoothed over a width, m, in steps of `ROUTE_SPACING`."""
     from scipy.ndimage import gaussian_filter1d
 
     way = arc_lengths(line)
     line = interpolate(np.arange(0.0, way[-1], ROUTE_SPACING), way, line)
     # The ends stay where they are: the line continues beyond them, point reflected.
-    beyond = min(round(3 * _SMOOTHING / ROUTE_SPACING), len(line) - 1)
+    beyond = min(round(3 * width / ROUTE_SPACING), len(line) - 1)
     around = ((beyond, beyond), (0, 0))
     whole = np.pad(line, around, "reflect", reflect_type="odd")
-    smooth = gaussian_filter1d(whole, _SMOOTHING / ROUTE_SPACING, axis=0)
+    smooth = gaussian_filter1d(whole, width / ROUTE_SPACING, axis=0)
     return smooth[beyond : beyond + len(line)]
 
 

@@ -24,6 +24,9 @@ _FEWEST = 7
 # The direction of the head is that of the chord to this point behind the marker.
 _CHORD = 2
 _OUT = -1e-3  # m from the outline; behind, the device is in its sheath
+# The middle and the lumen of a narrow branch, and so the head's place in it, have the
+# errors of the outlines: there, deviations from the route count in this radius, m.
+_LEAST_TUBE = 6e-3
 
 
 class BiplaneSight:
@@ -98,7 +101,8 @@ class BiplaneSight:
             if fresh or self._routes[number] is None:
                 self._routes[number] = _route(machine, line, goal)
             route = self._routes[number]
-            rows.append(_seen(line, handles[k], route, goal, last[k : k + 1]))
+            least = _LEAST_TUBE * self._errors.any
+            rows.append(_seen(line, handles[k], route, goal, last[k : k + 1], least))
         return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
@@ -127,6 +131,7 @@ def _seen(
     route: Route,
     goal: np.ndarray,
     last: np.ndarray,
+    least: float,
 ) -> dict[str, np.ndarray]:
     ways = biplane.TRACE_SPACING * np.arange(len(line))
     direction = line[0] - line[_CHORD]
@@ -139,6 +144,9 @@ def _seen(
     back = (line[-1] - line[-2]) / biplane.TRACE_SPACING
     device = interpolate(places, ways, line) + beyond * back
     place = locate(route, head[None], last)
+    radius = np.interp(place.arc_length, route.arc_length, route.radii)
+    share = np.where(place.excess > 0.0, radius / np.maximum(radius, least), 1.0)
+    place = place._replace(excess=place.excess * share)
     ahead = look_ahead([route], np.zeros(1, int), place, head[None], frame[None])
     return {
         "points": ahead.points.ravel(),
