@@ -100,8 +100,8 @@ the lumen is pooled along it. By how much a head is out of it counts in radii of
 least. With errors of 0.5 (noise) and 0.25 pixels (erosion) on
 three roadmaps (60°, −30°, AP), towards the LCCA from the groin, 20 draws on each
 phantom (*outside*: share of the last 60 mm of the true line that is farther out of the
-lumen of the route than the memory of attempts allows; *aside*: mean distance of the true
-line in the branch from the route):
+lumen of the route than the memory of attempts allows; *aside*: mean distance of the
+true line in the branch from the route):
 
 | | type1 | type2 | source |
 |---|---|---|---|
