@@ -26,7 +26,7 @@ _CHORD = 2
 _OUT = -1e-3  # m from the outline; behind, the device is in its sheath
 # The middle and the lumen of a narrow branch, and so the head's place in it, have the
 # errors of the outlines: there, deviations from the route count in this radius, m.
-_LEAST_TUBE = 6e-3
+_LEAST_TUBE = 10e-3
 
 
 class BiplaneSight:
