@@ -105,7 +105,7 @@ true line in the branch from the route):
 
 | | type1 | type2 | source |
 |---|---|---|---|
-| outside | 1.9 % | 0.8 % | 27 November 2026, commit 2c0ddeb |
+| outside | 1.9 % | 0.8 % | 27 November 2026, commit 545a44d |
 | outside, without centring, pooling and this radius | 20 % | 33 % | the same |
 | aside, mm | 1.1 | 1.4 | the same |
 | aside, mm, without centring | 2.2 | 3.5 | the same |
