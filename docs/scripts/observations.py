@@ -96,8 +96,8 @@ from what an angiography suite has:
 
 Through roadmaps with errors, whose hull is thin and broken in narrow branches, the
 route goes on across gaps; it is centred on what the views together show round it, and
-the lumen is pooled along it. By how much a head is out of it counts in radii of 10 mm at
-least. With errors of 0.5 (noise) and 0.25 pixels (erosion) on
+the lumen is pooled along it. By how much a head is out of it counts in radii of 10 mm
+at least. With errors of 0.5 (noise) and 0.25 pixels (erosion) on
 three roadmaps (60°, −30°, AP), towards the LCCA from the groin, 20 draws on each
 phantom (*outside*: share of the last 60 mm of the true line that is farther out of the
 lumen of the route than the memory of attempts allows; *aside*: mean distance of the
