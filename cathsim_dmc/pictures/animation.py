@@ -148,7 +148,7 @@ def _draw_force(axes: Any, episode: Episode) -> Any:
     axes.set_xlim(0, time.max(initial=1e-3))
     axes.set_ylim(0, max(1.15 * force.max(initial=0.0), 1.0))
     axes.set_xlabel("s", fontsize=8, labelpad=0)
-    axes.set_ylabel("largest contact, mN", fontsize=8)
+    axes.set_ylabel("contact, mN", fontsize=8)
     axes.tick_params(labelsize=7)
     axes.spines[["top", "right"]].set_visible(False)
     return axes.axvline(0.0, color="0.2", lw=1.0)

@@ -108,6 +108,29 @@ CLIPS = (
         200,
     ),
     Clip("jam", "A straight push passes and jams", "push", "type1_lcca", 0, 120),
+    Clip(
+        "recovery",
+        "Navigator, bovine arch: it withdraws and tries again",
+        "pretrained:navigator",
+        "femoral_bovine_lcca",
+        1,
+    ),
+    Clip(
+        "image",
+        "Navigator that sees three views alone, Type II",
+        "pretrained:navigator_image",
+        "type2_lcca",
+        1,
+    ),
+    Clip(
+        "pair_any",
+        "Wire in catheter, random arch that the policy has not seen",
+        "pretrained:navigator_pair",
+        "arch_any_pair",
+        EVALUATION,
+        own_task=True,
+        options={"first": 7, "pool": 1, "arches": "test"},
+    ),
 )
 
 
