@@ -1,6 +1,7 @@
 """The scripted expert of coaxial devices."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,11 +9,13 @@ from test_policies import assert_same_in_composer
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.agents import evaluate
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.policies import coaxial_pursuit
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan
 from cathsim_dmc.policies.expert import Teacher
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import coaxial_ends
+from cathsim_dmc.tasks.objectives import Cannulation
 from cathsim_dmc.tasks.retry import Memory
 from cathsim_dmc.tasks.route import SIDE_AHEAD, Place, locate
 
@@ -128,6 +131,37 @@ def test_a_hard_push_slows_the_pair(environment):
     assert speeds[0] == pytest.approx(settings.speed)
     assert speeds[2] == pytest.approx(settings.speed * settings.creep)
     assert speeds[2] < speeds[1] < speeds[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "goal", "ways"),
+    [
+        ("type1", "lcca", [40e-3]),  # narrows once more, without a bend
+        ("type2", "lcca", [36e-3]),  # and bends once more, where it is narrow already
+        ("type3", "bca", [41e-3]),
+        ("bovine", "bca", [41e-3]),
+        ("bovine", "lcca", [53e-3, 35e-3]),
+    ],
+)
+def test_the_catheter_follows_to_a_take_off_close_to_the_first(
+    environment, monkeypatch, name, goal, ways
+):
+    """Where the one before is close, the pair looks farther ahead and goes slowly."""
+    anatomy = phantoms.load(name, access="descending")
+    objective = Cannulation.to(anatomy, anatomy.goal(goal))
+    case = SimpleNamespace(scene=environment.task.scene, objective=objective)
+    plan = CoaxialPlan.for_case(case)  # pyright: ignore[reportArgumentType]
+    left = plan.arc_length[-1] - np.array(coaxial_pursuit.take_offs(plan))
+    np.testing.assert_allclose(left, ways, atol=1e-3)
+    assert plan.arc_length[-1] - plan.ostium == pytest.approx(left[-1])
+    close = len(ways) == 2
+    assert plan.settings is (coaxial_pursuit.CLOSE if close else CoaxialPlan.settings)
+    assert close or plan.ostium == plan.arc_length[np.diff(plan.radii).argmin()]
+    if close:  # no longer, where the way between them is longer
+        monkeypatch.setattr(coaxial_pursuit, "_CLOSE", 0.9 * (ways[0] - ways[1]))
+        plan = CoaxialPlan.for_case(case)  # pyright: ignore[reportArgumentType]
+        assert plan.arc_length[-1] - plan.ostium == pytest.approx(left[0])
+        assert plan.settings is CoaxialPlan.settings
 
 
 @pytest.mark.slow

@@ -282,23 +282,30 @@ def shown(
     return np.stack([np.asarray(column, float) for column in columns], axis=-1)
 
 
-def blunt(settings: RetrySettings, route: Route, way: float = 20e-3) -> bool:
+def blunt(settings: RetrySettings, route: Route) -> bool:
     """Whether attempts of coaxial devices begin with the last of the leads.
 
     The bend before a take-off presses a wire on the outer wall of the vessel in the
     plane of the bend; it hooks a branch that leaves there, and passes by one that
     leaves aside or goes nearly straight on. The shaped end of a catheter, turned there,
     enters these.
-
-    Args:
-        way: Over which the directions before and after the take-off are measured, m.
     """
     ostium = float(route.arc_length[np.diff(route.radii).argmin()])
-    points = route.at(ostium + way * np.array([-2.0, -1.0, 0.0, 1.0]))
+    turn, planar = bend(route, ostium)
+    return turn < settings.sharp or planar < settings.planar
+
+
+def bend(route: Route, place: float, way: float = 20e-3) -> tuple[float, float]:
+    """Turn of a route at a place, rad, and cosine between its plane and that before.
+
+    Args:
+        place: arc length, m.
+        way: over which the directions before and after the place are measured, m.
+    """
+    points = route.at(place + way * np.array([-2.0, -1.0, 0.0, 1.0]))
     ways = np.diff(points, axis=0)
     ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
     turn = float(np.arccos(np.clip(ways[1] @ ways[2], -1.0, 1.0)))
     planes = np.cross(ways[:2], ways[1:])
     planes /= np.maximum(np.linalg.norm(planes, axis=1, keepdims=True), 1e-9)
-    planar = abs(float(planes[0] @ planes[1]))
-    return turn < settings.sharp or planar < settings.planar
+    return turn, abs(float(planes[0] @ planes[1]))

@@ -1,21 +1,26 @@
 """Two devices at work: a Simmons catheter reforms, and a pair cannulates a carotid.
 
-    python docs/scripts/pair_strip.py
+    python docs/scripts/pair_strip.py [SCAN]
 
-Writes docs/images/pair_simmons.png and docs/images/pair_cannulation.png. Needs no
-OpenGL; the same seeds give the same pictures.
+Writes docs/images/pair_simmons.png and docs/images/pair_cannulation.png; with the
+directory of an imported scan docs/images/pair_vertebral.png alone, where the learned
+policy goes into its left vertebral artery. Needs no OpenGL; the same seeds give the
+same pictures.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
 
 from cathsim_dmc import policies, suite
+from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.pictures.figure import DEVICES, Picture, background, draw_scene
 from cathsim_dmc.pictures.moment import Moment
 
@@ -48,11 +53,13 @@ def simmons() -> list[Moment]:
 
 
 def cannulation(
-    task: str = "femoral_type1_lcca_pair", seed: int = 0, moments: int = 6
+    task: str = "femoral_type1_lcca_pair", policy: str = "expert", **options: Any
 ) -> list[Moment]:
-    """The scripted expert drives both devices from the groin into a carotid."""
-    env = suite.load("cathsim", task, {"random": seed, "observation": "tracking"})
-    act = policies.in_environment(policies.make_policy("expert"), env)
+    """A policy drives both devices from the groin into a branch."""
+    player = load_policy(policy)
+    options = {"random": 0, "observation": player.observation, **options}
+    env = suite.load("cathsim", task, options)
+    act = policies.in_environment(player, env)
     timestep, seen = env.reset(), []
     while True:
         wire, catheter = 1e3 * env.task.devices.insertion
@@ -61,10 +68,9 @@ def cannulation(
         if timestep.last():
             break
         timestep = env.step(act(timestep))
-    print(f"{task}, seed {seed}: {env.task.termination} after {len(seen) - 1} steps")
+    print(f"{task}: {env.task.termination} after {len(seen) - 1} steps")
     env.close()
-    chosen = np.linspace(0, len(seen) - 1, moments).round().astype(int)
-    return [seen[index] for index in chosen]
+    return seen
 
 
 def _titled(env, words: str) -> Moment:
@@ -75,11 +81,27 @@ def _titled(env, words: str) -> Moment:
     )
 
 
-def strip(snapshots: Sequence[Moment], path: Path) -> None:
-    """Draws snapshots of one anatomy side by side, from the front."""
-    projection, picture = background(snapshots[0].surface, "front", 700)
+def last(seen: Sequence[Moment], way: float = 1.0, moments: int = 6) -> list[Moment]:
+    """Moments in which the head is within a way, m, of its last place."""
+    heads = np.array([one.device[-1] for one in seen])
+    far = np.linalg.norm(heads - heads[-1], axis=1) > way
+    first = np.flatnonzero(far)[-1] + 1 if far.any() else 0
+    chosen = np.linspace(first, len(seen) - 1, moments).round().astype(int)
+    return [seen[index] for index in chosen]
+
+
+def strip(
+    snapshots: Sequence[Moment], path: Path, view: str = "front", around: float = 0.0
+) -> None:
+    """Draws snapshots of one anatomy side by side, `around` m before the last head."""
+    size = 3600 if around else 700
+    projection, picture = background(snapshots[0].surface, view, size)
     left, right, low, high = projection.extent_mm
     low += BELOW * (high - low)
+    if around:
+        x, y = projection.flat_mm(snapshots[-1].device[-1])
+        left, right = x - 300.0 * around, x + 1e3 * around
+        low, high = y - 400.0 * around, y + 400.0 * around
     width = HEIGHT * (right - left) / (high - low)
     figure = Picture(
         figsize=(width * len(snapshots), HEIGHT + 0.5), dpi=DPI, layout="constrained"
@@ -88,6 +110,7 @@ def strip(snapshots: Sequence[Moment], path: Path) -> None:
     for panel, snapshot in zip(panels, snapshots, strict=True):
         draw_scene(panel, snapshot, projection, picture)
         panel.set_title(snapshot.title, fontsize=9)
+        panel.set_xlim(left, right)
         panel.set_ylim(low, high)
         panel.set_axis_off()
     names = ("guidewire", "catheter")
@@ -101,8 +124,18 @@ def strip(snapshots: Sequence[Moment], path: Path) -> None:
 
 
 def main() -> None:
+    if len(sys.argv) > 1:
+        options = {
+            "anatomy": sys.argv[1],
+            "goal": "lva",
+            "devices": suite.COAXIAL["pair"][0],
+        }
+        seen = cannulation("navigate", "pretrained:navigator_pair", **options)
+        path = IMAGES / "pair_vertebral.png"
+        strip(last(seen, 0.1, 4), path, "below", around=0.08)
+        return
     strip(simmons(), IMAGES / "pair_simmons.png")
-    strip(cannulation(), IMAGES / "pair_cannulation.png")
+    strip(last(cannulation()), IMAGES / "pair_cannulation.png")
 
 
 if __name__ == "__main__":
