@@ -195,7 +195,7 @@ def take_offs(route: Route) -> list[float]:
             far = not found or place > found[-1] + _APART
             if far and retry.bend(route, place)[0] > _BEND:
                 found.append(place)
-    return found or [float(route.arc_length[np.diff(radii).argmin()])]
+    return found or [route.narrowing]
 
 
 def _led(

@@ -290,8 +290,7 @@ def blunt(settings: RetrySettings, route: Route) -> bool:
     leaves aside or goes nearly straight on. The shaped end of a catheter, turned there,
     enters these.
     """
-    ostium = float(route.arc_length[np.diff(route.radii).argmin()])
-    turn, planar = bend(route, ostium)
+    turn, planar = bend(route, route.narrowing)
     return turn < settings.sharp or planar < settings.planar
 
 

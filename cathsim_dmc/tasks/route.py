@@ -45,6 +45,11 @@ class Route:
         fine = objective.route.resampled(ROUTE_SPACING)
         return cls(fine.points, fine.radii, fine.arc_length)
 
+    @property
+    def narrowing(self) -> float:
+        """Arc length, m, where the lumen narrows fastest."""
+        return float(self.arc_length[np.diff(self.radii).argmin()])
+
     def at(self, arc_length: np.ndarray) -> np.ndarray:
         """Point (..., 3) of the route; beyond its end, straight on."""
         held = interpolate(arc_length, self.arc_length, self.points)

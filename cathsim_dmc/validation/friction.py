@@ -122,12 +122,11 @@ class Capstan(NamedTuple):
         """Largest standard deviation of the ratio over its mean, in 5 mm of way."""
         part = (self.travel // _PART).astype(int)
         sliding = range(round(_LEAD / _PART), part.max() + 1)
-        return (
-            max(float(np.std(self.ratio[part == each])) for each in sliding) / self.mean
-        )
+        deviations = [self.ratio[part == each].std() for each in sliding]
+        return float(max(deviations)) / self.mean
 
     def checks(self) -> Iterator[Check]:
-        """Compares coefficients: a ratio near 1 would hide the error of a small one."""
+        """Coefficients (a ratio near 1 would hide errors of a small one) and ripple."""
         angle = np.degrees(self.angle)
         name = f"capstan, friction {self.friction:g} over {angle:.0f}°"
         note = f"friction {self.acting:.4f} acts, ratio {self.mean:.4f}, "
