@@ -3,6 +3,11 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import torch
+
+from cathsim_dmc import files, suite
+from cathsim_dmc.agents import loggers
+from cathsim_dmc.agents.collection import check_collector
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.dagger import DAgger, DAggerConfig
 from cathsim_dmc.agents.imitation import BC, BCConfig
@@ -47,3 +52,18 @@ def _choice(table: Mapping[str, Any], name: object, what: str) -> Any:
     if not isinstance(name, str) or name not in table:
         raise ConfigError(f"{what} {name!r} is unknown; choose one of {list(table)}.")
     return table[name]
+
+
+def check_usable(config: TrainingConfig) -> None:
+    """Refuses settings that cannot be used here: modules, device, logger, collectors.
+
+    Raises:
+        ConfigError: one of them cannot; the message says what can.
+    """
+    if config.modules:
+        suite.known(config.task, config.modules)
+    text = f"torch_device={config.torch_device!r} cannot be used here, 'cpu' always can"
+    with files.refused(ConfigError, text, (RuntimeError, AssertionError)):
+        torch.zeros(1, device=config.torch_device)
+    loggers.require(config.logger)
+    check_collector(config, LEARNERS[config.algorithm].learner)

@@ -18,20 +18,19 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
 
-from cathsim_dmc import files, suite
-from cathsim_dmc.agents import loggers
+from cathsim_dmc import files
 from cathsim_dmc.agents.checkpoint import (
     Checkpoint,
     CheckpointError,
     checkpoints_in,
     save_checkpoint,
 )
-from cathsim_dmc.agents.collection import check_collector, make_collector
+from cathsim_dmc.agents.collection import make_collector
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
 from cathsim_dmc.agents.learner import Learner
-from cathsim_dmc.agents.learners import LEARNERS
+from cathsim_dmc.agents.learners import LEARNERS, check_usable
 from cathsim_dmc.agents.networks import NetworkShapes, bounded
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 from cathsim_dmc.agents.training_log import TrainingLog, crossed, read_metrics
@@ -109,13 +108,7 @@ def train(
             "resume=True (--resume) too, or leave it out"
         )
     run = Path(out_dir)
-    if config.modules:
-        suite.known(config.task, config.modules)
-    text = f"torch_device={config.torch_device!r} cannot be used here, 'cpu' always can"
-    with files.refused(ConfigError, text, (RuntimeError, AssertionError)):
-        torch.zeros(1, device=config.torch_device)
-    loggers.require(config.logger)
-    check_collector(config, LEARNERS[config.algorithm].learner)
+    check_usable(config)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_only_process(run))
         checkpoint = _prepare(run, config, resume)
