@@ -21,9 +21,9 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.tasks import observations, placement
 from cathsim_dmc.tasks.anatomies import (
-    BRANCHES,
     arch_numbers,
     goal_of,
+    goals_for,
     load_anatomy,
     load_arches,
 )
@@ -153,8 +153,9 @@ def make_task(
         **options: Fields of `NavigationConfig`, options of the task's objective (such
             as `reward` and `goal_radius`); for `navigate`, `anatomy`, `goal` (a name,
             or (x, y, z) in the unit and frame of the file that the anatomy was
-            imported from) and `access`; for random arches, `arches`, `pool`, `first`
-            and `numbers`, see `load_arches`.
+            imported from) and `access`; for random arches, `goal` (a name, "any", or
+            one for each arch), `access`, and `arches`, `pool`, `first` and `numbers`,
+            see `load_arches`.
 
     Raises:
         ValueError: if the task or an option does not exist; lists those that do.
@@ -177,12 +178,10 @@ def make_task(
     goal = own.pop("goal", definition.goal or "bca")
     access = own.pop("access", definition.access)
     if definition.random_arch:
-        bounds.choice("goal", goal, ("any", *BRANCHES))
+        numbers = arch_numbers(own)
+        named = goals_for(goal, numbers)
         anatomies = load_arches(**({} if access is None else {"access": access}), **own)
-        named = [
-            goal_of(anatomy, goal, number)
-            for number, anatomy in zip(arch_numbers(own), anatomies, strict=True)
-        ]
+        named = list(map(goal_of, anatomies, named, numbers))
     else:
         chosen = own.get("anatomy", definition.anatomy or "type1")
         anatomies, named = [load_anatomy(chosen, access)], [goal]

@@ -90,6 +90,7 @@ def test_the_command_line_takes_a_place(text):
     assert TaskOptions(goal=text).given == {"goal": [1.5, -2.0, 30.0]}
     assert TaskOptions(goal="lcca").given == {"goal": "lcca"}
     assert TaskOptions(goal="1,2").given == {"goal": "1,2"}
+    assert TaskOptions(goal="lcca, any").given == {"goal": ["lcca", "any"]}
 
 
 def test_a_goal_is_not_reached_at_the_one_before_it(anatomy):

@@ -14,8 +14,9 @@ from cathsim_dmc.policies import coaxial_pursuit
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan
 from cathsim_dmc.policies.expert import Teacher
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import coaxial_ends
+from cathsim_dmc.tasks import coaxial_ends, take_offs
 from cathsim_dmc.tasks.objectives import Cannulation
+from cathsim_dmc.tasks.progress import Progress
 from cathsim_dmc.tasks.retry import Memory
 from cathsim_dmc.tasks.route import SIDE_AHEAD, Place, locate
 
@@ -101,7 +102,7 @@ def test_turning_by_the_error_turns_the_side_to_the_route(environment):
 
 def test_a_lead_comes_about_without_a_push():
     """In withdrawals nothing is pushed; else nothing goes faster than the first."""
-    settings, leads = CoaxialPlan.settings, CoaxialPlan.settings.retry.leads
+    settings, leads = CoaxialPlan.settings, CoaxialPlan.settings.retry.pattern.leads
     place = Place(np.full(2 * len(leads), 0.1), np.full(2 * len(leads), -0.5))
     retracting = np.repeat([True, False], len(leads))
     insertion = np.tile([0.1, 0.08], (len(retracting), 1))
@@ -151,14 +152,18 @@ def test_the_catheter_follows_to_a_take_off_close_to_the_first(
     objective = Cannulation.to(anatomy, anatomy.goal(goal))
     case = SimpleNamespace(scene=environment.task.scene, objective=objective)
     plan = CoaxialPlan.for_case(case)  # pyright: ignore[reportArgumentType]
-    left = plan.arc_length[-1] - np.array(coaxial_pursuit.take_offs(plan))
+    left = plan.arc_length[-1] - np.array(take_offs.take_offs(plan))
     np.testing.assert_allclose(left, ways, atol=1e-3)
     assert plan.arc_length[-1] - plan.ostium == pytest.approx(left[-1])
     close = len(ways) == 2
     assert plan.settings is (coaxial_pursuit.CLOSE if close else CoaxialPlan.settings)
+    progress = Progress(["route_retry"], [case], 1, False)  # pyright: ignore[reportArgumentType]
+    rows, readings = np.zeros(1, int), environment.task.rollout.readings
+    progress.see(rows, True, rows, readings, {})
+    assert progress.memory is not None and progress.memory.close.tolist() == [close]
     assert close or plan.ostium == plan.arc_length[np.diff(plan.radii).argmin()]
     if close:  # no longer, where the way between them is longer
-        monkeypatch.setattr(coaxial_pursuit, "_CLOSE", 0.9 * (ways[0] - ways[1]))
+        monkeypatch.setattr(take_offs, "CLOSE", 0.9 * (ways[0] - ways[1]))
         plan = CoaxialPlan.for_case(case)  # pyright: ignore[reportArgumentType]
         assert plan.arc_length[-1] - plan.ostium == pytest.approx(left[0])
         assert plan.settings is CoaxialPlan.settings

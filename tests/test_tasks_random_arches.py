@@ -11,6 +11,7 @@ from cathsim_dmc.physics.readings import part
 from cathsim_dmc.pictures.recorded import record, surface_of
 from cathsim_dmc.policies.pursuit import Plan
 from cathsim_dmc.tasks import cases, placement
+from cathsim_dmc.tasks.anatomies import goals_for
 from cathsim_dmc.tasks.physics_errors import ESCAPE_INTERVAL
 
 POOL = 3
@@ -116,6 +117,15 @@ def test_arches_are_chosen_by_their_numbers():
     assert [one.name for one in chosen] == [names(n, 1, "test")[0] for n in (7, 2)]
     task = suite.make_task("arch_any", arches="test", numbers=[2])
     assert task.scene.anatomy.name == chosen[1].name
+    each, alone = (
+        suite.make_task("arch_any", numbers=numbers, goal=goal).objective.goal
+        for numbers, goal in (([3, 3], ["lsa", "lcca"]), ([3], "lsa"))
+    )
+    np.testing.assert_array_equal(each, alone)
+    assert goals_for(["lsa", "lcca"], [3, 3]) == ["lsa", "lcca"]
+    for goal, message in ((["lsa"], "1 names for 2 arches"), (["lsa", "x"], "goal")):
+        with pytest.raises(ValueError, match=message):
+            suite.make_task("arch_any", numbers=[3, 2], goal=goal)
     with pytest.raises(ValueError, match="leave out pool and first"):
         suite.make_task("arch_any", numbers=[2], pool=1)
     for wrong, message in (([98], "numbers"), ([], "numbers"), ([1.5], "numbers")):

@@ -122,9 +122,15 @@ def test_attempts_differ_in_what_policies_see():
         rows = np.delete(seen, 4, axis=1)  # without their number
         distinct = {tuple(row) for row in rows.round(6)}
         assert len(distinct) == (8 if coaxial else 6)
-    first = memory._replace(first=np.full(8, len(COAXIAL.leads) - 1))
-    assert retry.lead(COAXIAL, first)[0] == COAXIAL.leads[-1]
-    assert retry.lead(COAXIAL, first)[1] == COAXIAL.leads[0]
+    first = memory._replace(first=np.full(8, len(COAXIAL.pattern.leads) - 1))
+    assert retry.lead(COAXIAL, first)[0] == COAXIAL.pattern.leads[-1]
+    assert retry.lead(COAXIAL, first)[1] == COAXIAL.pattern.leads[0]
+    close = memory._replace(close=np.arange(8) < 4)
+    pair = COAXIAL.close.leads + COAXIAL.pattern.leads
+    assert retry.lead(COAXIAL, close).tolist() == list(pair)
+    assert retry.shown(COAXIAL, close, insertion, insertion, True)[
+        0, 12
+    ] == pytest.approx(1.8)
 
 
 # In tasks.

@@ -23,7 +23,8 @@ class TaskOptions:
     Attributes:
         anatomy: Directory of an anatomy, or name of an arch (`navigate`).
         goal: Name of the goal in it, or a place x,y,z of the lumen in the unit and
-            frame of the file that it was imported from (`navigate`).
+            frame of the file that it was imported from (`navigate`). Of random arches
+            "any" for one branch after the other, or a name for each arch: lcca,any.
         access: Way in: "ascending", from the ascending aorta, or "descending", from
             the femoral artery (`navigate`).
         arches: Set of random arches that episodes draw from: train, test or
@@ -45,18 +46,19 @@ class TaskOptions:
     def given(self) -> dict[str, Any]:
         """The options that were given, by name."""
         given = {name: one for name, one in vars(self).items() if one is not None}
-        if self.goal is not None and (place := _place(self.goal)):
-            given["goal"] = place
+        if self.goal is not None and (several := _several(self.goal)):
+            given["goal"] = several
         return given
 
 
-def _place(text: str) -> list[float] | None:
-    """The three numbers of a text such as 12,-30.5,110, or None if it is no place."""
+def _several(text: str) -> list[float] | list[str] | None:
+    """The parts of a text such as 12,-30.5,110, a place, or lcca,any; None of one."""
+    parts = text.strip("[]() ").split(",")
     try:
-        numbers = [float(part) for part in text.strip("[]() ").split(",")]
+        place = [float(part) for part in parts]
     except ValueError:
-        return None
-    return numbers if len(numbers) == 3 else None
+        return [part.strip() for part in parts] if len(parts) > 1 else None
+    return place if len(place) == 3 else None
 
 
 def _read(words: list[str]) -> Any:

@@ -34,21 +34,16 @@ from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.policies import attempts
 from cathsim_dmc.policies.attempts import AttemptSettings, State
-from cathsim_dmc.tasks import retry
+from cathsim_dmc.tasks import retry, take_offs
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.coaxial_ends import CoaxialEnds
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.retry import Memory, RetrySettings
-from cathsim_dmc.tasks.route import ROUTE_SPACING, Place, Route
+from cathsim_dmc.tasks.route import Place, Route
 
 # What a full action moves (m) and turns (rad) a device by in a control step.
 _MOVE = MAX_PUSH_SPEED * CONTROL_TIMESTEP
 _TURN = MAX_ROTATION_SPEED * CONTROL_TIMESTEP
-# A take-off: a lumen of this radius, m, or more falls below this share of itself within
-# this way, m, at a bend of this angle, rad, and this far, m, behind the last take-off.
-# In narrower vessels all devices follow the wall.
-_WIDE, _SHARE, _WITHIN, _BEND, _APART = 4.5e-3, 0.75, 10e-3, 0.6, 15e-3
-_CLOSE = 30e-3  # m from one take-off to the next
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,16 +78,7 @@ class CoaxialSettings(AttemptSettings):
 
 
 # Of a route whose first two take-offs are close to each other.
-CLOSE = CoaxialSettings(
-    retry=dataclasses.replace(
-        retry.COAXIAL,
-        lookahead_factors=(3.64, 2.6, 1.95, 2.6),
-        leads=(0.036, -0.02, 0.05, -0.02),
-        offsets=(0.0, 0.0, 0.0, 0.0, 0.4, 0.4, -0.4, -0.4),
-    ),
-    aligned=0.9,
-    misaligned=0.3,
-)
+CLOSE = CoaxialSettings(aligned=0.9, misaligned=0.3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,16 +100,13 @@ class CoaxialPlan(Route):
     def for_case(cls, case: Case) -> "CoaxialPlan":
         """Reads off an anatomy of a task."""
         route = Route.of(case.objective)
-        first, *others = take_offs(route)
-        ostium = first
-        for place in others:
-            # To one farther on, a limp wire goes better alone.
-            ostium = place if place < ostium + _CLOSE else ostium
+        # To a take-off farther on, a limp wire goes better alone.
+        ostium, close = take_offs.followed(route)
         return cls(
             **vars(route),
             ends=CoaxialEnds.of(case.scene.catheter),
             ostium=ostium,
-            settings=cls.settings if ostium == first else CLOSE,
+            settings=CLOSE if close else cls.settings,
         )
 
     def fresh(self, shape: tuple[int, ...]) -> State:
@@ -176,26 +159,6 @@ class CoaxialPlan(Route):
         insertion, arc_length = np.array(readings.insertion), np.array(place.arc_length)
         state = state._replace(arc_length=arc_length, insertion=insertion)
         return np.clip(action, -1.0, 1.0), state
-
-
-def take_offs(route: Route) -> list[float]:
-    """Arc lengths, m, where a route leaves one vessel for a narrower one, one or more.
-
-    Each is where the lumen narrows fastest. Where it does not narrow at a bend, it is
-    where the route narrows fastest of all.
-    """
-    radii, way = route.radii, round(_WITHIN / ROUTE_SPACING)
-    wide = radii[:-way] >= _WIDE
-    narrows = np.flatnonzero(wide & (radii[way:] < _SHARE * radii[:-way]))
-    found: list[float] = []
-    for run in np.split(narrows, np.flatnonzero(np.diff(narrows) > 1) + 1):
-        if len(run):
-            steepest = run[0] + np.diff(radii[run[0] : run[-1] + way + 1]).argmin()
-            place = float(route.arc_length[steepest])
-            far = not found or place > found[-1] + _APART
-            if far and retry.bend(route, place)[0] > _BEND:
-                found.append(place)
-    return found or [route.narrowing]
 
 
 def _led(

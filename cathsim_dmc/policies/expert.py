@@ -114,9 +114,8 @@ class Teacher:
         self._last = np.full((2, view.num_simulations), np.nan)
         # A longer look-ahead than the expert's needs no retry: with 1.4 a pair stops
         # short of the left common carotid, with 1.8 to 2.4 it reaches it.
-        one = dataclasses.replace(
-            retry.COAXIAL, leads=(lead,), offsets=(0.0,), lookahead_factors=(2.0,)
-        )
+        pattern = retry.Pattern(lookahead_factors=(2.0,), leads=(lead,))
+        one = dataclasses.replace(retry.COAXIAL, pattern=pattern)
         self._one_lead = CoaxialSettings(retry=one)
 
     def reset(self, which: np.ndarray) -> None:

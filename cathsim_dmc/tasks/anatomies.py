@@ -117,6 +117,23 @@ def load_arches(
     return found
 
 
+def goals_for(goal: str | Sequence[str], numbers: Sequence[int]) -> list[str]:
+    """The option `goal` for each arch: a name or "any" for all, or one for each.
+
+    Raises:
+        ValueError: if it is something else, or not as many as there are arches.
+    """
+    each = [goal] * len(numbers) if isinstance(goal, str) else list(goal)
+    for one in each:
+        bounds.choice("goal", one, ("any", *BRANCHES))
+    if len(each) != len(numbers):
+        raise ValueError(
+            f"option goal has {len(each)} names for {len(numbers)} arches; give one "
+            "name for all of them, or one for each"
+        )
+    return each
+
+
 def goal_of(anatomy: Anatomy, goal: str, number: int) -> str:
     """Name of a goal; "any" is one branch after the other, by the arch's number."""
     if goal != "any":

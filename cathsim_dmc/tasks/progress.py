@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
-from cathsim_dmc.tasks import coaxial_ends, observations, retry
+from cathsim_dmc.tasks import coaxial_ends, observations, retry, take_offs
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.coaxial_ends import CoaxialEnds
 from cathsim_dmc.tasks.observation_kind import COAXIAL_ROUTE, ROUTE
@@ -73,9 +73,11 @@ class Progress:
         routes = [] if self._of_images else self._routes
         least = _ROOM * self._radius
         tight = [route.arc_length[route.radii < least] for route in routes]
-        last = len(self.settings.leads) - 1
+        last = len(self.settings.pattern.leads) - 1
         blunt = [retry.blunt(self.settings, route) for route in routes]
         self._tight, self._first = tight, last * np.array(blunt, int)
+        close = [self._coaxial and take_offs.followed(route)[1] for route in routes]
+        self._close = np.array(close, bool)
         nowhere = Place(np.full(self._count, np.nan), np.zeros(self._count))
         self.memory = Memory.at(nowhere, np.zeros(self._count))
 
@@ -170,7 +172,7 @@ class Progress:
         assert self.memory is not None
         new = Memory.at(place, insertion)
         if len(self._first):
-            new = new._replace(first=self._first[chosen])
+            new = new._replace(first=self._first[chosen], close=self._close[chosen])
         begun = np.zeros(self._count, bool)
         begun[rows] = True
         pairs = zip(self.memory, new, strict=True)

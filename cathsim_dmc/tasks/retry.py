@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cathsim_dmc.tasks.route import Place, Route
+from cathsim_dmc.tasks.take_offs import bend
 
 _WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
 _GROWING = 4  # retries over which the way back grows
@@ -36,6 +37,22 @@ SHOWN = (
     "slack is taken up, the lead of the attempt / 20 mm, cosine and sine of its offset "
     "in direction"
 )
+
+
+@dataclasses.dataclass(frozen=True)
+class Pattern:
+    """What successive attempts differ in, over and over.
+
+    Attributes:
+        lookahead_factors: of the look-ahead.
+        leads: by how much each coaxial device is ahead of the one around it, m;
+            negative where it stays behind in it.
+        offsets: added to the direction of coaxial devices, rad.
+    """
+
+    lookahead_factors: tuple[float, ...] = (1.0, 0.75, 1.3)
+    leads: tuple[float, ...] = (0.0,)
+    offsets: tuple[float, ...] = (0.0,)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,10 +73,8 @@ class RetrySettings:
         slack: Buckling threshold: advance of the base without the head, m.
         give: distance that the head may move back while slack is taken up, m.
         thorough: every n-th retry withdraws the whole way, not the slack alone.
-        lookahead_factors: of the look-ahead in successive attempts, over and over.
-        leads: by how much each coaxial device is ahead of the one around it in
-            successive attempts, over and over, m; negative where it stays behind in it.
-        offsets: added to the direction of coaxial devices likewise, rad.
+        pattern: of the attempts.
+        close: likewise on routes with a take-off close to the first one.
         sharp, planar: turn of the route into its last branch, rad, and cosine between
             the planes of this turn and of the bend before it, below either of which
             the attempts begin with the last of the leads, see `blunt`.
@@ -78,9 +93,8 @@ class RetrySettings:
     slack: float = np.inf
     give: float = 0.0
     thorough: int = 1
-    lookahead_factors: tuple[float, ...] = (1.0, 0.75, 1.3)
-    leads: tuple[float, ...] = (0.0,)
-    offsets: tuple[float, ...] = (0.0,)
+    pattern: Pattern = Pattern()
+    close: Pattern = Pattern()
     sharp: float = 0.0
     planar: float = -1.0
 
@@ -95,9 +109,16 @@ COAXIAL = RetrySettings(
     slack=12e-3,
     give=2e-3,
     thorough=4,
-    lookahead_factors=(1.4, 1.0, 0.75),
-    leads=(0.02, -0.03, -0.045, -0.02),
-    offsets=(0.0, 0.0, 0.0, 0.7, -0.7, 0.0, 1.4, -1.4),
+    pattern=Pattern(
+        lookahead_factors=(1.4, 1.0, 0.75),
+        leads=(0.02, -0.03, -0.045, -0.02),
+        offsets=(0.0, 0.0, 0.0, 0.7, -0.7, 0.0, 1.4, -1.4),
+    ),
+    close=Pattern(
+        lookahead_factors=(3.64, 2.6, 1.95, 2.6),
+        leads=(0.036, -0.02, 0.05, -0.02),
+        offsets=(0.0, 0.0, 0.0, 0.0, 0.4, 0.4, -0.4, -0.4),
+    ),
     sharp=0.84,
     planar=0.85,
 )
@@ -121,6 +142,7 @@ class Memory(NamedTuple):
         pushed: number of these retries at that place.
         attempts: retries so far.
         first: number of the lead that the first attempt has.
+        close: bool, whether the route has a take-off close to the first one.
         given_up: bool, whether there is no further attempt.
     """
 
@@ -138,6 +160,7 @@ class Memory(NamedTuple):
     pushed: np.ndarray
     attempts: np.ndarray
     first: np.ndarray
+    close: np.ndarray
     given_up: np.ndarray
 
     @classmethod
@@ -151,7 +174,7 @@ class Memory(NamedTuple):
             best=arc_length,
             held=np.array(insertion),
             barrier=arc_length,
-            **dict.fromkeys(("retracting", "taking_up", "given_up"), no),
+            **dict.fromkeys(("retracting", "taking_up", "close", "given_up"), no),
             **dict.fromkeys(("stale", "lost", "pressed"), none),
             **dict.fromkeys(("pushed", "attempts", "first"), none),
             turn=zero,
@@ -237,21 +260,34 @@ def _barrier(
 
 def lookahead(settings: RetrySettings, memory: Memory) -> np.ndarray:
     """Factor (...) of the look-ahead in the present attempt."""
-    return _nth(settings.lookahead_factors, memory.attempts)
+    usual, close = settings.pattern, settings.close
+    number, factors = (
+        memory.attempts,
+        (usual.lookahead_factors, close.lookahead_factors),
+    )
+    return _nth(factors, number, memory)
 
 
 def lead(settings: RetrySettings, memory: Memory) -> np.ndarray:
     """Lead (...) of coaxial devices in the present attempt, m."""
-    return _nth(settings.leads, memory.attempts + memory.first)
+    leads = settings.pattern.leads, settings.close.leads
+    return _nth(leads, memory.attempts + memory.first, memory)
 
 
 def offset(settings: RetrySettings, memory: Memory) -> np.ndarray:
     """Offset (...) of the direction of coaxial devices likewise, rad."""
-    return _nth(settings.offsets, memory.attempts)
+    offsets = settings.pattern.offsets, settings.close.offsets
+    return _nth(offsets, memory.attempts, memory)
 
 
-def _nth(values: tuple[float, ...], number: np.ndarray) -> np.ndarray:
-    return np.asarray(values)[number % len(values)]
+def _nth(
+    values: tuple[tuple[float, ...], tuple[float, ...]],
+    number: np.ndarray,
+    memory: Memory,
+) -> np.ndarray:
+    """Those (...) of most routes, or of routes with two take-offs close together."""
+    usual, close = (np.asarray(v)[number % len(v)] for v in values)
+    return np.where(memory.close, close, usual)
 
 
 def shown(
@@ -264,7 +300,7 @@ def shown(
     """What a policy sees of it: (..., `RETRY_ENTRIES` or `COAXIAL_RETRY_ENTRIES`)."""
     m, s = memory, settings
     left = np.clip((insertion - m.turn) / _SEEN_WAY, -1.0, 2.0)
-    turns = m.attempts % len(s.lookahead_factors)
+    turns = m.attempts % len(s.pattern.lookahead_factors)
     columns = [
         m.retracting,
         np.where(m.retracting, left, 0.0),
@@ -292,19 +328,3 @@ def blunt(settings: RetrySettings, route: Route) -> bool:
     """
     turn, planar = bend(route, route.narrowing)
     return turn < settings.sharp or planar < settings.planar
-
-
-def bend(route: Route, place: float, way: float = 20e-3) -> tuple[float, float]:
-    """Turn of a route at a place, rad, and cosine between its plane and that before.
-
-    Args:
-        place: arc length, m.
-        way: over which the directions before and after the place are measured, m.
-    """
-    points = route.at(place + way * np.array([-2.0, -1.0, 0.0, 1.0]))
-    ways = np.diff(points, axis=0)
-    ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
-    turn = float(np.arccos(np.clip(ways[1] @ ways[2], -1.0, 1.0)))
-    planes = np.cross(ways[:2], ways[1:])
-    planes /= np.maximum(np.linalg.norm(planes, axis=1, keepdims=True), 1e-9)
-    return turn, abs(float(planes[0] @ planes[1]))
