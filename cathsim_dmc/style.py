@@ -29,6 +29,10 @@ def tidy(axes: Any) -> None:
 def save(figure: Any, path: str | Path, dpi: int = 110) -> None:
     """Writes a matplotlib figure as PNG, whole or not at all."""
     require_file(path, make=True)
+    figure.set_dpi(dpi)
+    if layout := figure.get_layout_engine():
+        # Once: matplotlib would draw the figure a second time for it.
+        layout.execute(figure)
+        figure.set_layout_engine("none")
     with atomic_path(path) as temporary:
-        options = {"format": "png", "pil_kwargs": {"optimize": True}}
-        figure.savefig(temporary, dpi=dpi, **options)
+        figure.savefig(temporary, dpi=dpi, format="png")

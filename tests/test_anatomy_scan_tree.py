@@ -26,7 +26,7 @@ from cathsim_dmc.anatomy.scan.tree import grow_tree
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
-from cathsim_dmc.pictures.figure import anatomy_figure
+from cathsim_dmc.pictures.anatomies import anatomy_figure
 
 
 def tube(points, radii):

@@ -14,8 +14,9 @@ from cathsim_dmc import suite
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.physics.forces import PEAK_NOTE
 from cathsim_dmc.pictures import curves, recorded
+from cathsim_dmc.pictures.anatomies import Picture
 from cathsim_dmc.pictures.animation import animate
-from cathsim_dmc.pictures.figure import Picture, draw_fluoroscopy, scene_figure
+from cathsim_dmc.pictures.figure import draw_fluoroscopy, scene_figure
 from cathsim_dmc.pictures.moment import Moment, on_screen, xray
 from cathsim_dmc.pictures.readout import LEAST_FORCE
 from cathsim_dmc.pictures.recorded import write, xray_film

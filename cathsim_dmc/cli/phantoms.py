@@ -17,7 +17,7 @@ from cathsim_dmc.anatomy.scan.places import describe
 from cathsim_dmc.anatomy.tree_file import read_tree
 from cathsim_dmc.cli.options import Json, print_json, say, show
 from cathsim_dmc.entities import devices
-from cathsim_dmc.pictures.figure import anatomy_figure
+from cathsim_dmc.pictures.anatomies import anatomy_figure
 from cathsim_dmc.tasks.anatomies import load_anatomy
 
 phantoms = SubcommandApp()

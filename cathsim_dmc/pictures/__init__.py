@@ -6,20 +6,18 @@ that `import cathsim_dmc` is enough in a notebook.
 """
 
 import dataclasses
+import importlib
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.pictures.moment import Moment, xray
-from cathsim_dmc.pictures.readout import ForceReadout, forces
-from cathsim_dmc.pictures.recorded import record, surface_of, write
-from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.recorder import navigation_of
-
 if TYPE_CHECKING:
-    from cathsim_dmc.pictures.figure import Picture
+    from cathsim_dmc.pictures.anatomies import Picture
+    from cathsim_dmc.pictures.moment import Moment
+    from cathsim_dmc.pictures.readout import ForceReadout, forces
+    from cathsim_dmc.pictures.recorded import record, write
+    from cathsim_dmc.recording.episode import Episode
 
 __all__ = [
     "Episode",
@@ -32,10 +30,25 @@ __all__ = [
     "show",
     "write",
 ]
+_MODULES = {
+    "Episode": "cathsim_dmc.recording.episode",
+    "ForceReadout": "cathsim_dmc.pictures.readout",
+    "Moment": "cathsim_dmc.pictures.moment",
+    "forces": "cathsim_dmc.pictures.readout",
+    "record": "cathsim_dmc.pictures.recorded",
+    "write": "cathsim_dmc.pictures.recorded",
+}
+
+
+def __getattr__(name: str) -> Any:
+    # Lazy, so that a picture of an anatomy alone does not load the simulation.
+    if name in _MODULES:
+        return getattr(importlib.import_module(_MODULES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def show(
-    env: Any, episode: Episode | None = None, *, step: int = -1, **options: Any
+    env: Any, episode: "Episode | None" = None, *, step: int = -1, **options: Any
 ) -> Any:
     """Draw anatomy, device, goal and contact forces.
 
@@ -56,6 +69,8 @@ def show(
         RuntimeError: no episode is given, and none has begun.
     """
     from cathsim_dmc.pictures.figure import scene_figure
+    from cathsim_dmc.pictures.moment import Moment
+    from cathsim_dmc.pictures.recorded import surface_of
 
     _check(options, scene_figure.__kwdefaults__ or ())
     if episode is None:
@@ -64,7 +79,7 @@ def show(
     return scene_figure(moment, **options)
 
 
-def plot(episode: Episode) -> "Picture":
+def plot(episode: "Episode") -> "Picture":
     """Draw forces, insertion and distance of an episode over time, with its phases.
 
     Args:
@@ -101,7 +116,10 @@ def fluoroscopy(env: Any, *, seed: int = 0, **options: Any) -> np.ndarray:
         ValueError: an option's value is not possible.
         RuntimeError: no episode has begun.
     """
-    base: FluoroscopyOptions = navigation_of(env).config.fluoroscopy
+    from cathsim_dmc.pictures.moment import Moment, xray
+    from cathsim_dmc.recording.recorder import navigation_of
+
+    base = navigation_of(env).config.fluoroscopy
     _check(options, vars(base))
     return xray(Moment.of(env), dataclasses.replace(base, **options), seed)
 

@@ -13,6 +13,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.files import atomic_path, require_file
 from cathsim_dmc.pictures import figure as drawing
+from cathsim_dmc.pictures.anatomies import Picture
 from cathsim_dmc.pictures.films import MP4, check_film, write_mp4
 from cathsim_dmc.pictures.moment import Moment, on_screen
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
@@ -107,7 +108,7 @@ def _frames(
     projection = dataclasses.replace(rough, pixels=pixels)
     rest = glass(surface, projection)
     size, share = (width / _DPI, height / _DPI), left / (left + 0.66)
-    figure = drawing.Picture(figsize=size, dpi=_DPI, facecolor="white")
+    figure = Picture(figsize=size, dpi=_DPI, facecolor="white")
     scene = figure.add_axes((0, 0, share, 1))
     beside = figure.add_axes((share + 0.01, 0.34, 0.98 - share, 0.64))
     below = figure.add_axes((share + 0.09, 0.1, 0.89 - share, 0.19))

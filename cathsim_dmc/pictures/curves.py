@@ -8,7 +8,7 @@ from matplotlib.patches import Patch
 from scipy.ndimage import median_filter
 
 from cathsim_dmc.physics.forces import PEAK_NOTE
-from cathsim_dmc.pictures.figure import Picture
+from cathsim_dmc.pictures.anatomies import Picture
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.style import COLOURS
 

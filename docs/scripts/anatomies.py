@@ -16,7 +16,7 @@ from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
-from cathsim_dmc.pictures.figure import anatomy_figure, draw_anatomy
+from cathsim_dmc.pictures.anatomies import anatomy_figure, draw_anatomy
 from cathsim_dmc.validation import wall
 
 ROOT = Path(__file__).parents[1]

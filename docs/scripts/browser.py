@@ -36,7 +36,7 @@ from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.pictures import record
-from cathsim_dmc.pictures.figure import background
+from cathsim_dmc.pictures.anatomies import background
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.simulation.mjcf import write_mjcf
 

@@ -29,7 +29,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.agents import load_policy
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.device import Shadow
-from cathsim_dmc.pictures.figure import Picture
+from cathsim_dmc.pictures.anatomies import Picture
 from cathsim_dmc.pictures.recorded import as_function
 from cathsim_dmc.style import COLOURS, tidy
 

@@ -21,7 +21,8 @@ from matplotlib.lines import Line2D
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.agents.policies import load_policy
-from cathsim_dmc.pictures.figure import DEVICES, Picture, background, draw_scene
+from cathsim_dmc.pictures.anatomies import Picture, background
+from cathsim_dmc.pictures.figure import DEVICES, draw_scene
 from cathsim_dmc.pictures.moment import Moment
 
 IMAGES = Path(__file__).parents[1] / "images"

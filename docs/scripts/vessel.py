@@ -22,7 +22,7 @@ import figures
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.pictures.figure import Picture
+from cathsim_dmc.pictures.anatomies import Picture
 from cathsim_dmc.simulation.batch import BatchSimulation
 
 PAGE = Path(__file__).parents[1] / "vessel_results.md"
