@@ -37,9 +37,9 @@ DEMONSTRATED, TAUGHT = "type1_lcca", ("bc", "dagger")
 NAMES = {"internal": "Internal", "image": "Image", "sequential": "Sequential"}
 
 BEFORE = """\
-The figures of this page were measured before version 0.3. The drive, the sheath, the
-armature, the wall and the judged force (now the mean over a control step) have changed
-since; the figures were not measured again.
+† marks figures of trainings before version 0.3. The drive, the sheath, the armature, the
+wall and the judged force (now the mean over a control step) have changed since; these
+trainings were not repeated.
 """
 
 INTRODUCTION = f"""\
@@ -222,7 +222,7 @@ def failures(table):
     rows, louder = [], []
     for task, label, found in ((t, a, r) for t in table for a, r in table[t].items()):
         rate, count = rate_of(found)
-        name = f"{label} ({len(found)})"
+        name = f"{marked(label, found)} ({len(found)})"
         if rate < 1:
             worst = percent(min(result.success for result in found))
             missed = f"{count - round(rate * count)} of {count}"
@@ -279,7 +279,7 @@ def success_row(label, count, of_task, theirs):
     cells = [label, count]
     for task in PUBLISHED_TASKS:
         found = of_task.get(task)
-        ours = percent(rate_of(found)[0]) if found else "–"
+        ours = marked(percent(rate_of(found)[0]), found) if found else "–"
         cells.append(f"{ours} / {percent(theirs[task]['success'])}" if theirs else ours)
     whole, mean = len(of_task) == len(PUBLISHED_TASKS), "–"
     if whole and min(map(len, of_task.values())) > 1:
@@ -298,7 +298,7 @@ def force_tables(table):
         lines += [f"### {task}", "", *(line_of(header) for header in HEADER)]
         for label, found in table[task].items():
             theirs = published.get(label, {}).get(task)
-            lines.append(line_of(row(label, found, theirs)))
+            lines.append(line_of(row(marked(label, found), found, theirs)))
         lines.append("")
     return "\n".join(lines)
 
@@ -320,7 +320,7 @@ def full_tables(table, cells):
             name = published_label(found[0])
             repeated.add(name)
             theirs = published.get(name, {}).get(task)
-            lines.append(row(label, found, theirs))
+            lines.append(row(marked(label, found), found, theirs))
         for name, tasks in published.items():
             if name not in repeated and task in tasks:
                 why = "missing" if (name, task) in planned else "not trained"
@@ -338,7 +338,8 @@ def other_tasks(table):
         for label, found in agents_.items():
             _, success, _, _, steps, mean, _, largest = figures_of(found)
             expert = percent(experts[task]) if task in experts else "–"
-            cells = [f"`{task}`", label, success, expert, steps, mean, largest]
+            agent = marked(label, found)
+            cells = [f"`{task}`", agent, success, expert, steps, mean, largest]
             lines.append(f"| {' | '.join(cells)} |")
     if not lines:
         return ""
@@ -380,6 +381,12 @@ def row(label, found, theirs):
         for place, text in published_figures(theirs).items():
             cells[place] += f" / {text}"
     return f"| {' | '.join(cells)} |"
+
+
+def marked(text, found):
+    """The text, marked if a result is of the physics before version 0.3."""
+    forces = (result.evaluation["summary"]["forces"] for result in found)
+    return text + " †" * any("mean_sum" not in one for one in forces)
 
 
 def rate_of(found):
