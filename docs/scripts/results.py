@@ -37,9 +37,9 @@ DEMONSTRATED, TAUGHT = "type1_lcca", ("bc", "dagger")
 NAMES = {"internal": "Internal", "image": "Image", "sequential": "Sequential"}
 
 BEFORE = """\
-† marks figures of trainings before version 0.3. The drive, the sheath, the armature, the
-wall and the judged force (now the mean over a control step) have changed since; these
-trainings were not repeated.
+† marks figures of trainings before version 0.3. The drive, the sheath, the armature,
+the wall and the judged force (now the mean over a control step) have changed since;
+these trainings were not repeated.
 """
 
 INTRODUCTION = f"""\
