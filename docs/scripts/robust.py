@@ -1,4 +1,4 @@
-"""The tables of docs/robustness.md from the lines that benchmarks/robust.py writes.
+"""The tables of docs/robustness.md and robustness_pair.md from the lines that benchmarks/robust.py writes.
 
     python docs/scripts/robust.py RUN.jsonl … [--keep]
 
@@ -15,7 +15,8 @@ from cathsim_dmc import files
 from cathsim_dmc.analysis.intervals import success_interval
 
 DOCS = Path(__file__).parents[1]
-DATA, PAGE = DOCS / "data" / "robust.jsonl", DOCS / "robustness.md"
+DATA = DOCS / "data" / "robust.jsonl"
+PAGES = DOCS / "robustness.md", DOCS / "robustness_pair.md"
 _FIGURES = "| safe, 0.5 N | steps | mean force, mN | largest sum, N |"
 _KEYS = ("policy", "part", "goal", "access", "anatomy", "change", "arch", "devices")
 _KEYS += ("radius",)
@@ -199,7 +200,6 @@ def main():
     if options.keep:
         lines = (json.dumps(row) for row in rows.values())
         files.write_text(DATA, "\n".join(lines) + "\n")
-    page = PAGE.read_text()
     coaxial = [row for row in rows.values() if row.get("devices")]
     rows = {key: row for key, row in rows.items() if row not in coaxial}
     makers = {"arches": arches, "anatomies": anatomies, "changes": changes}
@@ -213,11 +213,13 @@ def main():
     found["devices"] = devices(varied)
     found["kinds"] = kinds([r for r in varied if r["part"] != "anatomies"])
     found["pair"] = pairs([r for r in coaxial if r["part"] in ("arches", "anatomies")])
-    for name, lines in found.items():
-        block = "\n".join([f"<!-- {name} -->", *lines, f"<!-- end of {name} -->"])
-        pattern = f"<!-- {name} -->.*<!-- end of {name} -->"
-        page = re.sub(pattern, lambda _, b=block: b, page, flags=re.S)
-    files.write_text(PAGE, page)
+    for page in PAGES:
+        text = page.read_text()
+        for name, lines in found.items():
+            block = "\n".join([f"<!-- {name} -->", *lines, f"<!-- end of {name} -->"])
+            pattern = f"<!-- {name} -->.*<!-- end of {name} -->"
+            text = re.sub(pattern, lambda _, b=block: b, text, flags=re.S)
+        files.write_text(page, text)
 
 
 if __name__ == "__main__":
