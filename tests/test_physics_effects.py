@@ -47,8 +47,35 @@ def windy():
     return make
 
 
+class Stiffer(Effect):
+    """A device of another stiffness, in every second simulation."""
+
+    model_fields = ("jnt_stiffness",)
+
+    def restart(self, index, episode, random_state):
+        self.world.field(index, "jnt_stiffness")[:] *= 1.0 + 2.0 * (index % 2)
+
+
 def actions(count):
     return np.random.default_rng(0).uniform(-1, 1, (STEPS, count))
+
+
+@pytest.mark.parametrize("clearance", [None, 0.35e-3])
+def test_an_effect_makes_the_device_stiffer(clearance):
+    """Held in the sheath or in a bore, and again in the next episode."""
+    task = suite.make_task("type1_bca", effects=[Stiffer()], sheath_clearance=clearance)
+    simulation = BatchSimulation(task, 2, num_threads=1)
+    push = np.zeros((2, task.num_actions))
+    push[:, -1] = 1.0
+    for _ in range(2):
+        simulation.seed([0, 0])
+        simulation.reset()
+        forces = []
+        for _ in range(30):
+            simulation.step(push)
+            forces.append(simulation.contacts().magnitude.sum(axis=1))
+        soft, stiff = np.mean(forces, axis=0)
+        assert stiff == pytest.approx(3.0 * soft, rel=0.1)
 
 
 def simulate(task, count, threads=1):

@@ -9,9 +9,12 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.random import RandomState
 
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.laws import sheath
+from cathsim_dmc.physics.effects import Draw, Effect, World
+from cathsim_dmc.physics.readings import ids
 
 FIELDS = ("jnt_stiffness", "dof_damping", "qpos_spring")
 
@@ -78,6 +81,33 @@ class Held:
         finally:
             for field, values in zip(fields, before, strict=True):
                 field[:] = values
+
+
+class Released(Effect):
+    """Hinges without a sheath as an episode begins, for effects that change them.
+
+    The device, which acts last, holds what it then finds.
+    """
+
+    model_fields = FIELDS
+
+    def bind(self, world: World) -> None:
+        """Finds the hinges of the device in the model."""
+        super().bind(world)
+        joints = ids(world.model, world.chain.hinges)
+        dofs, qpos = (
+            getattr(world.model, name)[joints] for name in ("jnt_dofadr", "jnt_qposadr")
+        )
+        places = dict(zip(FIELDS, (joints, dofs, qpos), strict=True))
+        self._nominal = [
+            (name, where, getattr(world.model, name)[where])
+            for name, where in places.items()
+        ]
+
+    def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
+        """Writes the values of one simulation that none has changed."""
+        for name, where, values in self._nominal:
+            self.world.field(index, name)[where] = values
 
 
 class Sheathed(NamedTuple):

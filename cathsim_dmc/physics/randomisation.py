@@ -246,8 +246,9 @@ class RandomisedModel(Effect):
             device, timestep = self.world.chain.device, self.world.chain.timestep
             factor = 1.0 if stiffness is None else stiffness
             material = device.relaxation_time * (1.0 if loss is None else loss)
+            stiff = self._stiffness * factor
             field(index, "dof_damping")[self._dofs] = (
-                hinge_time(material, timestep) * factor * self._stiffness
+                hinge_time(material, timestep) * stiff
             )
         if stiffness is not None:
             for name, where in (

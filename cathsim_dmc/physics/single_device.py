@@ -6,7 +6,7 @@ import numpy as np
 from numpy.random import RandomState
 
 from cathsim_dmc import rows
-from cathsim_dmc.entities.chain import Chain, hinge_time
+from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.robot import pose
 from cathsim_dmc.laws import sheath
@@ -93,15 +93,8 @@ class SingleDevice(Effect):
             self.world.parameters.compliance[index] = self._springs.compliance
         if not self._holds:
             return
-        factor, loss = (
-            1.0 if value is None else value
-            for value in (episode.stiffness, episode.loss)
-        )
-        material = self._device.relaxation_time * loss
-        stiffness, damping, _ = self._free[index]
-        stiffness[:] = self._held.nominal[0] * factor
-        damping[:] = hinge_time(material, self.world.chain.timestep) * stiffness
         self._find_hinges(index)
+        self._free[index] = self._held.read(self._hinged[index])
         self._hold(index)
 
     def _find_hinges(self, index: int) -> None:

@@ -15,6 +15,7 @@ from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import LEAD, LUMEN_FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.effects import Effect
+from cathsim_dmc.physics.held import Released
 from cathsim_dmc.physics.randomisation import (
     ActionDelay,
     Randomisation,
@@ -139,7 +140,8 @@ class NavigationConfig:
         model = RandomisedModel(self.randomisation)
         blood, walls = self.vessel.effects()
         devices = devices_of(chain, holds=self.sheath_clearance is None)
-        return [blood, model, delay, *walls, *own, devices]
+        released = [] if chain.coaxial else [Released()]
+        return [blood, *released, model, delay, *walls, *own, devices]
 
     def _check_devices(self):
         if self.devices is None:

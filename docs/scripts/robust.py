@@ -1,4 +1,6 @@
-"""The tables of docs/robustness.md and robustness_pair.md from the lines that benchmarks/robust.py writes.
+"""The tables of docs/robustness.md and robustness_pair.md.
+
+Their lines are those that benchmarks/robust.py writes.
 
     python docs/scripts/robust.py RUN.jsonl … [--keep]
 
