@@ -11,6 +11,7 @@ from cathsim_dmc.tasks import placement
 # Goals in the branches of an arch.
 BRANCHES = ("bca", "rcca", "lcca", "lsa", "rsa")
 POOL = 16  # arches that an episode draws from, unless one says otherwise
+_MOST = 1_000_000  # arches; no set has as many
 
 
 def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> Anatomy:
@@ -51,11 +52,14 @@ def arch_numbers(options: Mapping[str, Any]) -> tuple[int, ...]:
     """Numbers in their set of the arches that `pool`, `first` and `numbers` name.
 
     Raises:
-        ValueError: if numbers stand beside a pool or a first one, or are none.
+        ValueError: if they are no numbers, or none, or numbers stand beside a pool or a
+            first one.
     """
-    numbers, first = options.get("numbers"), options.get("first", 0)
+    numbers = options.get("numbers")
     if numbers is None:
-        return tuple(range(first, first + options.get("pool", POOL)))
+        first = bounds.whole("first", options.get("first", 0), 0, _MOST)
+        pool = bounds.whole("pool", options.get("pool", POOL), 1, _MOST)
+        return tuple(range(first, first + pool))
     if not {"pool", "first"}.isdisjoint(options):
         raise ValueError(
             "option numbers names the arches; leave out pool and first, which do so too"
@@ -123,7 +127,7 @@ def goals_for(goal: str | Sequence[str], numbers: Sequence[int]) -> list[str]:
     Raises:
         ValueError: if it is something else, or not as many as there are arches.
     """
-    each = [goal] * len(numbers) if isinstance(goal, str) else list(goal)
+    each = list(goal) if isinstance(goal, (list, tuple)) else [goal] * len(numbers)
     for one in each:
         bounds.choice("goal", one, ("any", *BRANCHES))
     if len(each) != len(numbers):
