@@ -127,7 +127,10 @@ def goals_for(goal: str | Sequence[str], numbers: Sequence[int]) -> list[str]:
     Raises:
         ValueError: if it is something else, or not as many as there are arches.
     """
-    each = list(goal) if isinstance(goal, (list, tuple)) else [goal] * len(numbers)
+    if isinstance(goal, str) or not isinstance(goal, Sequence):
+        each = [goal] * len(numbers)
+    else:
+        each = list(goal)
     for one in each:
         bounds.choice("goal", one, ("any", *BRANCHES))
     if len(each) != len(numbers):
