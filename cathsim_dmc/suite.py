@@ -20,13 +20,8 @@ from dm_control.utils import containers
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.tasks import observations, placement
-from cathsim_dmc.tasks.anatomies import (
-    arch_numbers,
-    goal_of,
-    goals_for,
-    load_anatomy,
-    load_arches,
-)
+from cathsim_dmc.tasks.anatomies import load_anatomy, load_arches_to
+from cathsim_dmc.tasks.anatomies import load_arches as load_arches  # for users, too
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.environment import Environment
 from cathsim_dmc.tasks.navigation import Navigation
@@ -178,10 +173,8 @@ def make_task(
     goal = own.pop("goal", definition.goal or "bca")
     access = own.pop("access", definition.access)
     if definition.random_arch:
-        numbers = arch_numbers(own)
-        named = goals_for(goal, numbers)
-        anatomies = load_arches(**({} if access is None else {"access": access}), **own)
-        named = list(map(goal_of, anatomies, named, numbers))
+        entered = {} if access is None else {"access": access}
+        anatomies, named = load_arches_to(goal, {**entered, **own})
     else:
         chosen = own.get("anatomy", definition.anatomy or "type1")
         anatomies, named = [load_anatomy(chosen, access)], [goal]

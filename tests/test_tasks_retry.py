@@ -128,9 +128,8 @@ def test_attempts_differ_in_what_policies_see():
     close = memory._replace(close=np.arange(8) < 4)
     pair = COAXIAL.close.leads + COAXIAL.pattern.leads
     assert retry.lead(COAXIAL, close).tolist() == list(pair)
-    assert retry.shown(COAXIAL, close, insertion, insertion, True)[
-        0, 12
-    ] == pytest.approx(1.8)
+    seen = retry.shown(COAXIAL, close, insertion, insertion, True)
+    assert seen[0, 12] == pytest.approx(1.8)
 
 
 # In tasks.

@@ -11,7 +11,6 @@ from cathsim_dmc.tasks import placement
 # Goals in the branches of an arch.
 BRANCHES = ("bca", "rcca", "lcca", "lsa", "rsa")
 POOL = 16  # arches that an episode draws from, unless one says otherwise
-_MOST = 1_000_000  # arches; no set has as many
 
 
 def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> Anatomy:
@@ -49,16 +48,20 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> An
 
 
 def arch_numbers(options: Mapping[str, Any]) -> tuple[int, ...]:
-    """Numbers in their set of the arches that `pool`, `first` and `numbers` name.
+    """Numbers in their set of the arches that options of `load_arches` name.
 
     Raises:
-        ValueError: if they are no numbers, or none, or numbers stand beside a pool or a
-            first one.
+        ValueError: if there is no such set, it has no such arches, or numbers stand
+            beside a pool or a first one, or are none.
     """
-    numbers = options.get("numbers")
+    from cathsim_dmc.anatomy.arch import arch  # late, as in `load_anatomy`
+
+    arches, numbers = options.get("arches", "train"), options.get("numbers")
+    size = len(arch.arch_set(bounds.choice("arches", arches, arch.SETS)))
     if numbers is None:
-        first = bounds.whole("first", options.get("first", 0), 0, _MOST)
-        pool = bounds.whole("pool", options.get("pool", POOL), 1, _MOST)
+        pool, first = options.get("pool", POOL), options.get("first", 0)
+        bounds.whole(f"pool of arches {arches!r}", pool, 1, size)
+        bounds.whole(f"first of arches {arches!r}", first, 0, size - pool)
         return tuple(range(first, first + pool))
     if not {"pool", "first"}.isdisjoint(options):
         raise ValueError(
@@ -67,6 +70,8 @@ def arch_numbers(options: Mapping[str, Any]) -> tuple[int, ...]:
     found = tuple(bounds.array("numbers", numbers, "i", (-1,)).tolist())
     if not found:
         raise ValueError("option numbers names no arch; leave it out, or give some")
+    for number in found:
+        bounds.whole(f"numbers of arches {arches!r}", number, 0, size - 1)
     return found
 
 
@@ -96,15 +101,11 @@ def load_arches(
     from cathsim_dmc.anatomy.builder import ACCESSES
 
     bounds.choice("access", access, ("any", *ACCESSES))
-    seeds = arch.arch_set(bounds.choice("arches", arches, arch.SETS))
-    chosen = {"numbers": numbers}
+    chosen = {"arches": arches, "numbers": numbers}
     if numbers is None or (pool, first) != (POOL, 0):
-        bounds.whole(f"pool of arches {arches!r}", pool, 1, len(seeds))
-        bounds.whole(f"first of arches {arches!r}", first, 0, len(seeds) - pool)
         chosen |= {"pool": pool, "first": first}
-    found = []
-    for number in arch_numbers(chosen):
-        bounds.whole(f"numbers of arches {arches!r}", number, 0, len(seeds) - 1)
+    chosen_numbers, seeds, found = arch_numbers(chosen), arch.arch_set(arches), []
+    for number in chosen_numbers:
         way = ACCESSES[number % 2] if access == "any" else access
         anatomy = arch.build_seed(seeds[number], access=way)
         if access == "any" and placement.sheath_direction(anatomy) is None:
@@ -119,6 +120,21 @@ def load_arches(
             f"bends back across it; give {instead}"
         )
     return found
+
+
+def load_arches_to(
+    goal: str | Sequence[str], options: Mapping[str, Any]
+) -> tuple[list[Anatomy], list[str]]:
+    """Random arches by options of `load_arches`, and the name of the goal in each.
+
+    Raises:
+        ValueError: see `load_arches` and `goals_for`, which is asked before any arch is
+            built.
+    """
+    numbers = arch_numbers(options)
+    each = goals_for(goal, numbers)
+    found = load_arches(**options)
+    return found, list(map(goal_of, found, each, numbers))
 
 
 def goals_for(goal: str | Sequence[str], numbers: Sequence[int]) -> list[str]:

@@ -260,12 +260,8 @@ def _barrier(
 
 def lookahead(settings: RetrySettings, memory: Memory) -> np.ndarray:
     """Factor (...) of the look-ahead in the present attempt."""
-    usual, close = settings.pattern, settings.close
-    number, factors = (
-        memory.attempts,
-        (usual.lookahead_factors, close.lookahead_factors),
-    )
-    return _nth(factors, number, memory)
+    factors = settings.pattern.lookahead_factors, settings.close.lookahead_factors
+    return _nth(factors, memory.attempts, memory)
 
 
 def lead(settings: RetrySettings, memory: Memory) -> np.ndarray:
