@@ -125,11 +125,36 @@ def test_attempts_differ_in_what_policies_see():
     first = memory._replace(first=np.full(8, len(COAXIAL.pattern.leads) - 1))
     assert retry.lead(COAXIAL, first)[0] == COAXIAL.pattern.leads[-1]
     assert retry.lead(COAXIAL, first)[1] == COAXIAL.pattern.leads[0]
-    close = memory._replace(close=np.arange(8) < 4)
-    pair = COAXIAL.close.leads + COAXIAL.pattern.leads
-    assert retry.lead(COAXIAL, close).tolist() == list(pair)
+    # A policy knows the look-ahead on every route by the number of the attempt.
+    factors = COAXIAL.close.lookahead_factors
+    assert len(factors) == len(COAXIAL.pattern.lookahead_factors)
+    close = memory._replace(ostium=np.where(np.arange(8) < 4, 0.1, np.inf))
+    assert retry.lookahead(COAXIAL, close)[:3].tolist() == list(factors)
+    leads = COAXIAL.close.leads * 4 + COAXIAL.pattern.leads
+    assert retry.lead(COAXIAL, close).tolist() == list(leads)
     seen = retry.shown(COAXIAL, close, insertion, insertion, True)
-    assert seen[0, 12] == pytest.approx(1.8)
+    assert seen[0, 12] == pytest.approx(-1.0)
+
+
+def test_past_a_close_take_off_a_withdrawal_ends_in_the_middle_of_the_branch():
+    def ends(arc_length, insertion, excess, **values):
+        memory = begun(
+            [0.24], [0.15], turn=[0.13], ostium=[0.22], retracting=[True], **values
+        )
+        memory = goes_on(memory, arc_length, insertion, excess=excess, settings=COAXIAL)
+        return not memory.retracting[0]
+
+    # A head that has strayed falls into the branch, or comes back before it.
+    middle = COAXIAL.middle - 0.05
+    assert ends(0.23, 0.14, middle) and not ends(0.23, 0.14, middle + 0.1)
+    assert not ends(0.23, 0.12, 0.0) and ends(0.22, 0.12, 0.0)
+    assert not ends(0.22, 0.14, middle)
+    # One that buckles takes the slack back.
+    assert not ends(0.24, 0.14, middle, taking_up=[True], attempts=[1])
+    assert ends(0.24, 0.12, middle, taking_up=[True], attempts=[1])
+    stays = begun([0.24], [0.15], ostium=[0.22], stale=[COAXIAL.patience])
+    stays = goes_on(stays, 0.24, 0.15, excess=middle, settings=COAXIAL)
+    assert stays.retracting[0] and stays.attempts[0] == 1
 
 
 # In tasks.

@@ -17,9 +17,10 @@ leads badly: its shaft, the stiffer one, comes to lie in the bend. With a negati
 the wire stays behind in the catheter, whose soft end takes its shape, hooks the branch
 and goes up; the wire holds the shaft in the aorta straight.
 
-**Or in turns.** Where a branch leaves another one close to its ostium, the ends are
-turned to it before they pass the first take-off, slowly. The catheter passes the branch
-and comes back with its end turned to it; then the wire goes in, farther ahead.
+**Or in turns.** Where a branch leaves another one close to its ostium, the catheter
+goes first, its end turned to the branch, slowly. When it has passed the branch, it
+comes back until its end falls in. It goes up far enough to hold there, and the wire
+goes on from it alone.
 
 **Retries** (`tasks.retry`) have another lead, look-ahead and direction, and every other
 time no jumps of the head's place on the route.
@@ -44,6 +45,7 @@ from cathsim_dmc.tasks.route import Place, Route
 # What a full action moves (m) and turns (rad) a device by in a control step.
 _MOVE = MAX_PUSH_SPEED * CONTROL_TIMESTEP
 _TURN = MAX_ROTATION_SPEED * CONTROL_TIMESTEP
+_ALONE = 20e-3  # m that a wire goes ahead from a hooked branch before it is followed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +59,8 @@ class CoaxialSettings(AttemptSettings):
         aside: by how much the route must bend away for a device to be turned, rad.
         turning: share of the error of direction that a base is turned by in a control
             step.
+        hooked: how far past the ostium a leading catheter holds it, so that the wire
+            goes in, m.
     """
 
     retry: RetrySettings = retry.COAXIAL
@@ -75,10 +79,11 @@ class CoaxialSettings(AttemptSettings):
     lead_gain: float = 0.2
     aside: float = 0.2
     turning: float = 0.2
+    hooked: float = np.inf
 
 
 # Of a route whose first two take-offs are close to each other.
-CLOSE = CoaxialSettings(aligned=0.9, misaligned=0.3)
+CLOSE = CoaxialSettings(aligned=0.9, misaligned=0.3, hooked=14e-3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,7 +180,10 @@ def _led(
     all in a withdrawal.
     """
     lead = retry.lead(settings.retry, memory)
-    lead = np.where(lead > 0.0, np.maximum(lead, deep), lead)[:, None]
+    hooked = deep > settings.hooked
+    # A catheter pushed after its wire too early leaves the branch that it holds.
+    deep = deep + np.where(hooked, _ALONE, 0.0)
+    lead = np.where(hooked | (lead > 0.0), np.maximum(lead, deep), lead)[:, None]
     wanted = insertion[:, :1] - lead * np.arange(insertion.shape[1])
     moves = speed[:, None] + settings.lead_gain * (wanted - insertion) / _MOVE
     moves -= moves.max(axis=1, keepdims=True) - speed[:, None]

@@ -76,8 +76,8 @@ class Progress:
         last = len(self.settings.pattern.leads) - 1
         blunt = [retry.blunt(self.settings, route) for route in routes]
         self._tight, self._first = tight, last * np.array(blunt, int)
-        close = [self._coaxial and take_offs.followed(route)[1] for route in routes]
-        self._close = np.array(close, bool)
+        ends = [take_offs.followed(route) for route in routes if self._coaxial]
+        self._ostium = np.array([end if close else np.inf for end, close in ends])
         nowhere = Place(np.full(self._count, np.nan), np.zeros(self._count))
         self.memory = Memory.at(nowhere, np.zeros(self._count))
 
@@ -172,7 +172,9 @@ class Progress:
         assert self.memory is not None
         new = Memory.at(place, insertion)
         if len(self._first):
-            new = new._replace(first=self._first[chosen], close=self._close[chosen])
+            new = new._replace(first=self._first[chosen])
+        if len(self._ostium):
+            new = new._replace(ostium=self._ostium[chosen])
         begun = np.zeros(self._count, bool)
         begun[rows] = True
         pairs = zip(self.memory, new, strict=True)

@@ -26,6 +26,7 @@ from cathsim_dmc.tasks.take_offs import bend
 _WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
 _GROWING = 4  # retries over which the way back grows
 _SAME_PLACE = 5e-3  # m of the route
+_PAST = 3e-3  # m from a close take-off on, where vessels lie side by side
 # Scales of what a policy sees.
 _SEEN_WAY, _SEEN_LEAD, _SEEN_ATTEMPTS = 20e-3, 20e-3, 4
 RETRY_ENTRIES, COAXIAL_RETRY_ENTRIES = 11, 15
@@ -73,6 +74,8 @@ class RetrySettings:
         slack: Buckling threshold: advance of the base without the head, m.
         give: distance that the head may move back while slack is taken up, m.
         thorough: every n-th retry withdraws the whole way, not the slack alone.
+        middle: excess below which a head past a take-off close to the first one is in
+            the right branch; then a withdrawal ends, and not before.
         pattern: of the attempts.
         close: likewise on routes with a take-off close to the first one.
         sharp, planar: turn of the route into its last branch, rad, and cosine between
@@ -93,6 +96,7 @@ class RetrySettings:
     slack: float = np.inf
     give: float = 0.0
     thorough: int = 1
+    middle: float = -0.7
     pattern: Pattern = Pattern()
     close: Pattern = Pattern()
     sharp: float = 0.0
@@ -115,9 +119,8 @@ COAXIAL = RetrySettings(
         offsets=(0.0, 0.0, 0.0, 0.7, -0.7, 0.0, 1.4, -1.4),
     ),
     close=Pattern(
-        lookahead_factors=(3.64, 2.6, 1.95, 2.6),
-        leads=(0.036, -0.02, 0.05, -0.02),
-        offsets=(0.0, 0.0, 0.0, 0.0, 0.4, 0.4, -0.4, -0.4),
+        lookahead_factors=(3.64, 2.6, 1.95),
+        leads=(-0.02,),
     ),
     sharp=0.84,
     planar=0.85,
@@ -142,7 +145,8 @@ class Memory(NamedTuple):
         pushed: number of these retries at that place.
         attempts: retries so far.
         first: number of the lead that the first attempt has.
-        close: bool, whether the route has a take-off close to the first one.
+        ostium: arc length of the last take-off close to the first one, m; infinite
+            without.
         given_up: bool, whether there is no further attempt.
     """
 
@@ -160,7 +164,7 @@ class Memory(NamedTuple):
     pushed: np.ndarray
     attempts: np.ndarray
     first: np.ndarray
-    close: np.ndarray
+    ostium: np.ndarray
     given_up: np.ndarray
 
     @classmethod
@@ -174,10 +178,11 @@ class Memory(NamedTuple):
             best=arc_length,
             held=np.array(insertion),
             barrier=arc_length,
-            **dict.fromkeys(("retracting", "taking_up", "close", "given_up"), no),
+            **dict.fromkeys(("retracting", "taking_up", "given_up"), no),
             **dict.fromkeys(("stale", "lost", "pressed"), none),
             **dict.fromkeys(("pushed", "attempts", "first"), none),
             turn=zero,
+            ostium=zero + np.inf,
         )
 
     @property
@@ -226,7 +231,11 @@ def advance(
     # Taking up slack ends when the head comes back with the shaft.
     comes_back = taking_up & ~give_up & (place.arc_length < best - s.give)
     back = (insertion <= turn) | comes_back | m.retracting & (stale > s.longest)
-    back = back & ~outside | (insertion <= _WITHDRAWN)
+    # Past a close take-off only the middle of the lumen is in the right branch.
+    past, middle = place.arc_length > m.ostium + _PAST, place.excess <= s.middle
+    falls_in = m.retracting & ~taking_up
+    back = np.where(past, (back | falls_in) & middle, back & ~outside)
+    back = back | (insertion <= _WITHDRAWN)
     retracting = (m.retracting | give_up) & ~back
     again = m.retracting & ~retracting
     barrier, pushed = _barrier(m, place, forced)
@@ -283,7 +292,7 @@ def _nth(
 ) -> np.ndarray:
     """Those (...) of most routes, or of routes with two take-offs close together."""
     usual, close = (np.asarray(v)[number % len(v)] for v in values)
-    return np.where(memory.close, close, usual)
+    return np.where(np.isfinite(memory.ostium), close, usual)
 
 
 def shown(
