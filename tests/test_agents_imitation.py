@@ -203,6 +203,10 @@ def test_a_policy_starts_from_that_of_another_run(
     take_over(learner.network, config, shapes)
     for one, other in zip(act(learner.policy, vectors), expected, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
+    # Other states change nothing but where the weights are learnt anew, too.
+    learner.observe(TensorDict({"observation_vector": 3.0 * vectors + 1.0}))
+    same = torch.equal(act(learner.policy, vectors)[0], expected[0])
+    assert same == (algorithm in ("ppo", "sac"))
 
 
 def test_the_deviation_to_start_with_can_be_given(cloned, shapes, tmp_path):

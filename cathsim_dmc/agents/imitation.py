@@ -29,6 +29,8 @@ class CloningLearner(Learner):
     start, is that of the expert's actions around its own.
     """
 
+    imitates: ClassVar[bool] = True
+
     def __init__(self, config: TrainingConfig, shapes: NetworkShapes, directory: Path):
         super().__init__(config, shapes, directory)
         self._actor = network_of(self.network)

@@ -21,6 +21,9 @@ class Learner(abc.ABC):
     metrics: Names of the figures that `update` returns, columns of metrics.csv.
     remote: Whether the policy needs nothing but observations, so that it can act in
         another process.
+    imitates: Whether it learns all of the policy anew in every update. Otherwise a
+        policy that starts from another keeps its observation statistics: weights fit
+        these alone.
     random_frames: Number of frames to collect with uniformly random actions first.
     device: Torch device of the networks.
     shapes: Sizes of what the policy reads, and of the action.
@@ -34,6 +37,7 @@ class Learner(abc.ABC):
 
     metrics: ClassVar[tuple[str, ...]]
     remote: ClassVar[bool] = True
+    imitates: ClassVar[bool] = False
     random_frames: int = 0
     optimiser: torch.optim.Optimizer
     replay: Any = None
@@ -66,7 +70,9 @@ class Learner(abc.ABC):
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
-        chosen: list[Any] = [*self._policy_normalisers, *self.critic_normalisers]
+        chosen: list[Any] = list(self.critic_normalisers)
+        if self.imitates or self.config.initial_policy is None:
+            chosen += self._policy_normalisers
         for module in chosen:
             module.module.update(batch[module.in_keys[0]].to(self.device))
 
