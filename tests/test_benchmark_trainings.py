@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import judgement
 import pytest
@@ -135,6 +136,13 @@ def test_a_cell_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, capsy
     assert trainings.main(*where, only=["bca"]) == 1 and len(did) == 6
     assert trainings.main(*where, list=True) == 0 and len(did) == 6
     assert trainings.main(tmp_path / "none.toml") == 2
+
+
+def test_every_result_is_of_a_cell_of_the_grid():
+    cells = {cell.name: dataclasses.asdict(cell) for cell in trainings.read_grid()}
+    for path in (Path(__file__).parents[1] / "results").glob("*.json"):
+        cell = json.loads(path.read_text())["cell"]
+        assert {"name": path.stem, **cells[path.stem]} == cell
 
 
 def test_first_seed_of_every_task_comes_first(grid):
