@@ -1,6 +1,8 @@
 """What an interrupt or an error in the middle of a reset or control step leaves."""
 
 import dataclasses
+import subprocess
+import sys
 
 import mujoco
 import numpy as np
@@ -169,3 +171,32 @@ def test_a_deep_link_copies_its_own_state_only(monkeypatch):
     way, _ = batch.stepper._way(np.zeros(16), depth, 3e-4)
     batch.stepper._depth_at_end(depth, way, warned, 3e-4)
     assert copied == [4]
+
+
+LOST = """
+import signal, time
+from cathsim_dmc.cli.interrupts import Interrupts
+
+interrupts, began = Interrupts(), time.monotonic()
+try:
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except BaseException:
+        pass  # as an import does
+    assert interrupts.came
+    try:
+        while time.monotonic() < began + 20:
+            time.sleep(0.05)
+    finally:
+        time.sleep(2.5)  # saves
+        print("saved")
+except KeyboardInterrupt:
+    interrupts.handled()
+    time.sleep(1.5)
+    print("once", time.monotonic() - began < 10)
+"""
+
+
+def test_an_interrupt_that_is_lost_comes_again_until_it_is_handled():
+    done = subprocess.run([sys.executable, "-c", LOST], capture_output=True, text=True)
+    assert done.stdout.split() == ["saved", "once", "True"], done.stderr

@@ -11,6 +11,7 @@ from tyro.extras import SubcommandApp
 
 from cathsim_dmc import __version__
 from cathsim_dmc.cli import modules
+from cathsim_dmc.cli.interrupts import Interrupts
 from cathsim_dmc.cli.opengl import import_command
 from cathsim_dmc.cli.options import BAD_INPUT, INTERRUPTED
 
@@ -50,6 +51,7 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Its encoding may lack signs such as µ.
         sys.stdout.reconfigure(errors="backslashreplace")
+    interrupts = Interrupts()
     try:
         _require_here()
         code = _run(sys.argv[1:])
@@ -59,17 +61,27 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     except KeyboardInterrupt:
-        print("cathsim: interrupted", file=sys.stderr)
-        code = INTERRUPTED
+        code = _interrupted(interrupts)
     except (ValueError, OSError, RuntimeError, ImportError, ArithmeticError,
             MemoryError) as error:  # fmt: skip
-        # Errors with a message for the user; anything else is ours, with traceback.
-        text = " ".join(str(error).split()) or "no message"
-        if len(text) > _LONGEST:  # as a name of thousands of characters makes it
-            text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
-        print(f"cathsim: {type(error).__name__}: {text}", file=sys.stderr)
-        code = BAD_INPUT
+        # Errors with a message for the user; anything else is ours, with traceback. An
+        # interrupt may make an import fail.
+        code = _interrupted(interrupts) if interrupts.came else _refused(error)
     sys.exit(code)
+
+
+def _interrupted(interrupts: Interrupts) -> int:
+    interrupts.handled()
+    print("cathsim: interrupted", file=sys.stderr)
+    return INTERRUPTED
+
+
+def _refused(error: Exception) -> int:
+    text = " ".join(str(error).split()) or "no message"
+    if len(text) > _LONGEST:  # as a name of thousands of characters makes it
+        text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
+    print(f"cathsim: {type(error).__name__}: {text}", file=sys.stderr)
+    return BAD_INPUT
 
 
 def _require_here() -> None:
