@@ -14,7 +14,7 @@ from cathsim_dmc.policies import coaxial_pursuit
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan
 from cathsim_dmc.policies.expert import Teacher
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import coaxial_ends, take_offs
+from cathsim_dmc.tasks import coaxial_ends, retry, take_offs
 from cathsim_dmc.tasks.objectives import Cannulation
 from cathsim_dmc.tasks.progress import Progress
 from cathsim_dmc.tasks.retry import Memory
@@ -121,13 +121,18 @@ def test_a_lead_comes_about_without_a_push():
 
 
 def test_a_catheter_that_holds_a_branch_stays_while_the_wire_goes_on():
-    settings, place = coaxial_pursuit.CLOSE, Place(np.full(3, 0.24), np.full(3, -0.9))
+    settings = coaxial_pursuit.CLOSE
+    deep = settings.retry.held + np.array([-1e-3, 1e-3, 1e-3])
     insertion = np.array([[0.14, 0.16], [0.14, 0.16], [0.19, 0.16]])
+    place = Place(0.22 + deep, np.full(3, -0.9))
     memory = Memory.at(place, insertion[:, 0])._replace(ostium=np.full(3, 0.22))
-    deep, speed = settings.hooked + np.array([-1e-3, 1e-3, 1e-3]), np.full(3, 0.3)
-    moves = coaxial_pursuit._led(settings, memory, insertion, speed, deep)
+    moves = coaxial_pursuit._led(settings, memory, insertion, np.full(3, 0.3), deep)
     np.testing.assert_allclose(moves[0], [0.3, 0.3])
     np.testing.assert_allclose(moves[1:], [[0.3, 0.0], [0.3, 0.0]])
+    # A policy sees it.
+    push = np.zeros(3)
+    seen = retry.shown(settings.retry, memory, insertion[:, 0], push, True)[:, 12]
+    np.testing.assert_allclose(seen, [-1.0, 1.75, 1.75])
 
 
 def test_a_hard_push_slows_the_pair(environment):

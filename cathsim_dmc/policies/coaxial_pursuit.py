@@ -45,7 +45,6 @@ from cathsim_dmc.tasks.route import Place, Route
 # What a full action moves (m) and turns (rad) a device by in a control step.
 _MOVE = MAX_PUSH_SPEED * CONTROL_TIMESTEP
 _TURN = MAX_ROTATION_SPEED * CONTROL_TIMESTEP
-_ALONE = 20e-3  # m that a wire goes ahead from a hooked branch before it is followed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +58,6 @@ class CoaxialSettings(AttemptSettings):
         aside: by how much the route must bend away for a device to be turned, rad.
         turning: share of the error of direction that a base is turned by in a control
             step.
-        hooked: how far past the ostium a leading catheter holds it, so that the wire
-            goes in, m.
     """
 
     retry: RetrySettings = retry.COAXIAL
@@ -79,11 +76,10 @@ class CoaxialSettings(AttemptSettings):
     lead_gain: float = 0.2
     aside: float = 0.2
     turning: float = 0.2
-    hooked: float = np.inf
 
 
 # Of a route whose first two take-offs are close to each other.
-CLOSE = CoaxialSettings(aligned=0.9, misaligned=0.3, hooked=14e-3)
+CLOSE = CoaxialSettings(aligned=0.9, misaligned=0.3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,10 +176,7 @@ def _led(
     all in a withdrawal.
     """
     lead = retry.lead(settings.retry, memory)
-    hooked = deep > settings.hooked
-    # A catheter pushed after its wire too early leaves the branch that it holds.
-    deep = deep + np.where(hooked, _ALONE, 0.0)
-    lead = np.where(hooked | (lead > 0.0), np.maximum(lead, deep), lead)[:, None]
+    lead = np.where(lead > 0.0, np.maximum(lead, deep), lead)[:, None]
     wanted = insertion[:, :1] - lead * np.arange(insertion.shape[1])
     moves = speed[:, None] + settings.lead_gain * (wanted - insertion) / _MOVE
     moves -= moves.max(axis=1, keepdims=True) - speed[:, None]

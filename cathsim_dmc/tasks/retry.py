@@ -27,15 +27,16 @@ _WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
 _GROWING = 4  # retries over which the way back grows
 _SAME_PLACE = 5e-3  # m of the route
 _PAST = 3e-3  # m from a close take-off on, where vessels lie side by side
+_ALONE = 20e-3  # m that a wire goes ahead from a held branch before it is followed
 # Scales of what a policy sees.
-_SEEN_WAY, _SEEN_LEAD, _SEEN_ATTEMPTS = 20e-3, 20e-3, 4
+_SEEN_WAY, _SEEN_LEAD, _SEEN_ATTEMPTS, _MOST_LEAD = 20e-3, 20e-3, 4, 2.0
 RETRY_ENTRIES, COAXIAL_RETRY_ENTRIES = 11, 15
 SHOWN = (
     "withdrawing, way left to withdraw / 20 mm, control steps without progress and "
     "outside the route over those until a retry, retries so far / 4, three numbers of "
     "which the look-ahead of the attempt is 1, whether the place of the head stays "
     "near the last one, force of the base in N, given up; of coaxial devices whether "
-    "slack is taken up, the lead of the attempt / 20 mm, cosine and sine of its offset "
+    "slack is taken up, its lead / 20 mm, 2 at most, cosine and sine of the offset "
     "in direction"
 )
 
@@ -76,6 +77,8 @@ class RetrySettings:
         thorough: every n-th retry withdraws the whole way, not the slack alone.
         middle: excess below which a head past a take-off close to the first one is in
             the right branch; then a withdrawal ends, and not before.
+        held: how far past such a take-off a leading catheter holds it, so that the wire
+            goes on, m.
         pattern: of the attempts.
         close: likewise on routes with a take-off close to the first one.
         sharp, planar: turn of the route into its last branch, rad, and cosine between
@@ -97,6 +100,7 @@ class RetrySettings:
     give: float = 0.0
     thorough: int = 1
     middle: float = -0.7
+    held: float = 14e-3
     pattern: Pattern = Pattern()
     close: Pattern = Pattern()
     sharp: float = 0.0
@@ -274,9 +278,14 @@ def lookahead(settings: RetrySettings, memory: Memory) -> np.ndarray:
 
 
 def lead(settings: RetrySettings, memory: Memory) -> np.ndarray:
-    """Lead (...) of coaxial devices in the present attempt, m."""
+    """Lead (...) of coaxial devices in the present attempt, m.
+
+    A catheter that is pushed after its wire too early leaves the branch that it holds.
+    """
     leads = settings.pattern.leads, settings.close.leads
-    return _nth(leads, memory.attempts + memory.first, memory)
+    lead = _nth(leads, memory.attempts + memory.first, memory)
+    deep = memory.arc_length - memory.ostium
+    return np.where(deep > settings.held, deep + _ALONE, lead)
 
 
 def offset(settings: RetrySettings, memory: Memory) -> np.ndarray:
@@ -319,7 +328,8 @@ def shown(
     ]
     if coaxial:
         angle = offset(s, m)
-        columns += [m.taking_up, lead(s, m) / _SEEN_LEAD, np.cos(angle), np.sin(angle)]
+        leads = np.minimum(lead(s, m) / _SEEN_LEAD, _MOST_LEAD)
+        columns += [m.taking_up, leads, np.cos(angle), np.sin(angle)]
     return np.stack([np.asarray(column, float) for column in columns], axis=-1)
 
 
