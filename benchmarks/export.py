@@ -73,6 +73,8 @@ def export(
     options = judgement.published_options(config.task_kwargs)
     if suite.TASKS[config.task].random_arch:
         options["arches"] = "test"
+        if not isinstance(options.get("goal", ""), str):  # one for each arch
+            options["goal"] = "any"
     label = f"{pretrained.PREFIX}{name}"
     card = {
         "task": config.task,
