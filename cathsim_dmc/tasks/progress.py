@@ -76,7 +76,8 @@ class Progress:
         last = len(self.settings.pattern.leads) - 1
         blunt = [retry.blunt(self.settings, route) for route in routes]
         self._tight, self._first = tight, last * np.array(blunt, int)
-        ends = [take_offs.followed(route) for route in routes if self._coaxial]
+        alone = np.inf, False  # one device follows to no take-off
+        ends = [take_offs.followed(r) if self._coaxial else alone for r in routes]
         self._ostium = np.array([end if close else np.inf for end, close in ends])
         nowhere = Place(np.full(self._count, np.nan), np.zeros(self._count))
         self.memory = Memory.at(nowhere, np.zeros(self._count))
@@ -172,9 +173,8 @@ class Progress:
         assert self.memory is not None
         new = Memory.at(place, insertion)
         if len(self._first):
-            new = new._replace(first=self._first[chosen])
-        if len(self._ostium):
-            new = new._replace(ostium=self._ostium[chosen])
+            first, ostium = self._first[chosen], self._ostium[chosen]
+            new = new._replace(first=first, ostium=ostium)
         begun = np.zeros(self._count, bool)
         begun[rows] = True
         pairs = zip(self.memory, new, strict=True)
