@@ -13,6 +13,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.arch.arch import ArchSeed
+from cathsim_dmc.anatomy.arch.neck import Course, with_courses
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Surface
@@ -205,61 +206,37 @@ def with_neck(tree: VesselTree, rng, narrow: float | None = None) -> VesselTree:
         rng: source of randomness.
         narrow: m, radius of a stenosis of the right subclavian artery, or None.
     """
-    vessels = dict(tree.vessels)
-    right = np.array([-1.0, 0.0, 0.0])
-    up = np.array([0.0, 0.0, 1.0])
-
-    def grow(start, first, bends, radii):
-        """A line from a place on, which turns into each of some directions."""
-        points, heading = [start], first
-        for target, length in bends:
-            target = target + rng.normal(0.0, 0.12, 3)
-            target /= np.linalg.norm(target)
-            for share in np.linspace(0.0, 1.0, 12)[1:]:
-                mixed = (1.0 - share) * heading + share * target
-                points.append(points[-1] + length / 11 * mixed / np.linalg.norm(mixed))
-            heading = target
-        line = Centreline(np.array(points), np.ones(len(points))).resampled(2e-3)
-        share = line.arc_length / line.length
-        given = np.interp(share, np.linspace(0.0, 1.0, len(radii)), radii)
-        return Centreline(line.points, given)
-
-    def go_on(name, bends, end):
-        line = vessels[name].centreline
-        last = line.at(line.length)
-        more = grow(last.position, last.tangent, bends, [float(last.radius), end])
-        points = np.concatenate([line.points, more.points[1:]])
-        radii = np.concatenate([line.radii, more.radii[1:]])
-        vessels[name] = replace(vessels[name], centreline=Centreline(points, radii))
-
-    def leave(name, parent, at, bends, radii):
-        place = vessels[parent].centreline.at(at)
-        line = grow(place.position, bends[0][0], bends, radii)
-        depth = vessels[parent].centreline.project(line.points)
-        out = depth.distance > depth.radius
-        vessels[name] = Vessel(name, line, parent, float(line.arc_length[out.argmax()]))
-
-    bca = vessels["bca"].centreline
-    wide = float(bca.radii[-1])
+    right, up = np.array([-1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
     back = np.array([0.0, 1.0, 0.0])
-    arm = [0.75 * wide, 3.6e-3, 3.4e-3, 3.2e-3]
+
+    def course(name, ways, radii, parent=None, place=0.0):
+        """An artery whose headings are moved a little at random."""
+        first = None if parent is None else tuple(ways[0][0])
+        moved = ((way + rng.normal(0.0, 0.12, 3), length) for way, length in ways)
+        drawn = tuple((tuple(way), length) for way, length in moved)
+        return Course(name, drawn, radii, parent, place, first)
+
+    bca, lsa = (tree.vessel(name).centreline for name in ("bca", "lsa"))
+    wide, fork = float(bca.radii[-1]), bca.length - 2e-3
+    arm = (0.75 * wide, 3.6e-3, 3.4e-3, 3.2e-3)
     if narrow is not None:
-        arm = [0.75 * wide, 3.4e-3, narrow, 3.2e-3, 3.2e-3, 3.2e-3, 3.0e-3]
+        arm = (0.75 * wide, 3.4e-3, narrow, 3.2e-3, 3.2e-3, 3.2e-3, 3.0e-3)
     steep = right + (1.6 if narrow is not None else 0.5) * up
-    leave("rsa", "bca", bca.length - 2e-3, [(steep, 25e-3), (right, 60e-3)], arm)
-    carotid = up + 0.15 * right
-    end = [0.8 * wide, 3.2e-3, 3.0e-3]
-    leave("rcca", "bca", bca.length - 2e-3, [(carotid, 30e-3), (up, 60e-3)], end)
-    at = 30e-3 if narrow is None else 52e-3
-    thin = [1.9e-3, 1.8e-3, 1.7e-3]
-    climb = up + 0.5 * back + 0.2 * right
-    leave("rva", "rsa", at, [(climb, 25e-3), (up + 0.1 * back, 45e-3)], thin)
-    go_on("lcca", [(up, 60e-3)], 3.0e-3)
-    lsa = vessels["lsa"].centreline.length
-    go_on("lsa", [(-right + 0.3 * up, 30e-3), (-right, 40e-3)], 3.2e-3)
-    climb = up + 0.3 * back - 0.1 * right
-    leave("lva", "lsa", lsa - 5e-3, [(climb, 25e-3), (up, 45e-3)], thin)
-    return VesselTree(vessels)
+    neck = 0.8 * wide, 3.2e-3, 3.0e-3
+    at, thin = 30e-3 if narrow is None else 52e-3, (1.9e-3, 1.8e-3, 1.7e-3)
+    rise = [(up + 0.5 * back + 0.2 * right, 25e-3), (up + 0.1 * back, 45e-3)]
+    climb = [(up + 0.3 * back - 0.1 * right, 25e-3), (up, 45e-3)]
+    over = [(-right + 0.3 * up, 30e-3), (-right, 40e-3)]
+    carotid = [(up + 0.15 * right, 30e-3), (up, 60e-3)]
+    courses = (
+        course("rsa", [(steep, 25e-3), (right, 60e-3)], arm, "bca", fork),
+        course("rcca", carotid, neck, "bca", fork),
+        course("rva", rise, thin, "rsa", at),
+        course("lcca", [(up, 60e-3)], (3.0e-3,)),
+        course("lsa", over, (3.2e-3,)),
+        course("lva", climb, thin, "lsa", lsa.length - 5e-3),
+    )
+    return with_courses(tree, courses)
 
 
 def with_vertebral(tree: VesselTree, rng) -> VesselTree:

@@ -33,6 +33,7 @@ from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.builder import GOAL_DEPTH, VesselPlace
 from cathsim_dmc.anatomy.centreline import VesselTree
+from cathsim_dmc.tasks import anatomies as known
 from cathsim_dmc.tasks.anatomies import load_anatomy
 
 GOALS = ("bca", "lcca", "lsa")
@@ -54,7 +55,7 @@ CHANGES = {
 # Radii of a branch that is too narrow for one device or all, m, from so far behind its
 # ostium on; between them the lumen tapers.
 NARROW, TAPER = (0.6e-3, 0.8e-3, 1.0e-3, 1.2e-3), 10e-3
-Part = Literal["arches", "variants", "anatomies", "changes", "narrow"]
+Part = Literal["arches", "neck", "variants", "anatomies", "changes", "narrow"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,6 +86,15 @@ def arches(pool=None, pair=False):
             where = {"goal": goal, "access": access}
             options = {**where, "arches": "test", "pool": pool}
             yield Cell("arches", where, _arch(pair), options, pool)
+
+
+def neck(pool=None, pair=False):
+    """Every held-out arch with the arteries of neck and arms once, for each goal."""
+    pool = pool or len(arch.arch_set("test_neck"))
+    for goal in known.GOALS:
+        where = {"arches": "test_neck", "goal": goal}
+        task = "neck_any_pair" if pair else "neck_any"
+        yield Cell("neck", where, task, {**where, "pool": pool}, pool)
 
 
 def variants(pair=False, episodes=4):
@@ -240,8 +250,8 @@ class Selection:
         anatomy: Names or directories of the anatomies of the part `anatomies`.
         goals: Branches of these anatomies, of those that they have.
         pair: Whether a guidewire in a catheter is driven from the groin.
-        pool: Number of held-out arches of the part `arches`, the first ones; all by
-            default.
+        pool: Number of held-out arches of the parts `arches` and `neck`, the first
+            ones; all by default.
         max_steps: Number of control steps after which an episode is cut off; that of
             the task by default.
         episodes: Number of episodes of a cell of `anatomies` or `changes`.
@@ -259,6 +269,7 @@ class Selection:
         """The cells in turn."""
         makers = {
             "arches": lambda: arches(self.pool, self.pair),
+            "neck": lambda: neck(self.pool, self.pair),
             "variants": lambda: variants(self.pair),
             "anatomies": lambda: anatomies(
                 self.anatomy, self.pair, self.goals, self.episodes

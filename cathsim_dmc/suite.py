@@ -389,6 +389,18 @@ register(
     ),
     "hard",
 )
+register(
+    "neck_any",
+    TaskDefinition(
+        "A random arch with the arteries of neck and arms, from the descending aorta.",
+        None,
+        "any",
+        "descending",
+        options={"working_length": 0.44, "arches": "neck"},
+        random_arch=True,
+    ),
+    "hard",
+)
 _register_coaxial()
 register(
     "navigate",

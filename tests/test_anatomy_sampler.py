@@ -1,6 +1,7 @@
 """Random arches: repeatable, of the type asked for, distributed as the tables say."""
 
 import math
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -8,9 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cathsim_dmc.anatomy import measures
-from cathsim_dmc.anatomy.arch import arch, sampler
+from cathsim_dmc.anatomy.arch import arch, neck, sampler
 from cathsim_dmc.anatomy.arch.tree import arch_tree
+from cathsim_dmc.anatomy.builder import GOAL_DEPTH
+from cathsim_dmc.anatomy.curves import check_septa
 from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.tasks.anatomies import GOALS
 from cathsim_dmc.validation.wall import field_error, lumen_checks
 
 RADII = [7.492, 4.211, 6.129]  # mm, of the BCA in the first three test arches
@@ -73,6 +77,52 @@ def test_sets_are_disjoint_and_fixed():
     assert radii == RADII
     with pytest.raises(ValueError, match="train, test, test_variants"):
         arch.arch_set("validation")
+
+
+def test_a_neck_has_the_arteries_beyond_the_arch():
+    seed = arch.arch_set("test_neck")[2]
+    anatomy = arch.build_seed(seed, access="descending")
+    assert anatomy.name == seed.name and seed.name.startswith("neck-")
+    parents = {name: one.parent for name, one in anatomy.tree.vessels.items()}
+    assert parents["bca"] == parents["lsa"] == "aorta"
+    ends = {"rcca": "bca", "rsa": "bca", "rva": "rsa", "lva": "lsa"}
+    assert ends.items() <= parents.items()
+    assert set(anatomy.goals) == {*GOALS, "descending"}
+    for name in ends:
+        goal = anatomy.goals[name]
+        assert goal.arc_length - anatomy.tree.vessel(name).ostium == pytest.approx(
+            GOAL_DEPTH
+        )
+    assert all(check.passed for check in lumen_checks(anatomy))
+    error = field_error(anatomy)
+    assert np.percentile(error, 99) < 0.02e-3
+
+
+def test_necks_differ_and_are_repeated():
+    """What the arch is without its neck is that of the same draws."""
+    seeds = arch.arch_set("neck")[:4]
+    found = [arch_tree(one.parameters()) for one in seeds]
+    again = arch_tree(seeds[1].parameters())
+    for name, one in found[1].vessels.items():
+        other = again.vessel(name).centreline
+        assert one.centreline.points.tobytes() == other.points.tobytes()
+    ends = [one.vessel("rva").centreline.points[-1] for one in found]
+    assert min(np.linalg.norm(a - b) for a, b in combinations(ends, 2)) > 3e-3
+    # Upright: the carotids go to the head, the arms to either side.
+    for tree in found:
+        way = {n: np.diff(one.centreline.points[[0, -1]], axis=0)[0]
+               for n, one in tree.vessels.items()}  # fmt: skip
+        assert way["rcca"][2] > 0.05 and way["lva"][2] > 0.03
+        assert way["rsa"][0] < -0.04 and way["lsa"][0] > 0.02
+        check_septa(tree)
+
+
+def test_an_arch_without_a_bca_has_no_neck():
+    with pytest.raises(ValueError, match="aberrant arch has no neck"):
+        arch.sample(np.random.RandomState(0), "II", variant="aberrant", neck=True)
+    tree = arch_tree(arch.sample(np.random.RandomState(0), "II", variant="aberrant"))
+    with pytest.raises(ValueError, match="this one has aorta, rcca"):
+        neck.sample_neck(np.random.RandomState(0), tree)
 
 
 def test_unknown_kinds_list_the_known():

@@ -46,9 +46,10 @@ def test_signs_that_an_encoding_lacks_are_spelt(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", [("type1",), ("test", "--index", 3)])
-def test_a_variant_that_would_change_nothing_is_refused(cathsim, tmp_path, kind):
+@pytest.mark.parametrize("more", [("--variant", "aberrant"), ("--neck",)])
+def test_a_variant_that_would_change_nothing_is_refused(cathsim, tmp_path, kind, more):
     out = "--out", tmp_path / "x"
-    code, _, err = cathsim("phantom", "generate", *kind, "--variant", "aberrant", *out)
+    code, _, err = cathsim("phantom", "generate", *kind, *more, *out)
     assert code == 2 and "which I, II and III take alone" in err
     assert not list(tmp_path.iterdir())
 

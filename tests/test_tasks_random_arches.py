@@ -11,7 +11,7 @@ from cathsim_dmc.physics.readings import part
 from cathsim_dmc.pictures.recorded import record, surface_of
 from cathsim_dmc.policies.pursuit import Plan
 from cathsim_dmc.tasks import cases, placement
-from cathsim_dmc.tasks.anatomies import goals_for
+from cathsim_dmc.tasks.anatomies import goal_of, goals_for
 from cathsim_dmc.tasks.physics_errors import ESCAPE_INTERVAL
 
 POOL = 3
@@ -234,6 +234,17 @@ def test_any_arch_takes_accesses_and_branches_in_turn():
     ways = ["ascending", "descending"] * 2
     assert own(pool=4) == list(zip(ways, ["bca", "bca", "lcca", "lcca"], strict=True))
     assert own(pool=2, goal="lsa", access="descending") == [("descending", "lsa")] * 2
+
+
+def test_a_neck_has_a_vertebral_goal_and_a_device_that_reaches_it():
+    options = {"arches": "test_neck", "numbers": [1], "goal": "rva"}
+    for name in ("neck_any", "neck_any_pair"):
+        task = suite.make_task(name, **options)
+        scene = task.scene
+        assert scene.goal.name == "rva" and scene.anatomy.inlet.vessel == "aorta"
+        route = scene.anatomy.route(scene.goal).length
+        assert scene.placement.stroke > route - scene.placement.start_depth
+    assert goal_of(scene.anatomy, "any", 13) == "lva"
 
 
 @pytest.mark.parametrize("wrong", [{"goal": "left"}, {"access": "radial"}])

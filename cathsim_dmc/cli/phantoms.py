@@ -145,6 +145,7 @@ def generate(
     out: Path,
     seed: int | None = None,
     variant: str = "normal",
+    neck: bool = False,
     index: int | None = None,
     access: str = "ascending",
 ) -> int:
@@ -152,11 +153,13 @@ def generate(
 
     Args:
         kind: A named phantom such as type1, simple1, bovine; I, II or III for a random
-            arch of that type; train, test or test_variants for an arch of that set.
+            arch of that type; train, test, test_variants, neck or test_neck for an arch
+            of that set.
         out: Directory of the anatomy.
         seed: Seed of a random arch of a type.
         variant: How the branches of a random arch of a type leave it: normal,
             bovine_trunk, bovine_branch or aberrant.
+        neck: Whether a random arch of a type has the arteries of neck and arms.
         index: Place of an arch in its set.
         access: End of the aorta that the device enters, ascending or descending.
     """
@@ -168,11 +171,14 @@ def generate(
         if (value is not None) != (option == needs[kind]):
             wanted = f"--{needs[kind]}" if needs[kind] else "neither --seed nor --index"
             raise ValueError(f"{kind!r} takes {wanted}; --{option} is {value}")
-    if variant != "normal" and needs[kind] != "seed":
-        raise ValueError(f"--variant is {variant!r}, which I, II and III take alone")
+    if needs[kind] != "seed" and (neck or variant != "normal"):
+        wrong = "--neck is given" if neck else f"--variant is {variant!r}"
+        raise ValueError(f"{wrong}, which I, II and III take alone")
     files.require_place(out)
     if seed is not None:
-        anatomy = arch.build_seed(arch.ArchSeed(seed, kind, variant), access=access)
+        anatomy = arch.build_seed(
+            arch.ArchSeed(seed, kind, variant, neck), access=access
+        )
     elif index is not None:
         arches = arch.arch_set(kind)
         bounds.whole("index", index, 0, len(arches) - 1)

@@ -27,8 +27,8 @@ class TaskOptions:
             "any" for one branch after the other, or a name for each arch: lcca,any.
         access: Way in: "ascending", from the ascending aorta, or "descending", from
             the femoral artery (`navigate`).
-        arches: Set of random arches that episodes draw from: train, test or
-            test_variants (`arch_…`, `femoral_arch_…`).
+        arches: Set of random arches that episodes draw from: train, test,
+            test_variants, neck or test_neck (`arch_…`, `femoral_arch_…`, `neck_…`).
         pool: Number of arches that episodes draw from (the same tasks).
         first: Number in the set of the first of them (the same tasks).
         numbers: Their numbers in the set, in place of pool and first.

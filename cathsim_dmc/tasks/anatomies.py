@@ -10,6 +10,7 @@ from cathsim_dmc.tasks import placement
 
 # Goals in the branches of an arch.
 BRANCHES = ("bca", "rcca", "lcca", "lsa", "rsa")
+GOALS = (*BRANCHES, "rva", "lva")  # with the vertebral arteries of a neck
 POOL = 16  # arches that an episode draws from, unless one says otherwise
 
 
@@ -86,7 +87,7 @@ def load_arches(
     """Random arches of a named set, in the order of their seeds; see `arch_set`.
 
     Args:
-        arches: Name of the set: "train", "test" or "test_variants".
+        arches: Name of the set, one of `arch.SETS`.
         pool: Number of arches; building one takes about a second and a half.
         first: Number of the first one in the set.
         numbers: Numbers of the arches in the set, in place of pool and first.
@@ -148,7 +149,7 @@ def goals_for(goal: str | Sequence[str], numbers: Sequence[int]) -> list[str]:
     else:
         each = list(goal)
     for one in each:
-        bounds.choice("goal", one, ("any", *BRANCHES))
+        bounds.choice("goal", one, ("any", *GOALS))
     if len(each) != len(numbers):
         raise ValueError(
             f"option goal has {len(each)} names for {len(numbers)} arches; give one "
@@ -161,5 +162,5 @@ def goal_of(anatomy: Anatomy, goal: str, number: int) -> str:
     """Name of a goal; "any" is one branch after the other, by the arch's number."""
     if goal != "any":
         return goal
-    branches = [name for name in BRANCHES if name in anatomy.goals]
+    branches = [name for name in GOALS if name in anatomy.goals]
     return branches[number // 2 % len(branches)]

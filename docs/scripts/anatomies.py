@@ -167,12 +167,37 @@ def distributions():
     return table(["", "table", "98 test arches", "range"], rows)
 
 
-def gallery():
-    """Front and left views of random arches."""
-    figure = Figure(figsize=(15, 10.5), layout="constrained")
+def necks():
+    """Arteries of neck and arms in the test arches that have them, and their goals."""
+    seeds, wanted = arch.arch_set("test_neck"), ("rcca", "rsa", "rva", "lva")
+    found = {name: [] for name in wanted}
+    for seed in seeds:
+        anatomy = arch.build_seed(seed, access="descending")
+        measured = measures.measure(anatomy.tree)["branches"]
+        for name in wanted:
+            vessel = anatomy.tree.vessel(name)
+            off = anatomy.tree.vessel(vessel.parent).centreline.at(
+                anatomy.tree.origin(name)
+            )
+            way = vessel.centreline.at(vessel.ostium + 10e-3).tangent
+            angle = np.degrees(np.arccos(np.clip(way @ off.tangent, -1.0, 1.0)))
+            route = 1e3 * anatomy.route(anatomy.goals[name]).length
+            found[name].append((measured[name]["diameter_mm"], angle, route))
+    rows = []
+    for name, values in found.items():
+        lows, highs = np.min(values, axis=0), np.max(values, axis=0)
+        spans = zip(lows, highs, (1, 0, 0), strict=True)
+        rows.append([name, *(f"{a:.{d}f} to {b:.{d}f}" for a, b, d in spans)])
+    header = ["", "Ø 10 mm past the ostium, mm", "leaves its parent at, °"]
+    return table([*header, "route to its goal, mm"], rows)
+
+
+def gallery(seeds, name):
+    """Front and left views of random arches, three in a row."""
+    rows = -(-len(seeds) // 3)
+    figure = Figure(figsize=(15, 2.6 * rows), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(4, 6)
-    seeds = [*arch.arch_set("test")[:8], *arch.arch_set("test_variants")[:4]]
+    axes = figure.subplots(rows, 6, squeeze=False)
     for place, seed in enumerate(seeds):
         anatomy = arch.build_seed(seed)
         for side, view in enumerate(("front", "left")):
@@ -182,21 +207,23 @@ def gallery():
             ax.set_ylabel("")
             ax.tick_params(labelsize=6)
             ax.set_title(seed.name if side == 0 else "from the left", fontsize=7)
-    style.save(figure, IMAGES / "random_arches.png")
+    style.save(figure, IMAGES / name)
 
 
 def main():
     anatomies = {name: phantoms.load(name) for name in phantoms.PHANTOMS}
     for name in phantoms.MEASURED:
         style.save(anatomy_figure(anatomies[name]), IMAGES / f"anatomy_{name}.png")
-    gallery()
+    variants = arch.arch_set("test_variants")[:4]
+    gallery([*arch.arch_set("test")[:8], *variants], "random_arches.png")
+    gallery(arch.arch_set("test_neck")[:6], "neck_arches.png")
     blocks = {
         "shapes": shapes(anatomies),
         "fields": fields(anatomies),
         "against measured": against_measured(),
     }
     figures.put(PAGE, **blocks)
-    figures.put(ARCHES, distributions=distributions())
+    figures.put(ARCHES, distributions=distributions(), necks=necks())
 
 
 if __name__ == "__main__":

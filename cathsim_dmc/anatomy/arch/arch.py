@@ -47,7 +47,7 @@ def build_arch(
     inlet = VesselPlace(tree.root.name, 0.0 if access == "ascending" else math.inf)
     goals = {
         branch: VesselPlace(branch, GOAL_DEPTH, past_ostium=True)
-        for branch in params.branches
+        for branch in (*params.branches, *(c.name for c in params.neck if c.parent))
     }
     arc = tree.root.centreline.length - _FROM_CAP
     goals["descending"] = VesselPlace(tree.root.name, arc)
@@ -147,29 +147,41 @@ class ArchSeed:
         seed: of the `RandomState` that draws it.
         arch_type: "I", "II" or "III".
         variant: one of `VARIANTS`.
+        neck: whether it has the arteries of neck and arms.
     """
 
     seed: int
     arch_type: str
     variant: str = "normal"
+    neck: bool = False
 
     @property
     def name(self) -> str:
         """Such as "arch-II-2000049"."""
         variant = "" if self.variant == "normal" else f"-{self.variant}"
-        return f"arch-{self.arch_type}{variant}-{self.seed}"
+        kind = "neck" if self.neck else "arch"
+        return f"{kind}-{self.arch_type}{variant}-{self.seed}"
 
     def parameters(self) -> ArchParameters:
         """The arch; the same one at every call."""
         random_state = np.random.RandomState(self.seed)
-        return sample(random_state, self.arch_type, variant=self.variant)
+        return sample(
+            random_state, self.arch_type, variant=self.variant, neck=self.neck
+        )
 
 
-_FIRST_SEEDS = {"train": 1_000_000, "test": 2_000_000, "test_variants": 3_000_000}
+_FIRST_SEEDS = {
+    "train": 1_000_000,
+    "test": 2_000_000,
+    "test_variants": 3_000_000,
+    "neck": 4_000_000,
+    "test_neck": 5_000_000,
+}
 SETS = tuple(_FIRST_SEEDS)
 TRAIN_SIZE = 1000
 TEST_SIZE = 98
 _VARIANT_SIZE = 12  # of each kind in `test_variants`
+_NECK_SIZES = {"neck": 300, "test_neck": 28}
 _BOVINE_SHARE, _BOVINE_TRUNK_SHARE = 0.20, 0.78
 
 
@@ -180,7 +192,9 @@ def arch_set(name: str) -> tuple[ArchSeed, ...]:
     "train" holds 1,000 arches of all types by prevalence, a fifth of them bovine.
     "test" holds 98 normal arches, 49 of type I and 49 of type II. "test_variants"
     holds 12 each of type III, of both bovine variants and with an aberrant right
-    subclavian (which have no BCA: their goals are rcca, lcca, lsa and rsa).
+    subclavian (which have no BCA: their goals are rcca, lcca, lsa and rsa). "neck" and
+    "test_neck" hold 300 and 28 arches drawn as those of "train", with the arteries of
+    neck and arms: both carotids, subclavian and vertebral arteries are goals, too.
 
     Raises:
         ValueError: if there is no such set.
@@ -194,7 +208,7 @@ def arch_set(name: str) -> tuple[ArchSeed, ...]:
     else:
         source = np.random.RandomState(first)
         kinds = []
-        for _ in range(TRAIN_SIZE):
+        for _ in range(_NECK_SIZES.get(name, TRAIN_SIZE)):
             kind, bovine, trunk = source.uniform(size=3)
             variant = "normal"
             if bovine < _BOVINE_SHARE:
@@ -202,7 +216,7 @@ def arch_set(name: str) -> tuple[ArchSeed, ...]:
                 variant = "bovine_trunk" if is_trunk else "bovine_branch"
             kinds.append((kind_at(kind), variant))
     return tuple(
-        ArchSeed(first + index, kind, variant)
+        ArchSeed(first + index, kind, variant, name in _NECK_SIZES)
         for index, (kind, variant) in enumerate(kinds)
     )
 

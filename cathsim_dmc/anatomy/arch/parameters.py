@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from cathsim_dmc import bounds
+from cathsim_dmc.anatomy.arch.neck import Course
 
 MINIMUM_SEPTUM = 1e-3  # m of wall between two lumens side by side
 # Tube in front of the ascending aorta, m: the device starts with its steerable tip
@@ -109,6 +110,7 @@ class ArchParameters:
         aberrant: right subclavian artery that leaves the aorta last ("rsa"); the
             first branch is then the right carotid ("rcca") with the figures of `bca`.
         lsa_aberrant_spacing: between their ostium centres, as the other spacings.
+        neck: arteries beyond the branches of the arch, see `neck.sample_neck`.
     """
 
     bca: BranchParameters
@@ -135,6 +137,7 @@ class ArchParameters:
     sway: float = 0.0
     aberrant: BranchParameters | None = None
     lsa_aberrant_spacing: float = 16e-3
+    neck: tuple[Course, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("bca", "lcca", "lsa", "aberrant"):

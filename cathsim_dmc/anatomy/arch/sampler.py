@@ -9,6 +9,7 @@ import numpy as np
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import measures
+from cathsim_dmc.anatomy.arch.neck import Random, sample_neck
 from cathsim_dmc.anatomy.arch.parameters import ArchParameters, BranchParameters
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 
@@ -64,17 +65,29 @@ _LENGTH_TOLERANCE, _DROP_TOLERANCE = 2e-3, 0.05  # m; LCCA diameters
 _SHORTEST_LIMB = 6e-3  # m
 _LIMB_BEND = 1.4  # least radius of a limb's bend, in widest radii of the lumen
 
-Random = np.random.RandomState | np.random.Generator
-
 
 def sample(
-    random_state: Random, arch_type: str, *, variant: str = "normal"
+    random_state: Random,
+    arch_type: str,
+    *,
+    variant: str = "normal",
+    neck: bool = False,
 ) -> ArchParameters:
     """Random arch from the anatomical distributions, measured to be of the type drawn.
 
-    The type is "I", "II" or "III", and the variant one of `VARIANTS`, else ValueError.
     The same random state gives the same arch.
+
+    Args:
+        random_state: Source of all draws.
+        arch_type: "I", "II" or "III".
+        variant: One of `VARIANTS`.
+        neck: Whether the arteries of neck and arms are drawn, too; not of an aberrant.
+
+    Raises:
+        ValueError: if there is no such type or variant, or neck with an aberrant.
     """
+    if neck and variant == "aberrant":
+        raise ValueError("an aberrant arch has no neck; leave out one of the two")
     bounds.choice("arch_type", arch_type, DROP_RANGES)
     bounds.choice("variant", variant, VARIANTS)
     for _ in range(_ATTEMPTS):
@@ -84,6 +97,9 @@ def sample(
             params = _draw(random_state, drop, variant)
             length = _normal(random_state, ASCENDING_LENGTH)
             params = _corrected(params, drop, length)
+            if params is not None and neck:
+                courses = sample_neck(random_state, arch_tree(params))
+                params = replace(params, neck=courses)
         except ValueError:
             continue
         if params is not None:

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from cathsim_dmc.anatomy.arch.neck import with_courses
 from cathsim_dmc.anatomy.arch.parameters import (
     LEVELS,
     MINIMUM_SEPTUM,
@@ -150,7 +151,7 @@ def arch_tree(params: ArchParameters) -> VesselTree:
         vessels[name] = _branch_vessel(
             name, branch, parent, ostium, direction, plane, max(float(fillet), 0.0)
         )
-    tree = VesselTree(vessels)
+    tree = with_courses(VesselTree(vessels), params.neck)
     check_septa(tree)
     return tree
 
