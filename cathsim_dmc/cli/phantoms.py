@@ -18,7 +18,6 @@ from cathsim_dmc.anatomy.tree_file import read_tree
 from cathsim_dmc.cli.options import Json, print_json, say, show
 from cathsim_dmc.entities import devices
 from cathsim_dmc.pictures.anatomies import anatomy_figure
-from cathsim_dmc.tasks.anatomies import load_anatomy
 
 phantoms = SubcommandApp()
 _FIRST = ("lcca", "bca")  # goals that are tried first
@@ -208,6 +207,7 @@ def check(
             out.
     """
     # Not at the top: an import of a scan needs none of the simulation.
+    from cathsim_dmc.tasks.anatomies import load_anatomy
     from cathsim_dmc.validation.wall import validate_anatomy
 
     if figure is None and Path(phantom).is_dir():
@@ -240,7 +240,9 @@ def export(
         wall: Pieces of the wall: prisms on the triangles of the surface, merged or as
             they are; or those of CoACD (extra `export`), which intrude farther.
     """
-    from cathsim_dmc.anatomy import export as exported  # not needed by an import
+    # Not needed by an import.
+    from cathsim_dmc.anatomy import export as exported
+    from cathsim_dmc.tasks.anatomies import load_anatomy
 
     files.require_file(out)
     exported.check_wall(wall)

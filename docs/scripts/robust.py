@@ -22,6 +22,7 @@ PAGES = DOCS / "robustness.md", DOCS / "robustness_pair.md"
 _FIGURES = "| safe, 0.5 N | steps | mean force, mN | largest sum, N |"
 _KEYS = ("policy", "part", "goal", "access", "anatomy", "change", "arch", "devices")
 _KEYS += ("radius",)
+_HELD_OUT = {"arches": "held-out arches", "neck": "held-out arches with a neck"}
 
 
 def key(row):
@@ -144,7 +145,7 @@ def pairs(rows):
     for row in sorted(
         rows, key=lambda r: (r["success"] / r["episodes"], r["safe"][0] / r["episodes"])
     ):
-        place = row.get("anatomy") or "held-out arches"
+        place = row.get("anatomy") or _HELD_OUT[row["part"]]
         lines.append(
             f"| `{row['policy']}` | {place} | {row['goal'].upper()} "
             f"| {pooled([row])} | {figures([row])}"
@@ -214,7 +215,8 @@ def main():
     found["weakest"] = weakest([r for r in varied if r["part"] == "anatomies"])
     found["devices"] = devices(varied)
     found["kinds"] = kinds([r for r in varied if r["part"] != "anatomies"])
-    found["pair"] = pairs([r for r in coaxial if r["part"] in ("arches", "anatomies")])
+    tabled = "anatomies", *_HELD_OUT
+    found["pair"] = pairs([row for row in coaxial if row["part"] in tabled])
     for page in PAGES:
         text = page.read_text()
         for name, lines in found.items():

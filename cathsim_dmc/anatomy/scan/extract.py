@@ -11,7 +11,7 @@ from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.scan.rings import COVER, Cover, rings, round_ring
 from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.units import mm, shown
-from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common
+from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common, in_reach
 
 END_SEARCH = 15e-3  # m from a blind end in which its width is looked for
 STUB = 3e-3  # m, shortest own vessel beyond that
@@ -93,9 +93,7 @@ def stump(ways: Ways, ends: Sequence[FreeEnd]) -> FreeEnd | None:
     traces = [ways.trace(before, ways.node(end.position)) for end in ends]
     centres = np.unique(np.concatenate(traces))
     places, reach = ways.points[centres], COVER * ways.depth[centres] + 1e-3
-    near = cKDTree(ways.points).query_ball_point(places, reach, return_sorted=False)
-    beyond = ways.main.copy()
-    beyond[np.concatenate(near).astype(int)] = False
+    beyond = ways.main & ~in_reach(ways.points, places, reach)
     label = groups(len(beyond), ways.links[beyond[ways.links].all(axis=1)])
     sizes = np.bincount(label, beyond)
     piece = np.flatnonzero(beyond & (label == sizes.argmax()))

@@ -3,13 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.scan.extract import BRANCH
 from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.units import mm, shown
-from cathsim_dmc.anatomy.scan.ways import CELL, Ways
+from cathsim_dmc.anatomy.scan.ways import CELL, Ways, in_reach
 
 REACH = (1.2, 1e-3)  # radii and m from a centreline, up to which lumen is its vessel's
 THIN = 10e-3  # m, least length of a vessel too thin for the device that is told
@@ -29,12 +28,12 @@ def left_out(ways: Ways, tree: VesselTree) -> list[LeftOut]:
 
     Their length is counted from the lumen of the tree on, the longest is first.
     """
-    lookup, taken = cKDTree(ways.points), np.zeros(len(ways.points), dtype=bool)
-    for vessel in tree.vessels.values():
-        line = vessel.centreline
-        reach = REACH[0] * line.radii + REACH[1]
-        near = lookup.query_ball_point(line.points, reach, return_sorted=False)
-        taken[np.concatenate(near).astype(int)] = True
+    lines = [vessel.centreline for vessel in tree.vessels.values()]
+    centres, radii = (
+        np.concatenate([getattr(line, name) for line in lines])
+        for name in ("points", "radii")
+    )
+    taken = in_reach(ways.points, centres, REACH[0] * radii + REACH[1])
     beyond = ways.main & ~taken
     links = ways.links[beyond[ways.links].any(axis=1)]
     if not len(links):

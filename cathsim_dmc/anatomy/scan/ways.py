@@ -152,6 +152,19 @@ def _before(graph: csr_matrix, node: int) -> np.ndarray:
     return dijkstra(graph, directed=False, indices=node, return_predecessors=True)[1]
 
 
+def in_reach(points: np.ndarray, centres: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Whether points (n, 3) lie in a ball of centres (m, 3) and radii (m,): (n,) bool.
+
+    In a fourth dimension, in which a centre lies as far off as its ball is smaller than
+    the largest one, all balls have the same radius.
+    """
+    most = float(reach.max())
+    lifted = np.column_stack([centres, np.sqrt(most**2 - reach**2)])
+    flat = np.column_stack([points, np.zeros(len(points))])
+    limit = most * (1.0 + 1e-9)
+    return np.isfinite(cKDTree(lifted).query(flat, distance_upper_bound=limit)[0])
+
+
 def common(one: np.ndarray, other: np.ndarray) -> int:
     """How many first points two curves share."""
     count = min(len(one), len(other))
