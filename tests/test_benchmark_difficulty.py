@@ -1,5 +1,9 @@
 """How hard tasks are: ends of episodes, independence, bounds, bad input."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import difficulty
 import numpy as np
 import pytest
@@ -106,3 +110,13 @@ def test_every_task_with_an_anatomy_of_its_own_is_judged():
     from_the_groin = ("femoral_", "neck_")
     asking = {n for n in names if n.startswith(from_the_groin) or "lcca" in n}
     assert steered == asking - {"femoral_type1_lsa", "femoral_type2_lsa"}
+
+
+def test_the_page_of_the_test_arches_is_made_with_the_benchmark():
+    """The folder of its script has a difficulty.py, too."""
+    scripts = Path(__file__).parents[1] / "docs" / "scripts"
+    code = "import test_arches; print(sorted(test_arches.difficulty.LIMITS))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=scripts, capture_output=True, text=True
+    )
+    assert "random_curl" in done.stdout, done.stderr

@@ -21,7 +21,8 @@ from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.simulation.batch import BatchSimulation
 
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+# Before this folder, which has a difficulty.py, too.
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import difficulty
 
 TASKS = ("arch_bca", "arch_lcca", "femoral_arch_bca", "femoral_arch_lcca")
