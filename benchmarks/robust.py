@@ -33,7 +33,7 @@ from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.builder import GOAL_DEPTH, VesselPlace
 from cathsim_dmc.anatomy.centreline import VesselTree
-from cathsim_dmc.tasks import anatomies as known
+from cathsim_dmc.tasks.anatomies import GOALS as WITH_NECK
 from cathsim_dmc.tasks.anatomies import load_anatomy
 
 GOALS = ("bca", "lcca", "lsa")
@@ -91,7 +91,7 @@ def arches(pool=None, pair=False):
 def neck(pool=None, pair=False):
     """Every held-out arch with the arteries of neck and arms once, for each goal."""
     pool = pool or len(arch.arch_set("test_neck"))
-    for goal in known.GOALS:
+    for goal in WITH_NECK:
         where = {"arches": "test_neck", "goal": goal}
         task = "neck_any_pair" if pair else "neck_any"
         yield Cell("neck", where, task, {**where, "pool": pool}, pool)

@@ -99,7 +99,6 @@ def test_a_neck_has_the_arteries_beyond_the_arch():
 
 
 def test_necks_differ_and_are_repeated():
-    """What the arch is without its neck is that of the same draws."""
     seeds = arch.arch_set("neck")[:4]
     found = [arch_tree(one.parameters()) for one in seeds]
     again = arch_tree(seeds[1].parameters())

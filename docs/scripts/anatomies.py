@@ -195,7 +195,7 @@ def necks():
 def gallery(seeds, name):
     """Front and left views of random arches, three in a row."""
     rows = -(-len(seeds) // 3)
-    figure = Figure(figsize=(15, 2.6 * rows), layout="constrained")
+    figure = Figure(figsize=(15, 2.625 * rows), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, 6, squeeze=False)
     for place, seed in enumerate(seeds):

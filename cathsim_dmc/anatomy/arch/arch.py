@@ -47,7 +47,8 @@ def build_arch(
     inlet = VesselPlace(tree.root.name, 0.0 if access == "ascending" else math.inf)
     goals = {
         branch: VesselPlace(branch, GOAL_DEPTH, past_ostium=True)
-        for branch in (*params.branches, *(c.name for c in params.neck if c.parent))
+        for branch, vessel in tree.vessels.items()
+        if vessel.parent is not None
     }
     arc = tree.root.centreline.length - _FROM_CAP
     goals["descending"] = VesselPlace(tree.root.name, arc)

@@ -125,8 +125,8 @@ def sample_neck(
 def _drawn(source: Random, tree: VesselTree) -> tuple[Course, ...]:
     """Arteries at random.
 
-    The right subclavian artery rises over the lung and falls to the arm, the vertebral
-    arteries leave its back and top 15 to 30 mm up, and climb.
+    The right subclavian artery rises over the lung and falls to the arm; the vertebral
+    arteries leave the backs and tops of both subclavian arteries and climb.
     """
 
     def way(heading: Array, shortest: float, longest: float):

@@ -29,10 +29,8 @@ def left_out(ways: Ways, tree: VesselTree) -> list[LeftOut]:
     Their length is counted from the lumen of the tree on, the longest is first.
     """
     lines = [vessel.centreline for vessel in tree.vessels.values()]
-    centres, radii = (
-        np.concatenate([getattr(line, name) for line in lines])
-        for name in ("points", "radii")
-    )
+    centres = np.concatenate([line.points for line in lines])
+    radii = np.concatenate([line.radii for line in lines])
     taken = in_reach(ways.points, centres, REACH[0] * radii + REACH[1])
     beyond = ways.main & ~taken
     links = ways.links[beyond[ways.links].any(axis=1)]
