@@ -129,8 +129,23 @@ def test_a_vessel_that_passes_behind_the_inlet_keeps_its_wall():
     wall = np.array(
         [(0, 0, -60e-3 + RADIUS - 0.5e-3), (0, 0, -60e-3 + RADIUS + 0.5e-3)]
     )
-    np.testing.assert_allclose(field(wall, free=True), [0.5e-3, -0.5e-3], atol=0.02e-3)
     assert field((0, 0, -20e-3), free=True) == FREE
+    # A cap with a hole, as a sheath leaves it, ends at the inlet, too.
+    for each in (field, field.with_hole(2e-3)):
+        np.testing.assert_allclose(
+            each(wall, free=True), [0.5e-3, -0.5e-3], atol=0.02e-3
+        )
+        aside = wall + (
+            RADIUS - 1e-3,
+            0,
+            0,
+        )  # in the shadow of the cap, not of its hole
+        np.testing.assert_allclose(
+            each(aside, free=True), [0.5e-3, -0.5e-3], atol=0.02e-3
+        )
+        np.testing.assert_allclose(
+            each.gradient(np.concatenate([wall, aside])), [-UP] * 4, atol=0.01
+        )
 
 
 def test_the_gradient_points_away_from_the_wall(tube):

@@ -111,7 +111,10 @@ def depth_at(field, point):
 
 @inlined
 def walled_depth(field, point):
-    """Depth (m) at a point (3) m where flat caps leave holes in open ends."""
+    """Depth (m) at a point (3) m where flat caps leave holes in open ends.
+
+    A cap ends where a device is no longer free behind it: a vessel may pass there.
+    """
     head, value = field.head, depth_at(field, point)
     for number in range(int(head[ENDS])):
         at = FIRST_END + END * number
@@ -119,6 +122,8 @@ def walled_depth(field, point):
         if hole >= radius:
             continue
         level, across = _over(head, number, point)
+        if level >= _NEAR:
+            continue
         across = math.sqrt(max(across, 0.0))
         if hole < across <= radius:
             value = min(value, -level)
