@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End, Surface
@@ -87,6 +88,49 @@ def test_the_wall_of_a_taper_is_nearer_than_its_radius():
     )
     depth = TreeDepth(cone)(np.array([[3e-3, 0.0, 4e-3]]))
     assert depth[0] == pytest.approx(3e-3 / np.sqrt(2), abs=1e-6)
+
+
+def test_a_closed_end_is_a_wall_where_the_vessel_narrows_behind_it():
+    """The nearest cross-section of a place on it lies farther inside."""
+    radii = np.linspace(6, 4, 41) / 1e3
+    root = Vessel("root", line((0, 0, 0), (0, 0, LENGTH), radii))
+    above = np.linspace(-2e-3, 2e-3, 41)
+    for x in (0.0, 2e-3, 4e-3):
+        places = np.stack([0 * above + x, 0 * above, above], axis=-1)
+        flank = (6e-3 - x - 0.05 * above) / np.hypot(1, 0.05)  # of the cone
+        exact = np.where(above < 0, above, np.minimum(above, flank))
+        np.testing.assert_allclose(TreeDepth(tree_of(root))(places), exact, atol=1e-5)
+
+
+def test_a_vessel_that_ends_in_others_leaves_no_wall_in_them():
+    """The end of one lies in the crossing lumen of the other, at any angle."""
+    for angle in np.radians((0, 20, 45)):
+        way = np.array([np.cos(angle), 0, np.sin(angle)])
+        tree = tree_of(
+            Vessel("root", line((0, 0, -25e-3), (0, 0, 0), 5e-3)),
+            Vessel("over", line(-20e-3 * way, 20e-3 * way, 4e-3), "root", 6e-3),
+        )
+        # On a lattice, whose blocks leave out what is far from all of their places.
+        along = np.linspace(-2e-3, 2e-3, 9)
+        block = np.stack(np.meshgrid(along, along, along, indexing="ij"), -1)
+        block, middle = block.reshape(-1, 3), np.zeros((1, 3))
+        together = TreeDepth(tree).around(middle, block)[0]
+        alone = TreeDepth(tree)(block)
+        np.testing.assert_array_equal(together, alone)
+        assert (alone > 0.3e-3).all()
+
+
+def test_a_crease_is_found_where_a_wall_bends():
+    """The divider of two branches of a random arch; its walls meet at 45°."""
+    anatomy = arch.build_seed(arch.arch_set("test")[1])
+    places = (
+        np.array([-7e-3, 17.4e-3, 98.3e-3])
+        + np.array([(0.3, -0.3, -0.4), (0.5, -0.5, -0.5), (0.8, -0.6, -0.9)]) / 1e3
+    )
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(dense_wall(anatomy.tree)).query(places)
+    np.testing.assert_allclose(TreeDepth(anatomy.tree)(places), distance, atol=0.1e-3)
 
 
 def test_the_field_of_a_tube_is_exact_at_its_ends(tube):

@@ -12,6 +12,7 @@ from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.validation import wall
 
 
@@ -131,6 +132,17 @@ def test_check_measures_and_draws_into_a_directory(cathsim, tmp_path):
     assert found["branches"]["lcca"]["diameter_mm"] == pytest.approx(6.1, abs=0.2)
     assert (tmp_path / "one/check.png").stat().st_size > 20_000
     assert "check.png" in err
+
+
+def test_check_fails_where_a_branch_begins_outside_of_its_parent():
+    anatomy, name = phantoms.load("type2"), "branches begin in other vessels"
+    assert not check_tree(anatomy)[name]
+    lsa = anatomy.tree.vessel("lsa")
+    late = lsa.centreline.slice(lsa.ostium - 1e-3, lsa.centreline.length)
+    late = replace(lsa, centreline=late, ostium=1e-3)
+    tree = VesselTree({**anatomy.tree.vessels, "lsa": late})
+    wrong = check_tree(replace(anatomy, tree=tree))[name]
+    assert "lsa" in wrong and "outside of aorta: begin it deeper" in wrong
 
 
 def test_check_fails_where_a_goal_is_in_another_vessel():

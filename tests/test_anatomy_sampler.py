@@ -14,6 +14,7 @@ from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.builder import GOAL_DEPTH
 from cathsim_dmc.anatomy.curves import check_septa
 from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.anatomy.tree_depth import on_walls, rings_of
 from cathsim_dmc.tasks.anatomies import GOALS
 from cathsim_dmc.validation.wall import field_error, lumen_checks
 
@@ -114,6 +115,17 @@ def test_necks_differ_and_are_repeated():
         assert way["rcca"][2] > 0.05 and way["lva"][2] > 0.03
         assert way["rsa"][0] < -0.04 and way["lsa"][0] > 0.02
         check_septa(tree)
+
+
+@pytest.mark.parametrize("name", ["neck", "test_neck"])
+def test_the_branches_of_a_neck_begin_in_other_vessels(name):
+    """A cross-section that lies outside of them is a lumen without a wall."""
+    for seed in arch.arch_set(name)[:28]:
+        tree = arch_tree(seed.parameters())
+        for vessel in (one for one in tree.vessels.values() if one.parent):
+            rim = tree.depths(on_walls(rings_of(vessel.centreline)[:1]))
+            rim.pop(vessel.name)
+            assert np.max(list(rim.values()), axis=0).min() > 0, (seed, vessel.name)
 
 
 def test_an_arch_without_a_bca_has_no_neck():

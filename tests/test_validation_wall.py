@@ -71,6 +71,9 @@ def test_a_tube_passes_the_checks_of_the_lumen_a_false_field_and_a_narrow_one_fa
     vars(false)["lumen"] = straight_tube(0.06, 3.9e-3).lumen
     checks = {check.name: check for check in wall.lumen_checks(false)}
     assert not checks["tube: error of the field, 99th percentile"].passed
+    vars(false)["lumen"] = straight_tube(0.0594, 4e-3).lumen
+    checks = {check.name: check for check in wall.lumen_checks(false)}
+    assert not checks["tube: places at the wall where a device meets another"].passed
     narrow = wall.lumen_checks(straight_tube(0.06, 0.8e-3))
     assert any(one.name.endswith("does not pass") for one in narrow if not one.passed)
 

@@ -118,7 +118,7 @@ def _branch(name: str, curve: Curve, parent: Vessel) -> Vessel:
     dense = _smooth(start, _FINE, first_weight=100.0)
     dense[0] = start[0]
     fine = Centreline(dense, np.ones(len(dense)))
-    ostium = _ostium(name, fine, parent)
+    ostium = ostium_of(name, fine, parent)
     place = fine.at(ostium)
     line = parent.centreline
     foot = line.at(line.locate(place.position))
@@ -180,8 +180,12 @@ def _onto_parent(name: str, points: Array, parent: Vessel) -> Array:
     return np.concatenate([foot[None], kept])
 
 
-def _ostium(name: str, line: Centreline, parent: Vessel) -> float:
-    """Arc length (m) at which a branch leaves its parent's lumen for good."""
+def ostium_of(name: str, line: Centreline, parent: Vessel) -> float:
+    """Arc length (m) at which a branch leaves its parent's lumen for good.
+
+    Raises:
+        ValueError: if it ends inside of it.
+    """
     near = parent.centreline.project(line.points)
     outside = near.distance - near.radius
     if outside[-1] <= 0.0:

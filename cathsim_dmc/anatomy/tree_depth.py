@@ -17,6 +17,7 @@ _AROUND = 120  # points of a ring from which creases are looked for
 _SEED, _APART = 1.5e-3, 0.1e-3  # m, most of their way to one, and between two of them
 _GROUP = 2.5  # points along each axis of a group, about
 _ROUNDS = 30  # projections on both walls; those that meet at 30° take the most
+_MEETING = 3e-5  # m from both walls after them, within which walls meet
 _TOUCHING = 5e-6  # m; what lies no further inside another vessel is wall
 _BEHIND = 20e-3  # m behind an open end, in which its lumen goes on
 
@@ -42,7 +43,7 @@ class TreeDepth:
 
         # Centres (3), unit tangents (3) and radii of all rings; the first and the last
         # of each vessel; its two ends: 0 open, 1 closed, 2 within another vessel.
-        rings = [_rings(line) for line in lines]
+        rings = [rings_of(line) for line in lines]
         self._nodes = np.concatenate(rings)
         self._spans = np.stack([stops[:-1], stops[1:] - 1], axis=1)
         first = [2 if row else closed(x.points[0]) for row, x in enumerate(lines)]
@@ -73,12 +74,12 @@ class TreeDepth:
     def _find_creases(self, rings: list[Array]) -> Array:
         found = [np.empty((0, 3))]
         for one, two in combinations(range(len(rings)), 2):
-            seeds = _on_walls(rings[two])
+            seeds = on_walls(rings[two])
             low, high = _box(rings[one])
             seeds = seeds[((seeds > low) & (seeds < high)).all(axis=1)]
             seeds = seeds[np.abs(self._onto(one, two, seeds, 0)[:, 0]) < _SEED]
             left = self._onto(one, two, seeds, _ROUNDS)
-            seeds = seeds[(np.abs(left) < _TOUCHING).all(axis=1)]
+            seeds = seeds[(np.abs(left) < _MEETING).all(axis=1)]
             for other in set(range(len(rings))) - {one, two}:
                 inside = self._onto(other, two, seeds, 0)[:, 0] > _TOUCHING
                 seeds = seeds[~inside]
@@ -94,7 +95,7 @@ class TreeDepth:
         return left
 
 
-def _on_walls(nodes: Array) -> Array:
+def on_walls(nodes: Array) -> Array:
     """Points (n, 3) on the rings of a vessel, m."""
     across = np.eye(3)[np.abs(nodes[:, 3:6]).argmin(axis=1)]
     u = np.cross(nodes[:, 3:6], across)
@@ -105,7 +106,7 @@ def _on_walls(nodes: Array) -> Array:
     return (nodes[:, :3] + nodes[:, 6:] * spokes).reshape(-1, 3)
 
 
-def _rings(line: Centreline) -> Array:
+def rings_of(line: Centreline) -> Array:
     """Centres, unit tangents and radii (n, 7) of the rings at a centreline's points."""
     steps = np.diff(line.points, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
@@ -209,7 +210,6 @@ def _signed(tree, vessel, chosen, x, y, z, out):
     scale = radius / length
     out[0], out[1], out[2] = cx + scale * ex, cy + scale * ey, cz + scale * ez
     distance = math.sqrt(max(value, 0.0))
-    place = k + u
     for end in range(2):
         k, u, way = (first, 0.0, -1.0) if end == 0 else (last - 1, 1.0, 1.0)
         axial, radial, radius = _ring(nodes, k, u, x, y, z)
@@ -217,7 +217,9 @@ def _signed(tree, vessel, chosen, x, y, z, out):
         if radial > radius or (level <= 0.0 and flats[end] != 1):
             continue
         if level > 0.0:
-            if abs(place - k - u) > 0.01:
+            node = nodes[first] if end == 0 else nodes[last]
+            ways = (cx - node[0]) ** 2 + (cy - node[1]) ** 2 + (cz - node[2]) ** 2
+            if ways > radius * radius:
                 continue  # beside another part of a vessel that turns back
             # Beyond an open end the lumen goes on as a straight tube.
             inside = flats[end] == 0 and level < _BEHIND
@@ -252,6 +254,22 @@ def _rings_near(nodes, among, x, y, z, margin, chosen):
 
 
 @compiled
+def _at_flat_ends(tree, vessel, deepest, x, y, z):
+    """Least of the depth of a vessel's rings, whose spheres pass its flat ends."""
+    nodes, ends, flats = tree[0], tree[1][vessel], tree[2][vessel]
+    for end in range(2):
+        node = nodes[ends[end]]
+        dx, dy, dz = x - node[0], y - node[1], z - node[2]
+        level = dx * node[3] + dy * node[4] + dz * node[5]
+        if end == 0:
+            level = -level
+        near = dx * dx + dy * dy + dz * dz < 4.0 * node[6] * node[6]
+        if flats[end] != 0 and near:
+            deepest = min(deepest, -level)
+    return deepest
+
+
+@compiled
 def _creases_near(creases, among, x, y, z, margin, near):
     """Those of the creases that matter around a place, a part of `near`."""
     closest, found = np.inf, 0
@@ -282,7 +300,8 @@ def _tree_depths(tree, creases, blocks, points, reach, groups, out):
         margin = 2.0 * reach + _SLACK
         for v in range(vessels):
             among = rings[spans[v, 0] : spans[v, 1] + 1]
-            level[v] = _rings_near(nodes, among, x, y, z, margin, wide[v])
+            deepest = _rings_near(nodes, among, x, y, z, margin, wide[v])
+            level[v] = _at_flat_ends(tree, v, deepest, x, y, z)
         bar = level.max() - margin
         around = _creases_near(creases, edges, x, y, z, 2.0 * reach + 1e-6, first)
         for g in range(len(middles)):
@@ -292,7 +311,8 @@ def _tree_depths(tree, creases, blocks, points, reach, groups, out):
                 depths[v] = -np.inf
                 if level[v] >= bar:
                     among = wide[v, 1 : 1 + wide[v, 0]]
-                    depths[v] = _rings_near(nodes, among, gx, gy, gz, margin, close[v])
+                    deepest = _rings_near(nodes, among, gx, gy, gz, margin, close[v])
+                    depths[v] = _at_flat_ends(tree, v, deepest, gx, gy, gz)
             lowest = depths.max() - 2.0 * reaches[g] - _SLACK
             near = _creases_near(creases, around, gx, gy, gz, margin, second)
             here = depths >= lowest, close, level >= bar - _SLACK, wide, places

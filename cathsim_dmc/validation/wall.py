@@ -24,10 +24,42 @@ LARGEST_FIELD = 5.0  # MB
 ARCHES = ("type1", "type2")
 _NEAR_WALL = 1e-3  # m
 _PLACES = 20_000
+_AROUND_INLET = 20e-3  # m from an inlet, within which a cap or nothing may be the wall
+_DEEPEST = -0.5e-3  # m, depth of a place outside of the lumen
+# m, difference, and slope of the clearance, that make a wall another one. The slope of
+# a distance is 1.
+_OFF, _STEEPEST = 0.4e-3, 1.5
+_HOLE = 2e-3  # m, radius of the hole that a sheath leaves in a cap
 
 
 def field_error(anatomy: Anatomy) -> np.ndarray:
     """Difference (n,) between field and exact depth within 1 mm of the wall, m."""
+    points, exact = _near_wall(anatomy)
+    found = anatomy.lumen(points, free=True)
+    return np.abs(found - exact)[found < FREE]
+
+
+def without_wall(anatomy: Anatomy) -> int:
+    """Places at the wall, away from the inlet, where a device meets another one.
+
+    The clearance is that of the simulation, with a cap that has a hole for the sheath.
+    It differs there from the depth of the lumen, or is steeper than a distance.
+    """
+    points, exact = _near_wall(anatomy)
+    looked_at = exact > _DEEPEST
+    for end in anatomy.ends:
+        if end.open:
+            away = np.linalg.norm(points - end.position, axis=1)
+            looked_at &= away > _AROUND_INLET
+    points, exact = points[looked_at], exact[looked_at]
+    capped = anatomy.lumen.with_hole(_HOLE)
+    off = np.abs(capped(points, free=True) - exact) > _OFF
+    off |= np.linalg.norm(capped.gradient(points), axis=1) > _STEEPEST
+    return int(off.sum())
+
+
+def _near_wall(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
+    """Places (n, 3) m within 1 mm of the wall, and their exact depths (n,), m."""
     points, normals = sampled(anatomy.surface, _PLACES)
     away = np.random.default_rng(0).uniform(-1.2e-3, 1.2e-3, (_PLACES, 1))
     points = points + away * normals
@@ -35,9 +67,8 @@ def field_error(anatomy: Anatomy) -> np.ndarray:
         exact = SurfaceDepth(anatomy.surface, anatomy.ends)(points)
     else:
         exact = TreeDepth(anatomy.tree, anatomy.ends)(points)
-    found = anatomy.lumen(points, free=True)
-    near = (np.abs(exact) < _NEAR_WALL) & (found < FREE)
-    return np.abs(found - exact)[near]
+    near = np.abs(exact) < _NEAR_WALL
+    return points[near], exact[near]
 
 
 def lumen_checks(anatomy: Anatomy) -> list[Check]:
@@ -74,6 +105,7 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
         ("edges of the surface without two triangles", loose, 0, "", made),
         ("separate parts of the surface", parts, 1),
         ("error of the field, 99th percentile", worst, bound, "mm", exact),
+        ("places at the wall where a device meets another", without_wall(anatomy), 0),
         ("memory of the field", anatomy.lumen.nbytes / 1e6, LARGEST_FIELD, "MB"),
         (unpassed, sum(narrow.values()), 0, "", passed),
         (unreached, len(astray), 0, "", goals),

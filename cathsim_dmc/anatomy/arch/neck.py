@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cathsim_dmc.anatomy.arch.draws import Random, normal
 from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.curves import check_septa
+from cathsim_dmc.anatomy.curves import check_septa, ostium_of
 
 _STEP = 2e-3  # m, between points of a centreline
 _TURNS = 11  # steps in which a course turns into its next heading
@@ -20,8 +21,6 @@ _SHAKE = 0.15  # deviation of each heading in each coordinate
 # lengths and courses are.
 _CAROTID, _ARM, _VERTEBRAL = (3.15e-3, 0.35e-3), (3.6e-3, 0.4e-3), (1.8e-3, 0.2e-3)
 _THINNEST = 1.3e-3  # m
-
-Random = np.random.RandomState | np.random.Generator
 
 
 @dataclass(frozen=True)
@@ -56,12 +55,10 @@ def with_courses(tree: VesselTree, courses: tuple[Course, ...]) -> VesselTree:
             line = _going_on(old.centreline, course)
             vessels[course.name] = replace(old, centreline=line)
             continue
-        trunk = vessels[course.parent].centreline
-        start = trunk.at(course.place).position
+        parent = vessels[course.parent]
+        start = parent.centreline.at(course.place).position
         line = _line(start, np.array(course.first), course, course.radii)
-        near = trunk.project(line.points)
-        out = near.distance > near.radius
-        ostium = float(line.arc_length[out.argmax()])
+        ostium = ostium_of(course.name, line, parent)
         vessels[course.name] = Vessel(course.name, line, course.parent, ostium)
     return VesselTree(vessels)
 
@@ -134,16 +131,19 @@ def _drawn(source: Random, tree: VesselTree) -> tuple[Course, ...]:
         return tuple(moved.tolist()), source.uniform(shortest, longest)
 
     def radius(spread: tuple[float, float]) -> float:
-        mean, deviation = spread
-        z = float(np.clip(source.normal(), -2.2, 2.2))
-        return max(mean + deviation * z, _THINNEST)
+        return max(normal(source, spread), _THINNEST)
 
     bca, lsa = (tree.vessel(name).centreline for name in ("bca", "lsa"))
-    wide = float(bca.radii[-1])
-    fork = bca.length - source.uniform(1e-3, 3e-3)
+    wide, end = float(bca.radii[-1]), bca.at(bca.length).tangent
+    beyond = source.uniform(0.5e-3, 2e-3)
     carotid, arm = min(radius(_CAROTID), 0.8 * wide), min(radius(_ARM), 0.75 * wide)
     rise = source.uniform(0.3, 1.2)
     steep, climb = _RIGHT + rise * _UP, _UP + source.uniform(0.0, 0.3) * _RIGHT
+    # The first cross-sections of both, at most 0.8 as wide, lie inside the BCA.
+    leans = [
+        np.linalg.norm(np.cross(end, x)) / np.linalg.norm(x) for x in (steep, climb)
+    ]
+    fork = bca.length - 0.8 * wide * float(max(leans)) - beyond
     rsa = Course(
         "rsa",
         (way(steep, 22e-3, 32e-3), way(_RIGHT + 0.2 * _UP, 20e-3, 30e-3),

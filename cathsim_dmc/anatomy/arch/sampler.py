@@ -9,9 +9,11 @@ import numpy as np
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import measures
-from cathsim_dmc.anatomy.arch.neck import Random, sample_neck
+from cathsim_dmc.anatomy.arch.draws import Random, normal, uniform
+from cathsim_dmc.anatomy.arch.neck import sample_neck
 from cathsim_dmc.anatomy.arch.parameters import ArchParameters, BranchParameters
 from cathsim_dmc.anatomy.arch.tree import arch_tree
+from cathsim_dmc.anatomy.centreline import VesselTree
 
 # Range of the BCA drop in LCCA diameters for each type of arch.
 DROP_RANGES: Mapping[str, tuple[float, float]]
@@ -57,8 +59,6 @@ _ARCH_RADIUS = (34e-3, 3.4e-3)  # m
 _ARCH_ASPECT = (0.9, 1.15)
 _DESCENDING_LENGTH = (105e-3, 125e-3)  # m, below the arch
 _AORTA_CORRELATION = 0.8  # of the levels of one aorta; an assumption
-# Draws stop at `_CUT` standard deviations; what is left has `_CUT_DEVIATION` of one.
-_CUT, _CUT_DEVIATION = 2.2, 0.9162
 _ATTEMPTS = 1000
 _CORRECTIONS = 5  # of drop and ascending length towards what was drawn, at most
 _LENGTH_TOLERANCE, _DROP_TOLERANCE = 2e-3, 0.05  # m; LCCA diameters
@@ -92,18 +92,16 @@ def sample(
     bounds.choice("variant", variant, VARIANTS)
     for _ in range(_ATTEMPTS):
         # Independent draws now and then give branches that cross: draw again.
-        drop = _uniform(random_state, DROP_RANGES[arch_type])
+        drop = uniform(random_state, DROP_RANGES[arch_type])
         try:
             params = _draw(random_state, drop, variant)
-            length = _normal(random_state, ASCENDING_LENGTH)
-            params = _corrected(params, drop, length)
-            if params is not None and neck:
-                courses = sample_neck(random_state, arch_tree(params))
-                params = replace(params, neck=courses)
+            length = normal(random_state, ASCENDING_LENGTH)
+            params, tree = _corrected(params, drop, length)
+            if neck:
+                params = replace(params, neck=sample_neck(random_state, tree))
         except ValueError:
             continue
-        if params is not None:
-            return params
+        return params
     raise RuntimeError(f"no valid arch of type {arch_type} in {_ATTEMPTS} attempts.")
 
 
@@ -113,24 +111,14 @@ def kind_at(share: float) -> str:
     return list(DROP_RANGES)[min(int(place), 2)]
 
 
-def _uniform(source: Random, ends: tuple[float, float]) -> float:
-    return source.uniform(ends[0], ends[1])
-
-
-def _normal(source: Random, spread: tuple[float, float] = (0.0, 1.0)) -> float:
-    """A draw of a mean and deviation, cut off at `_CUT` deviations."""
-    mean, deviation = spread
-    # Again, not clipped, or the bounds would be likely values.
-    while True:
-        z = float(source.normal())
-        if abs(z) <= _CUT:
-            return mean + deviation * (z / _CUT_DEVIATION)
-
-
 def _corrected(
     params: ArchParameters, drop: float, ascending: float
-) -> ArchParameters | None:
-    """The arch whose measured drop and ascending length are those drawn, or None."""
+) -> tuple[ArchParameters, VesselTree]:
+    """The arch whose measured drop and ascending length are those drawn, and its tree.
+
+    Raises:
+        ValueError: if there is none, or it is of another type.
+    """
     bend = params.ascending_bend
     for _ in range(_CORRECTIONS):
         tree = arch_tree(params)
@@ -149,23 +137,24 @@ def _corrected(
             ascending_bend=min(bend, limb / (_LIMB_BEND * widest)),
         )
     else:
-        return None
-    same = measures.arch_type(drop) == measures.arch_type(found)
-    return params if same else None
+        raise ValueError(f"no arch of the drop {drop:.2f} and so long")
+    if measures.arch_type(drop) != measures.arch_type(found):
+        raise ValueError(f"an arch of the drop {drop:.2f} is measured as {found:.2f}")
+    return params, tree
 
 
 def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
-    share, common = math.sqrt(_AORTA_CORRELATION), _normal(source)
+    share, common = math.sqrt(_AORTA_CORRELATION), normal(source)
     own = math.sqrt(1.0 - _AORTA_CORRELATION)
     aorta: dict[str, Any] = {
-        name: 0.5 * (mean + deviation * (share * common + own * _normal(source)))
+        name: 0.5 * (mean + deviation * (share * common + own * normal(source)))
         for name, (mean, deviation) in AORTA_DIAMETERS.items()
     }
     branches = {name: _branch(source, name) for name in BRANCH_DIAMETERS}
     aberrant = None
     if variant == "aberrant":
         # The first branch is the right carotid, as wide as the left one.
-        radius = 0.5 * _normal(source, BRANCH_DIAMETERS["lcca"])
+        radius = 0.5 * normal(source, BRANCH_DIAMETERS["lcca"])
         branches["bca"] = replace(
             branches["bca"], radius=radius, end_radius=min(radius, 3.15e-3)
         )
@@ -189,23 +178,23 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
             along = max(source.uniform(10e-3, 18e-3), least)
         both = sum(spacings.values())
         spacings = {"bca_lcca_spacing": along, "lcca_lsa_spacing": both}
-    arch_radius = _normal(source, _ARCH_RADIUS)
+    arch_radius = normal(source, _ARCH_RADIUS)
     last = aberrant.radius if aberrant else 0.0
     return ArchParameters(
         **branches,
         **aorta,
         ascending_length=40e-3,  # corrected to the drawn length up to the BCA
-        descending_length=_uniform(source, _DESCENDING_LENGTH),
+        descending_length=uniform(source, _DESCENDING_LENGTH),
         arch_radius=arch_radius,
-        arch_height=arch_radius * _uniform(source, _ARCH_ASPECT),
-        plane_rotation=math.radians(_normal(source, PLANE_ROTATION)),
+        arch_height=arch_radius * uniform(source, _ARCH_ASPECT),
+        plane_rotation=math.radians(normal(source, PLANE_ROTATION)),
         bca_drop=drop,
         bovine=variant.startswith("bovine"),
-        ascending_bend=max(0.0, math.radians(_normal(source, ASCENDING_BEND))),
-        descending_bend=math.radians(_normal(source, _DESCENDING_BEND)),
-        plane_tilt=math.radians(_normal(source, _PLANE_TILT)),
-        bow=_normal(source, _BOW),
-        sway=_normal(source, _SWAY),
+        ascending_bend=max(0.0, math.radians(normal(source, ASCENDING_BEND))),
+        descending_bend=math.radians(normal(source, _DESCENDING_BEND)),
+        plane_tilt=math.radians(normal(source, _PLANE_TILT)),
+        bow=normal(source, _BOW),
+        sway=normal(source, _SWAY),
         aberrant=aberrant,
         lsa_aberrant_spacing=radii["lsa"] + last + source.uniform(2e-3, 6e-3),
         **spacings,
@@ -213,7 +202,7 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
 
 
 def _branch(source: Random, name: str) -> BranchParameters:
-    radius = 0.5 * _normal(source, BRANCH_DIAMETERS[name])
+    radius = 0.5 * normal(source, BRANCH_DIAMETERS[name])
     # Taper: the LCCA narrows to a mid common carotid of 6.3 mm, others by a tenth.
     end = min(radius, 3.15e-3) if name == "lcca" else 0.9 * radius
     # Downstream at first for those that lean upstream, and back for the LSA.
@@ -223,14 +212,14 @@ def _branch(source: Random, name: str) -> BranchParameters:
     return BranchParameters(
         radius=radius,
         end_radius=end,
-        take_off=math.radians(_normal(source, TAKE_OFFS[name])),
+        take_off=math.radians(normal(source, TAKE_OFFS[name])),
         length=source.uniform(45e-3, 55e-3),
-        bend_radius=_uniform(source, bends),
+        bend_radius=uniform(source, bends),
         bend_azimuth=towards + turn,
-        lean=math.radians(_normal(source, _LEAN)),
-        second_bend_radius=_uniform(source, bends),
+        lean=math.radians(normal(source, _LEAN)),
+        second_bend_radius=uniform(source, bends),
         # Most turn back, as arteries that go up the neck do.
         second_bend_azimuth=math.remainder(
-            towards + turn + math.pi + _normal(source, (0.0, 0.8)), 2.0 * math.pi
+            towards + turn + math.pi + normal(source, (0.0, 0.8)), 2.0 * math.pi
         ),
     )

@@ -19,6 +19,7 @@ from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.tree import END_TRIM, TAIL, TAIL_RADIUS
 from cathsim_dmc.anatomy.scan.units import enlarged, mm, shown
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+from cathsim_dmc.anatomy.tree_depth import on_walls, rings_of
 
 SLACK = 0.3e-3  # m, by which a triangulated surface may cut into a tube
 STEP = 0.5e-3  # m, between the places of a centreline that are tested
@@ -32,6 +33,7 @@ VOLUME = (0.02e-6, 2e-3)  # m^3 of a lumen
 WIDE = 90.0  # percentile of the radii of a tree that is the width of its wide part
 RADII = (0.3e-3, 30e-3)  # m, allowed median of a vessel: arteriole, aneurysm
 WIDEST = 45e-3  # m
+RIM_SLACK = 0.05e-3  # m, by which the first cross-section of a branch may lie outside
 ONE_OSTIUM = 3e-3  # m of the aorta between ostia that are one
 
 
@@ -238,6 +240,24 @@ def _inlet(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
         yield "its direction does not lead into the lumen"
 
 
+def _beginnings(anatomy: Anatomy) -> Iterator[str]:
+    """Whether branches begin inside other vessels; the lumen of a scan has no tubes."""
+    vessels = {} if anatomy.scan else anatomy.tree.vessels
+    for key, vessel in vessels.items():
+        if vessel.parent is None:
+            continue
+        rim = on_walls(rings_of(vessel.centreline)[:1])
+        depths = anatomy.tree.depths(rim).items()
+        out = -float(np.max([x for name, x in depths if name != key], axis=0).min())
+        if out > RIM_SLACK:
+            start = shown(vessel.centreline.points[0])
+            yield (
+                f"the first cross-section of {key}, at {start}, lies "
+                f"up to {mm(out):.2f} mm outside of {vessel.parent}: begin it deeper "
+                "inside, or thinner"
+            )
+
+
 def _start(anatomy: Anatomy) -> Iterator[str]:
     for where, names in unreachable(anatomy).items():
         yield (
@@ -255,4 +275,8 @@ _CHECKS = {
     "goals in their vessels": _goals,
     "inlet": _inlet,
 }
-_SIZES = {"sizes of vessels": _sizes, "start of the device": _start}
+_SIZES = {
+    "sizes of vessels": _sizes,
+    "start of the device": _start,
+    "branches begin in other vessels": _beginnings,
+}
