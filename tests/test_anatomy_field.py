@@ -10,6 +10,7 @@ from cathsim_dmc.anatomy.parts import End, Surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 from cathsim_dmc.laws.field import FREE
+from cathsim_dmc.tasks import placement
 
 RADIUS, LENGTH = 4e-3, 40e-3
 UP = np.array([0.0, 0.0, 1.0])
@@ -190,6 +191,16 @@ def test_a_vessel_that_passes_behind_the_inlet_keeps_its_wall():
         np.testing.assert_allclose(
             each.gradient(np.concatenate([wall, aside])), [-UP] * 4, atol=0.01
         )
+
+
+def test_a_tilted_sheath_stands_free_behind_the_inlet():
+    """It stands beside the straight continuation of the hole, 5 mm from the aorta."""
+    anatomy = arch.build_seed(arch.arch_set("test")[39])
+    way = placement.sheath_direction(anatomy)
+    assert way @ anatomy.inlet.direction < np.cos(np.radians(10))
+    behind = np.arange(6e-3, 0.1, 0.5e-3)[:, None]
+    places = anatomy.inlet.position - behind * way
+    assert (anatomy.lumen.with_hole(3e-3)(places, free=True) == FREE).all()
 
 
 def test_the_gradient_points_away_from_the_wall(tube):

@@ -25,7 +25,7 @@ END, FIRST_END = 8, 9
 FREE = 1.0  # m, clearance of a place behind an open end
 # m behind an open end, in which a device is free; farther off a vessel may pass.
 _NEAR = 28e-3
-_THICK = 5e-3  # m, of a cap, and more than any wall past the plane of an open end
+_THICK = 5e-3  # m, more than any wall past the plane of an open end
 
 
 class FieldArrays(NamedTuple):
@@ -113,7 +113,7 @@ def depth_at(field, point):
 def walled_depth(field, point):
     """Depth (m) at a point (3) m where flat caps leave holes in open ends.
 
-    A cap is `_THICK`; a vessel may pass farther behind it.
+    A cap ends where a device is no longer free behind it: a vessel may pass there.
     """
     head, value = field.head, depth_at(field, point)
     for number in range(int(head[ENDS])):
@@ -122,7 +122,7 @@ def walled_depth(field, point):
         if hole >= radius:
             continue
         level, across = _over(head, number, point)
-        if level >= _THICK:
+        if level >= _NEAR:
             continue
         across = math.sqrt(max(across, 0.0))
         if hole < across <= radius:

@@ -24,7 +24,8 @@ LARGEST_FIELD = 5.0  # MB
 ARCHES = ("type1", "type2")
 _NEAR_WALL = 1e-3  # m
 _PLACES = 20_000
-_AROUND_INLET = 20e-3  # m from an inlet, within which a cap or nothing may be the wall
+# m around an inlet, and behind it, where a cap or nothing may be the wall.
+_AT_INLET, _BEHIND_INLET = 2e-3, 28e-3
 _DEEPEST = -0.5e-3  # m, depth of a place outside of the lumen
 # m, difference, and slope of the clearance, that make a wall another one. The slope of
 # a distance is 1.
@@ -49,8 +50,11 @@ def without_wall(anatomy: Anatomy) -> int:
     looked_at = exact > _DEEPEST
     for end in anatomy.ends:
         if end.open:
-            away = np.linalg.norm(points - end.position, axis=1)
-            looked_at &= away > _AROUND_INLET
+            local = points - end.position
+            level = local @ end.direction
+            across = np.linalg.norm(local - level[:, None] * end.direction, axis=1)
+            behind = (-_AT_INLET < level) & (level < _BEHIND_INLET)
+            looked_at &= ~behind | (across > end.radius + _AT_INLET)
     points, exact = points[looked_at], exact[looked_at]
     capped = anatomy.lumen.with_hole(_HOLE)
     off = np.abs(capped(points, free=True) - exact) > _OFF
