@@ -9,7 +9,9 @@ import pytest
 from conftest import twin
 
 from cathsim_dmc import suite
+from cathsim_dmc.agents.protocols import VARIED_RANGES
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.physics.vessel import VesselOptions
 from cathsim_dmc.simulation import batch, error_files
 from cathsim_dmc.tasks import physics_errors, start
 
@@ -150,7 +152,12 @@ def test_an_error_leaves_a_file_that_a_command_plays_again(
     tmp_path, monkeypatch, cathsim, caplog
 ):
     simulation, step = _failing(
-        "simple1_bca", tmp_path / "errors", monkeypatch, randomisation=True
+        "simple1_bca",
+        tmp_path / "errors",
+        monkeypatch,
+        # As evaluations pass them on.
+        randomisation=VARIED_RANGES,
+        vessel=VesselOptions.make("living"),
     )
     paths = sorted((tmp_path / "errors").glob("*.npz"))
     assert len(paths) == 2
@@ -194,6 +201,9 @@ def test_a_folder_keeps_the_last_few_errors_one_of_an_episode(
 
 
 def test_objects_among_the_options_are_named(tmp_path):
+    anatomy = phantoms.load("simple1")
+    files = error_files.ErrorFiles(tmp_path, "navigate", {"anatomy": anatomy})
+    assert not files._whole
     files = error_files.ErrorFiles(tmp_path, "simple1_bca", {"effects": [object()]})
     assert not files._whole and "object" in files._options["effects"][0]
     files = error_files.ErrorFiles(tmp_path, "simple1_bca", {"rotation": True})

@@ -4,12 +4,12 @@
 """
 
 import contextlib
+import dataclasses
 import json
 import logging
 import os
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ _ACTION, _RANDOM = "error.action", "_random_states"
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False)
 class PhysicsError:
     """A control step in which the physics failed.
 
@@ -124,12 +124,12 @@ class ErrorFiles:
     ):
         """Takes the name and options of the task, which make it again."""
         self.folder, self._task = Path(folder), task
-        text = json.dumps(dict(options or {}), default=repr)
+        options, self._whole = dict(options or {}), True
+        try:
+            text = json.dumps(options, default=_as_mapping)
+        except TypeError:
+            text, self._whole = json.dumps(options, default=repr), False
         self._options = json.loads(text)
-        with contextlib.suppress(TypeError):
-            self._whole = json.dumps(dict(options or {})) == text
-            return
-        self._whole = False
 
     def before(self, rollout: Rollout) -> Snapshot:
         """The state of all simulations before a control step."""
@@ -166,7 +166,8 @@ class ErrorFiles:
             except OSError as error:  # must not end the other simulations
                 _LOG.error("the file of a physics error is lost: %s", error)
                 return
-            _LOG.error("repeat the failed step with: cathsim replay-error %s", path)
+            how = "with: cathsim replay-error" if self._whole else "in Python, from"
+            _LOG.error("repeat the failed step %s %s", how, path)
 
     def _write(self, error: PhysicsError) -> Path:
         files.require_folder(self.folder, make=True)
@@ -178,3 +179,12 @@ class ErrorFiles:
             for oldest in others[: 1 - KEPT]:
                 oldest.unlink()
         return path
+
+
+def _as_mapping(value: Any) -> dict[str, Any]:
+    """An option that is a dataclass, as the mapping that makes it again."""
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        raise TypeError
+    return dataclasses.asdict(
+        value, dict_factory=lambda pairs: {k: v for k, v in pairs if v is not None}
+    )
