@@ -99,3 +99,39 @@ def test_shorter_steps_are_equal_in_both_paths(task, options, limit, monkeypatch
     timestep = batch.task.physics_timestep
     for index in range(2):
         assert batch.batch.get_model(index).opt.timestep == timestep
+
+
+def test_what_diverges_is_done_again_in_both_paths(monkeypatch):
+    """A tip that whips: its hinges turn at 1,500 rad/s, one against the next."""
+    task = suite.make_task("type1_bca")
+    environment = suite.environment(twin(task, 3))
+    batch = BatchSimulation(task, 2, num_threads=1, seeds=[3, 4])
+    batch.reset()
+    environment.reset()
+    diverged, original = [], Stepper._refine
+
+    def refine(self, indices, parts):
+        diverged.append(self._warned()[indices].tolist())
+        return original(self, indices, parts)
+
+    monkeypatch.setattr(Stepper, "_refine", refine)
+    push = np.zeros((2, batch.num_actions))
+    push[:, -1] = 1.0
+    for _ in range(20):
+        batch.step(push)
+        environment.step(push[0])
+    hinges = np.r_[batch.rollout.index.dofs][-8:]
+    whip = 1.5e3 * np.resize([1.0, -1.0], 8)
+    data = environment.physics.data.ptr
+    batch.batch.qvel[0, hinges] = data.qvel[hinges] = whip
+    for _ in range(5):
+        step = batch.step(0.0 * push)
+        environment.step(0.0 * push[0])
+        assert step.errors == (None, None)
+        assert environment.task.error is None
+        np.testing.assert_array_equal(batch.batch.qpos[0], data.qpos)
+        assert [*environment.task.wall_force] == [each[0] for each in step.wall_force]
+    assert diverged[:2] == [[True], [True]] and not batch.stepper.repeated[1]
+    # Faster still, it diverges in shorter steps, too.
+    batch.batch.qvel[0, hinges] = 1e4 * whip
+    assert batch.step(0.0 * push).errors[0] is not None

@@ -117,18 +117,19 @@ class Stepper(abc.ABC):
         """Ends a control step, done again in shorter steps where it was too coarse.
 
         Returns:
-            Force on the wall over it, and whether MuJoCo has warned in it, (N,) bool.
+            Force on the wall over it, and whether MuJoCo has warned in it, (N,) bool;
+            in shorter steps, too, where it did.
         """
         warned, (force, depth) = self._warned(), self._forces()
         limit = forces.DEEPEST if self.deepest is None else self.deepest
         way, doubt = self._way(force.peak_max, depth, limit)
-        if not doubt:
+        if not (doubt or np.count_nonzero(warned)):
             return force, warned
         depth = self._depth_at_end(depth, way, warned, limit)
         again: list[tuple[np.ndarray, forces.WallForce]] = []
         # Half the step usually suffices for a compliant wall.
         for parts in (forces.REFINEMENT,) if self.deepest is None else (2, 8):
-            coarse = ((force.peak_max > forces.HARDEST) | (depth > limit)) & ~warned
+            coarse = (force.peak_max > forces.HARDEST) | (depth > limit) | warned
             if not np.count_nonzero(coarse):
                 break
             indices = np.flatnonzero(coarse)
@@ -266,6 +267,8 @@ class Stepper(abc.ABC):
     def _refine(self, indices: np.ndarray, parts: int) -> np.ndarray:
         """Does the control step of some simulations again, in steps so much shorter."""
         self.repeated[indices] += 1
+        # A warning resets the data, and with them the number of warnings, to one.
+        self.warnings[indices] = self._warnings_before[indices] = 0
         self.set_states(indices, self.before[indices])
         self._shortened = True
         try:
@@ -364,6 +367,7 @@ class SingleStepper(Stepper):
         row[:] = 0.0 if self._stopped else self._sensor
 
     def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
+        self._stopped, self._known_warnings = False, self._warnings_before.tobytes()
         rows = np.empty((self.substeps * parts, self._rows.shape[1]))
         for row in rows:
             self._advance(row)
