@@ -162,6 +162,29 @@ def test_a_hole_in_the_cap_of_the_inlet_is_all_that_lets_a_device_out(tube):
     assert (field(places, free=True)[:2] > 0.9e-3).all()
 
 
+def test_the_rim_of_the_hole_pushes_back_along_the_way_to_it(tube):
+    """A plate with a hole: also beside its plane, where a difference reaches behind."""
+    hole = 2e-3
+    capped = tube[2].with_hole(hole)
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0, 2 * np.pi, 400)
+    away, level = rng.uniform(0.3e-3, 1.2e-3, 400), rng.uniform(0, 0.5 * np.pi, 400)
+    # On circles around the rim, in front of the plate.
+    across, up = hole - away * np.cos(level), away * np.sin(level) + 1e-9
+    spokes = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+    places = across[:, None] * spokes + up[:, None] * UP
+    np.testing.assert_allclose(capped(places, free=True), away, atol=0.01e-3)
+    back = -np.cos(level)[:, None] * spokes + np.sin(level)[:, None] * UP
+    gradient = capped.gradient(places)
+    gradient /= np.linalg.norm(gradient, axis=1, keepdims=True)
+    # The rim is sharp, and the differences reach 0.25 mm.
+    assert np.vecdot(gradient, back).min() > 0.95
+    # In the hole and in the plate it points to the middle of the hole.
+    inside = (hole + np.array([-0.5e-3, 0.4e-3]))[:, None] * spokes[:2] - 1e-3 * UP
+    gradient = capped.gradient(inside)
+    np.testing.assert_allclose(gradient, -spokes[:2], atol=0.05)
+
+
 def test_a_vessel_that_passes_behind_the_inlet_keeps_its_wall():
     """60 mm behind it, in the straight continuation of the lumen."""
     turn = np.linspace(0.0, np.pi, 40)

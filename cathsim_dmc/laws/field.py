@@ -125,10 +125,15 @@ def walled_depth(field, point):
         if level >= _NEAR:
             continue
         across = math.sqrt(max(across, 0.0))
-        if hole < across <= radius:
-            value = min(value, -level)
-        elif across <= hole and level <= 0.0:
-            value = min(value, math.hypot(level, hole - across))
+        if across > radius:
+            continue
+        if level >= _THICK:
+            plate = -level if across > hole else value
+        elif across > hole:
+            plate = -level if level <= 0.0 else -min(level, across - hole)
+        else:  # the rim of the hole, or its side
+            plate = math.hypot(min(level, 0.0), hole - across)
+        value = min(value, plate)
     return value
 
 
