@@ -110,6 +110,26 @@ def depth_at(field, point):
 
 
 @inlined
+def _cap_distance(level, across, hole):
+    """Signed distance (m) of a flat cap with a hole (m), > 0 outside of the cap.
+
+    Args:
+        level: m behind the front of the cap.
+        across: m from the axis of the hole.
+        hole: Radius of it, m.
+    """
+    if across > hole:
+        # A tilted sheath leaves the straight continuation of the hole: it is as far
+        # inside of the cap as `field_clearance` takes for free.
+        if level <= 0.0 or level >= _THICK:
+            return -level
+        return -min(level, across - hole)
+    if level >= _THICK:
+        return FREE
+    return math.hypot(min(level, 0.0), hole - across)
+
+
+@inlined
 def walled_depth(field, point):
     """Depth (m) at a point (3) m where flat caps leave holes in open ends.
 
@@ -122,18 +142,9 @@ def walled_depth(field, point):
         if hole >= radius:
             continue
         level, across = _over(head, number, point)
-        if level >= _NEAR:
-            continue
         across = math.sqrt(max(across, 0.0))
-        if across > radius:
-            continue
-        if level >= _THICK:
-            plate = -level if across > hole else value
-        elif across > hole:
-            plate = -level if level <= 0.0 else -min(level, across - hole)
-        else:  # the rim of the hole, or its side
-            plate = math.hypot(min(level, 0.0), hole - across)
-        value = min(value, plate)
+        if level < _NEAR and across <= radius:
+            value = min(value, _cap_distance(level, across, hole))
     return value
 
 
