@@ -203,11 +203,8 @@ def test_a_vessel_that_passes_behind_the_inlet_keeps_its_wall():
         np.testing.assert_allclose(
             each(wall, free=True), [0.5e-3, -0.5e-3], atol=0.02e-3
         )
-        aside = wall + (
-            RADIUS - 1e-3,
-            0,
-            0,
-        )  # in the shadow of the cap, not of its hole
+        # In the shadow of the cap, not of its hole.
+        aside = wall + (RADIUS - 1e-3, 0, 0)
         np.testing.assert_allclose(
             each(aside, free=True), [0.5e-3, -0.5e-3], atol=0.02e-3
         )

@@ -28,11 +28,8 @@ _SHIPPED = Path(__file__).parent / "data"
 _DIGITS = 9  # of lengths, m, that count: processors round differently
 _SUFFIX = ".npy"
 _FILTERS = [{"id": lzma.FILTER_DELTA, "dist": 2}, {"id": lzma.FILTER_LZMA2}]
-_MODULES = (
-    "field",
-    "tree_depth",
-    "surface_depth",
-)  # whose code decides what a field holds
+# Whose code decides what a field holds.
+_MODULES = ("field", "tree_depth", "surface_depth")
 
 
 def cache_folder() -> Path:

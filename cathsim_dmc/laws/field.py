@@ -133,7 +133,7 @@ def _cap_distance(level, across, hole):
 def walled_depth(field, point):
     """Depth (m) at a point (3) m where flat caps leave holes in open ends.
 
-    A cap ends where a device is no longer free behind it: a vessel may pass there.
+    A cap reaches back for as far as a device is free behind it.
     """
     head, value = field.head, depth_at(field, point)
     for number in range(int(head[ENDS])):

@@ -32,21 +32,24 @@ _DEEPEST = -0.5e-3  # m, depth of a place outside of the lumen
 _OFF, _STEEPEST = 0.4e-3, 1.5
 _HOLE = 2e-3  # m, radius of the hole that a sheath leaves in a cap
 
+# Places (n, 3) m at a wall, and their exact depths (n,), m.
+Places = tuple[np.ndarray, np.ndarray]
 
-def field_error(anatomy: Anatomy) -> np.ndarray:
+
+def field_error(anatomy: Anatomy, places: Places | None = None) -> np.ndarray:
     """Difference (n,) between field and exact depth within 1 mm of the wall, m."""
-    points, exact = _near_wall(anatomy)
+    points, exact = _near_wall(anatomy) if places is None else places
     found = anatomy.lumen(points, free=True)
     return np.abs(found - exact)[found < FREE]
 
 
-def without_wall(anatomy: Anatomy) -> int:
+def without_wall(anatomy: Anatomy, places: Places | None = None) -> int:
     """Places at the wall, away from the inlet, where a device meets another one.
 
     The clearance is that of the simulation, with a cap that has a hole for the sheath.
     It differs there from the depth of the lumen, or is steeper than a distance.
     """
-    points, exact = _near_wall(anatomy)
+    points, exact = _near_wall(anatomy) if places is None else places
     looked_at = exact > _DEEPEST
     for end in anatomy.ends:
         if end.open:
@@ -62,7 +65,7 @@ def without_wall(anatomy: Anatomy) -> int:
     return int(off.sum())
 
 
-def _near_wall(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
+def _near_wall(anatomy: Anatomy) -> Places:
     """Places (n, 3) m within 1 mm of the wall, and their exact depths (n,), m."""
     points, normals = sampled(anatomy.surface, _PLACES)
     away = np.random.default_rng(0).uniform(-1.2e-3, 1.2e-3, (_PLACES, 1))
@@ -77,7 +80,8 @@ def _near_wall(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
 
 def lumen_checks(anatomy: Anatomy) -> list[Check]:
     """Surface, field, passage and goals of an anatomy, generated or imported."""
-    error = 1e3 * field_error(anatomy)
+    places = _near_wall(anatomy)
+    error, other = 1e3 * field_error(anatomy, places), without_wall(anatomy, places)
     radius = devices.get("steerable_5f").outer_radius
     # Places, 0.5 mm apart, on the way to each goal that are too narrow.
     narrow, astray = {}, []
@@ -109,7 +113,7 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
         ("edges of the surface without two triangles", loose, 0, "", made),
         ("separate parts of the surface", parts, 1),
         ("error of the field, 99th percentile", worst, bound, "mm", exact),
-        ("places at the wall where a device meets another", without_wall(anatomy), 0),
+        ("places at the wall where a device meets another", other, 0),
         ("memory of the field", anatomy.lumen.nbytes / 1e6, LARGEST_FIELD, "MB"),
         (unpassed, sum(narrow.values()), 0, "", passed),
         (unreached, len(astray), 0, "", goals),

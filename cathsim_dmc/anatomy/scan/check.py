@@ -46,7 +46,7 @@ def check_tree(anatomy: Anatomy) -> dict[str, str]:
     radii = [vessel.centreline.radii for vessel in anatomy.tree.vessels.values()]
     wide = float(np.percentile(np.concatenate(radii), WIDE))
     scale = enlargement(wide, surface.volume)
-    found = {name: "; ".join(look(anatomy)) for name, look in _SIZES.items()}
+    found = {name: "; ".join(look(anatomy)) for name, look in _UNSCALED.items()}
     # A small tree is looked at enlarged, as it was imported: the limits suit it then.
     with enlarged(scale):
         large = _enlarged(anatomy, scale)
@@ -275,7 +275,7 @@ _CHECKS = {
     "goals in their vessels": _goals,
     "inlet": _inlet,
 }
-_SIZES = {
+_UNSCALED = {
     "sizes of vessels": _sizes,
     "start of the device": _start,
     "branches begin in other vessels": _beginnings,
