@@ -10,11 +10,13 @@ from test_policies import assert_same_in_composer
 from cathsim_dmc import policies, suite
 from cathsim_dmc.agents import evaluate
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.entities.chain import MAX_ROTATION_SPEED
 from cathsim_dmc.policies import coaxial_pursuit
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan
 from cathsim_dmc.policies.expert import Teacher
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import coaxial_ends, retry, take_offs
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.objectives import Cannulation
 from cathsim_dmc.tasks.progress import Progress
 from cathsim_dmc.tasks.retry import Memory
@@ -25,7 +27,7 @@ TASK = "simple1_bca_pair"
 
 @pytest.fixture(scope="module")
 def environment():
-    seen = ["tracking", "route_coaxial", "route_retry"]
+    seen = ["tracking", "route_coaxial", "route_retry", "route_turns"]
     env = suite.load("cathsim", TASK, {"random": 3, "observation": seen})
     yield env
     env.close()
@@ -74,6 +76,34 @@ def test_a_policy_sees_the_route_from_each_shaped_end(environment):
     # The first device ends at the head, the other that much behind it.
     assert np.linalg.norm(lines[0, -1]) < 1e-9 and gaps[0] == 0.0
     assert np.linalg.norm(lines[1, -1]) == pytest.approx(gaps[1], rel=0.1)
+
+
+def test_a_policy_sees_by_what_the_expert_turns(environment):
+    """At the look-ahead and the offset of every attempt."""
+    environment.reset()
+    rollout = environment.task.rollout
+    progress, plan = rollout.progress, CoaxialPlan.for_case(rollout.case())
+    settings, case_of = plan.settings, np.zeros(1, int)
+    gain = settings.turning / (MAX_ROTATION_SPEED * CONTROL_TIMESTEP)
+    turned = 0
+    for attempt in range(12):
+        timestep = environment.step(np.array([1.0, 0.5, 1.0, -0.5]))
+        if timestep.last():
+            break
+        memory = rollout.memory._replace(attempts=np.full(1, attempt))
+        progress.memory = memory
+        readings, devices = rollout.readings, rollout.devices
+        seen = progress.ahead(case_of, readings, devices).turns
+        state = plan.fresh((1,))._replace(arc_length=memory.arc_length)
+        given = readings, rollout.wall_force, devices
+        action, _ = plan.decide(settings, state, memory, *given)
+        wanted = np.clip(gain * seen[0, :, 0], -1.0, 1.0)
+        wanted[seen[0, :, 1] <= settings.aside] = 0.0
+        np.testing.assert_allclose(action[0, 1::2], wanted, atol=1e-12)
+        turned += np.abs(wanted) > 0.0
+    assert turned.any()
+    shown = timestep.observation["route_turns"].reshape(2, 2)
+    assert (np.abs(shown[:, 0]) <= np.pi).all() and (shown[:, 1] >= 0.0).all()
 
 
 def test_turning_by_the_error_turns_the_side_to_the_route(environment):

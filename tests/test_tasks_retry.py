@@ -1,5 +1,6 @@
 """Memory of the attempts along a route: the automaton, and what tasks make of it."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -129,7 +130,12 @@ def test_attempts_differ_in_what_policies_see():
     factors = COAXIAL.close.lookahead_factors
     assert len(factors) == len(COAXIAL.pattern.lookahead_factors)
     close = memory._replace(ostium=np.where(np.arange(8) < 4, 0.1, np.inf))
-    assert retry.lookahead(COAXIAL, close)[:3].tolist() == list(factors)
+    route = Route(np.zeros((2, 3)), np.full(2, 8e-3), np.array([0.0, 1.0]))
+    ways = retry.lookahead(COAXIAL, close, route, np.full(8, 0.1))
+    assert ways[:3].tolist() == [12e-3 * factor for factor in factors]
+    wide = dataclasses.replace(route, radii=np.full(2, 20e-3))
+    ways = retry.lookahead(COAXIAL, close, wide, np.full(8, 0.1))
+    assert ways[:3].tolist() == [20e-3 * factor for factor in factors]
     leads = COAXIAL.close.leads * 4 + COAXIAL.pattern.leads
     assert retry.lead(COAXIAL, close).tolist() == list(leads)
     seen = retry.shown(COAXIAL, close, insertion, insertion, True)

@@ -16,13 +16,10 @@ from cathsim_dmc.tasks.route import Place, Route, locate
 
 @dataclasses.dataclass(frozen=True)
 class AttemptSettings:
-    """How fast to drive, and where to.
+    """How fast to drive.
 
     Attributes:
         retry: What attempts differ in, see `tasks.retry`.
-        lookahead: longest way along the route to the point pursued, m.
-        least_lookahead: shortest, m; about one link of the tip.
-        lookahead_radii: in between it is so many radii of the lumen.
         speed: fastest translation, as a part of what the carriage can do.
         creep: slowest, as a part of `speed`, when misaligned or pressing.
         aligned, misaligned: cosines of the error of direction between which the speed
@@ -42,9 +39,6 @@ class AttemptSettings:
     """
 
     retry: RetrySettings = retry.SINGLE
-    lookahead: float = 16e-3
-    least_lookahead: float = 8e-3
-    lookahead_radii: float = 1.5
     speed: float = 0.6
     creep: float = 0.05
     aligned: float = 0.9
@@ -91,13 +85,7 @@ def aim(
     """Place of a head (..., 3) on the route, and way (...) to the point pursued, m."""
     steady = np.where(np.isnan(memory.steady), np.nan, state.arc_length)
     place = locate(route, head, steady)
-    # The lumen that counts is the one to come, or a branch is entered too obliquely.
-    coming = place.arc_length + settings.least_lookahead
-    radius = np.interp(coming, route.arc_length, route.radii)
-    ahead = np.clip(
-        settings.lookahead_radii * radius, settings.least_lookahead, settings.lookahead
-    )
-    return place, ahead * retry.lookahead(settings.retry, memory)
+    return place, retry.lookahead(settings.retry, memory, route, place.arc_length)
 
 
 def translation(

@@ -35,7 +35,7 @@ from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.policies import attempts
 from cathsim_dmc.policies.attempts import AttemptSettings, State
-from cathsim_dmc.tasks import retry, take_offs
+from cathsim_dmc.tasks import coaxial_ends, retry, take_offs
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.coaxial_ends import CoaxialEnds
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
@@ -62,8 +62,6 @@ class CoaxialSettings(AttemptSettings):
 
     retry: RetrySettings = retry.COAXIAL
 
-    lookahead: float = 20e-3
-    least_lookahead: float = 12e-3
     creep: float = 0.1
     aligned: float = 0.7
     misaligned: float = 0.0
@@ -143,7 +141,7 @@ class CoaxialPlan(Route):
         error = error + retry.offset(settings.retry, memory)[:, None]
         turns = away > settings.aside
         action = np.zeros((len(error), 2 * error.shape[1]))
-        rate = settings.turning * np.angle(np.exp(1j * error)) / _TURN
+        rate = settings.turning * coaxial_ends.wrapped(error) / _TURN
         action[:, 1::2] = np.where(turns, rate, 0.0)
         leader = devices.insertion.argmax(axis=1)[:, None]
         looks = np.where(turns, np.cos(error), 1.0)
@@ -199,5 +197,4 @@ def _directions(
     gaps = insertion.max(axis=1, keepdims=True) - insertion
     targets = plan.at(place.arc_length[:, None] - gaps + ahead[:, None])
     ways = plan.ends.directions(readings, insertion, targets)
-    x, y, z = np.moveaxis(ways, -1, 0)
-    return np.arctan2(y, x) - devices.tip_rotation, np.arctan2(np.hypot(x, y), z)
+    return coaxial_ends.turns(ways, devices.tip_rotation)

@@ -91,3 +91,22 @@ def sides(ways: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     along = cosine * ways[..., 0] + sine * ways[..., 1]
     across = cosine * ways[..., 1] - sine * ways[..., 0]
     return np.stack([cosine, sine, along, across, ways[..., 2]], axis=-1)
+
+
+def turns(ways: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What is left to turn (N, K) to ways (N, K, 3), and their bends (N, K), rad.
+
+    Args:
+        rotation: (N, K), of the ends, rad.
+
+    Returns:
+        Rotation of a way about the axis of the device less that of its end, and the
+        angle between the way and this axis.
+    """
+    x, y, z = np.moveaxis(ways, -1, 0)
+    return np.arctan2(y, x) - rotation, np.arctan2(np.hypot(x, y), z)
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    """Angles (...) between -pi and pi, rad."""
+    return np.angle(np.exp(1j * angle))

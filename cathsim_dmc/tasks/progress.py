@@ -21,7 +21,8 @@ from cathsim_dmc.tasks.route import (
 
 _NARROW_AHEAD = 10e-3  # m along the route within which a narrow lumen is seen
 _ROOM = 1.5  # radii of the device; a lumen with less room is too narrow for it
-_SHOWN = ("route_retry", "biplane_retry")
+# Observations of the memory, and those that follow from it.
+_OF_ROUTE, _OF_IMAGES = ("route_retry", "route_turns"), ("biplane_retry",)
 
 
 class Progress:
@@ -43,13 +44,16 @@ class Progress:
             ValueError: if an objective is not `Routed`, or two memories are observed.
         """
         self._cases, self._count, self.ends = cases, count, ends
-        shown = [name for name in _SHOWN if name in names]
-        if len(shown) > 1:
+        of_route, of_images = (
+            [name for name in kind if name in names] for kind in (_OF_ROUTE, _OF_IMAGES)
+        )
+        if of_route and of_images:
             raise ValueError(
-                f"observation has {' and '.join(shown)}, but there is one memory of "
-                "attempts; leave one of the two out"
+                f"observation has {' and '.join(of_route + of_images)}, but there is "
+                "one memory of attempts; leave one of the two out"
             )
-        self.shown, self._of_images = bool(shown), shown == ["biplane_retry"]
+        self.shown, self._of_images = bool(of_route or of_images), bool(of_images)
+        self._turns = "route_turns" in names
         chain = cases[0].scene.catheter
         self._coaxial, self._radius = chain.coaxial, chain.devices[0].outer_radius
         self.settings = retry.COAXIAL if self._coaxial else retry.SINGLE
@@ -210,13 +214,50 @@ class Progress:
         ahead = look_ahead(self._routes, chosen, place, state.head, state.head_frame)
         if self._ends is None or devices is None:
             return ahead
-        insertion = devices.insertion
-        gaps = insertion.max(axis=1, keepdims=True) - insertion
-        ways, targets = place.arc_length[:, None] - gaps + SIDE_AHEAD, []
-        for number, way in zip(chosen.tolist(), ways, strict=True):
-            targets.append(self._routes[number].at(way))
-        found = self._ends.directions(state, insertion, np.stack(targets))
-        return ahead._replace(sides=coaxial_ends.sides(found, devices.tip_rotation))
+        ways = self._ways(chosen, place, SIDE_AHEAD, state, devices)
+        ahead = ahead._replace(sides=coaxial_ends.sides(ways, devices.tip_rotation))
+        return ahead._replace(turns=self._left(chosen, place, state, devices))
+
+    def _ways(
+        self,
+        chosen: np.ndarray,
+        place: Place,
+        ahead: np.ndarray | float,
+        state: Readings,
+        devices: CoaxialReadings,
+    ) -> np.ndarray:
+        """Ways (N, K, 3), m, to the points (N,) ahead of the ends of the devices."""
+        assert self._ends is not None
+        gaps = devices.insertion.max(axis=1, keepdims=True) - devices.insertion
+        ends = (place.arc_length + ahead)[:, None] - gaps
+        targets = np.empty((*ends.shape, 3))
+        for number in np.unique(chosen).tolist():
+            rows = chosen == number
+            targets[rows] = self._routes[number].at(ends[rows])
+        return self._ends.directions(state, devices.insertion, targets)
+
+    def _left(
+        self,
+        chosen: np.ndarray,
+        place: Place,
+        state: Readings,
+        devices: CoaxialReadings,
+    ) -> np.ndarray | None:
+        """`Ahead.turns`; None where it is not observed."""
+        if not self._turns:
+            return None
+        assert self.memory is not None
+        ahead = np.empty(self._count)
+        for number in np.unique(chosen).tolist():
+            rows, route = chosen == number, self._routes[number]
+            memory = Memory._make(column[rows] for column in self.memory)
+            ahead[rows] = retry.lookahead(
+                self.settings, memory, route, place.arc_length[rows]
+            )
+        ways = self._ways(chosen, place, ahead, state, devices)
+        error, away = coaxial_ends.turns(ways, devices.tip_rotation)
+        error = error + retry.offset(self.settings, self.memory)[:, None]
+        return np.stack([coaxial_ends.wrapped(error), away], axis=-1)
 
     def seen(self, state: Readings) -> np.ndarray | None:
         """What policies see of the memory, see `retry.shown`; None if nothing."""

@@ -79,6 +79,10 @@ class RetrySettings:
             the right branch; then a withdrawal ends, and not before.
         held: how far past such a take-off a leading catheter holds it, so that the wire
             goes on, m.
+        lookahead: longest way along the route to the point pursued, m, before the
+            factor of the attempt.
+        least_lookahead: shortest likewise, m; about one link of the tip.
+        lookahead_radii: in between it is so many radii of the lumen.
         pattern: of the attempts.
         close: likewise on routes with a take-off close to the first one.
         sharp, planar: turn of the route into its last branch, rad, and cosine between
@@ -101,6 +105,9 @@ class RetrySettings:
     thorough: int = 1
     middle: float = -0.7
     held: float = 14e-3
+    lookahead: float = 16e-3
+    least_lookahead: float = 8e-3
+    lookahead_radii: float = 1.5
     pattern: Pattern = Pattern()
     close: Pattern = Pattern()
     sharp: float = 0.0
@@ -117,6 +124,8 @@ COAXIAL = RetrySettings(
     slack=12e-3,
     give=2e-3,
     thorough=4,
+    lookahead=20e-3,
+    least_lookahead=12e-3,
     pattern=Pattern(
         lookahead_factors=(1.4, 1.0, 0.75),
         leads=(0.02, -0.03, -0.045, -0.02),
@@ -271,10 +280,21 @@ def _barrier(
     return barrier, pushed
 
 
-def lookahead(settings: RetrySettings, memory: Memory) -> np.ndarray:
-    """Factor (...) of the look-ahead in the present attempt."""
-    factors = settings.pattern.lookahead_factors, settings.close.lookahead_factors
-    return _nth(factors, memory.attempts, memory)
+def lookahead(
+    settings: RetrySettings, memory: Memory, route: Route, arc_length: np.ndarray
+) -> np.ndarray:
+    """Way (...) to the point pursued in the present attempt, m.
+
+    Args:
+        arc_length: (...), of the place of the head on the route, m.
+    """
+    s = settings
+    # The lumen that counts is the one to come, or a branch is entered too obliquely.
+    coming = arc_length + s.least_lookahead
+    radius = np.interp(coming, route.arc_length, route.radii)
+    way = np.clip(s.lookahead_radii * radius, s.least_lookahead, s.lookahead)
+    factors = s.pattern.lookahead_factors, s.close.lookahead_factors
+    return way * _nth(factors, memory.attempts, memory)
 
 
 def lead(settings: RetrySettings, memory: Memory) -> np.ndarray:

@@ -115,12 +115,15 @@ class Ahead(NamedTuple):
         excess: (N,), `Place.excess` of the head.
         sides: (N, K, 5), how coaxial devices lie to the route, `coaxial_ends.sides`;
             None where no observation needs it.
+        turns: (N, K, 2), what is left to turn to the point pursued, and its bend away,
+            `coaxial_ends.turns`, rad; None where no observation needs it.
     """
 
     points: np.ndarray
     radii: np.ndarray
     excess: np.ndarray
     sides: np.ndarray | None = None
+    turns: np.ndarray | None = None
 
 
 def locate_each(

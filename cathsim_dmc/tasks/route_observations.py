@@ -120,6 +120,25 @@ def route_coaxial(frame: Frame) -> Observation:
     }
 
 
+_TURNS = Entry(
+    "route_turns",
+    lambda sizes: 2 * sizes.devices,
+    "rad",
+    "of each device: what its end is still to be turned by to the point of the route "
+    "that is pursued in the attempt, between -pi and pi, and the angle between the way "
+    "there and the device before its shaped end",
+    -np.pi,
+    np.pi,
+)
+
+
+def route_turns(frame: Frame) -> Observation:
+    """What is left to turn, at the look-ahead and the offset of the attempt."""
+    assert frame.ahead is not None
+    assert frame.ahead.turns is not None
+    return {"route_turns": flat(frame.ahead.turns, 2)}
+
+
 def add_to(table: ObservationTable) -> None:
     """Adds the rows of this module to the table of observations."""
     joined = "drives", "devices"
@@ -131,3 +150,4 @@ def add_to(table: ObservationTable) -> None:
     table.row(_retry("route_retry"), needs=ROUTE)(route_retry)
     table.row(_retry("biplane_retry"), needs=BIPLANE)(biplane_retry)
     table.row(*along, *_COAXIAL, needs=COAXIAL_ROUTE)(route_coaxial)
+    table.row(_TURNS, needs=COAXIAL_ROUTE)(route_turns)

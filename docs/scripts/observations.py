@@ -264,7 +264,7 @@ def page() -> str:
     """The whole page."""
     parts = [INTRODUCTION, entries_table() + "\n"]
     coaxial = COAXIAL.replace("{table}", coaxial_table("drives", "devices"))
-    relative = coaxial_table("route_coaxial", "route_retry")
+    relative = coaxial_table("route_coaxial", "route_retry", "route_turns")
     parts.append(coaxial.replace("{relative}", relative))
     table = options_table(FluoroscopyOptions, FluoroscopyOptions(), "default")
     parts.append(FLUOROSCOPY.replace("{table}", table))
