@@ -43,6 +43,26 @@ def test_a_device_in_lumen_and_sheath_has_not_escaped():
     assert physics_errors.escaped(anatomy, both, inlet.direction).tolist() == [0, 1]
 
 
+def test_a_device_that_indents_a_compliant_wall_has_not_escaped():
+    """A tip that snaps in a retroflexed curl indents an aorta by 2.9 mm."""
+    anatomy = phantoms.load("simple1")
+    inlet = anatomy.inlet
+    inside = inlet.position + 0.05 * inlet.direction
+    aside = np.cross(inlet.direction, [0.3, 0.5, 0.8])
+    line = inside + np.linspace(0.0, 0.05, 5001)[:, None] * aside
+    depths = anatomy.lumen(line)
+    wanted = (-1.9e-3, -2.1e-3, -3.9e-3, -4.1e-3)
+    nodes = np.stack([line[[np.abs(depths - depth).argmin()]] for depth in wanted])
+
+    def escaped(*indentation):
+        return physics_errors.escaped(
+            anatomy, nodes, inlet.direction, *indentation
+        ).tolist()
+
+    assert escaped() == [False, True, True, True]
+    assert escaped(3e-3) == [False, False, False, True]
+
+
 def test_a_device_beside_the_sheath_may_neither_escape_nor_settle(task):
     """Both once counted nodes by rules of their own."""
     scene = task.scene

@@ -15,9 +15,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from typing_extensions import override
 
-from cathsim_dmc.agents.config import TrainingConfig, positive, require, within
+from cathsim_dmc.agents.config import positive, require, within
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION
-from cathsim_dmc.agents.imitation import CloningLearner, decaying
+from cathsim_dmc.agents.imitation import CloningConfig, CloningLearner, decaying
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.replay import ReplayMemory
 from cathsim_dmc.policies import Teacher, View
@@ -26,7 +26,7 @@ _BEGUN = "step_count"  # control steps since an episode began
 
 
 @dataclass(frozen=True, kw_only=True)
-class DAggerConfig(TrainingConfig):
+class DAggerConfig(CloningConfig):
     """DAgger from the scripted expert.
 
     A round collects frames in which expert and learner alternate, adds them with the
@@ -37,7 +37,6 @@ class DAggerConfig(TrainingConfig):
         expert_share: Share of the control steps that the expert acts in, as a factor
             from round to round; in the first round it acts alone.
         gradient_steps: Number of gradient steps in a round.
-        batch_size: Number of states per gradient step.
         withdrawal_weight: Largest weight of the states in which the expert withdraws a
             device, among those in which it does not; together they weigh at most as
             much as the others.
@@ -58,16 +57,11 @@ class DAggerConfig(TrainingConfig):
     steps_per_env: int = positive(128)
     expert_share: float = within(0.5, low=0, high=1)
     gradient_steps: int = positive(2_000)
-    batch_size: int = positive(256)
     withdrawal_weight: float = within(20.0, low=1, high=1_000)
     expert_lead: float = within(0.02, low=-0.1, high=0.1)
     replay_frames: int = 1_000_000
     replay_bytes: int = positive(2 * 1024**3)
     total_frames: int = 20_480
-    hidden: tuple[int, ...] = (128, 128)
-    learning_rate: float = 1e-3
-    normalisation_frames: int = 0
-    training_max_steps: int | None = 300
     checkpoint_frames: int = 2_048
 
     def __post_init__(self):

@@ -11,7 +11,12 @@ from tensordict import TensorDictBase
 from torch import nn
 from typing_extensions import override
 
-from cathsim_dmc.agents.config import ConfigError, TrainingConfig, positive
+from cathsim_dmc.agents.config import (
+    ConfigError,
+    TrainingConfig,
+    positive,
+    within,
+)
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, load_transitions
 from cathsim_dmc.agents.learner import Learner, means
 from cathsim_dmc.agents.networks import NetworkShapes, bounded, network_of
@@ -20,6 +25,27 @@ from cathsim_dmc.agents.networks import NetworkShapes, bounded, network_of
 _SATURATED = 0.99
 # Number of states from which the deviation of the policy is estimated.
 _SAMPLE = 4_096
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloningConfig(TrainingConfig):
+    """Settings of what imitates an expert.
+
+    Attributes:
+        gradient_steps: Number of gradient steps.
+        batch_size: Number of states per gradient step.
+        weight_decay: Decay of the weights in a gradient step, as a factor of the
+            learning rate; "Decoupled Weight Decay Regularization" (Loshchilov and
+            Hutter, 2019).
+    """
+
+    gradient_steps: int = positive(10_000)
+    batch_size: int = positive(256)
+    weight_decay: float = within(0.0, low=0, high=100)
+    hidden: tuple[int, ...] = (128, 128)
+    learning_rate: float = 1e-3
+    normalisation_frames: int = 0
+    training_max_steps: int | None = 300
 
 
 class CloningLearner(Learner):
@@ -31,14 +57,15 @@ class CloningLearner(Learner):
 
     imitates: ClassVar[bool] = True
 
-    def __init__(self, config: TrainingConfig, shapes: NetworkShapes, directory: Path):
+    def __init__(self, config: CloningConfig, shapes: NetworkShapes, directory: Path):
         super().__init__(config, shapes, directory)
         self._actor = network_of(self.network)
         assert isinstance(self._actor.log_std, nn.Parameter)
         self._log_std = self._actor.log_std
-        self.optimiser = torch.optim.Adam(
+        self.optimiser = torch.optim.AdamW(
             [*self._actor.body.parameters(), *self._actor.mean.parameters()],
             lr=config.learning_rate,
+            weight_decay=config.weight_decay,
             fused=True,
         )
 
@@ -93,7 +120,7 @@ def decaying(start: float, stop: float, steps: int) -> torch.Tensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BCConfig(TrainingConfig):
+class BCConfig(CloningConfig):
     """Behaviour cloning.
 
     Nothing is learnt from the frames of the run: the clone plays between the stretches
@@ -104,7 +131,6 @@ class BCConfig(TrainingConfig):
             the observation of the run among its observations; or of episodes of a hand,
             as `cathsim play --out` writes them.
         gradient_steps: Number of gradient steps in all, spread over total_frames.
-        batch_size: Number of states per gradient step.
         steps_per_env: Number of control steps of each environment between two
             stretches of learning.
     """
@@ -113,14 +139,8 @@ class BCConfig(TrainingConfig):
     resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable - {"total_frames"}
 
     demonstrations: str | None = None
-    gradient_steps: int = positive(10_000)
-    batch_size: int = positive(256)
     steps_per_env: int = positive(128)
     total_frames: int = 20_480
-    hidden: tuple[int, ...] = (128, 128)
-    learning_rate: float = 1e-3
-    normalisation_frames: int = 0
-    training_max_steps: int | None = 300
     checkpoint_frames: int = 10_240
 
 

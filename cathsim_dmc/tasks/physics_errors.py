@@ -15,24 +15,33 @@ EXPLODED = "exploding force"
 # Control steps between two checks for an escape.
 ESCAPE_INTERVAL = 50
 # Deeper outside the lumen than this, m, the axis of the device is behind the wall:
-# the wall is 4 mm thick, and penetration stays below 1 mm.
-_ESCAPE_DEPTH = 2e-3
+# in a rigid one penetration stays below 1 mm, and a compliant one may be indented by as
+# much as control steps are simulated in one go, which the axis is less deep than.
+_ESCAPE_DEPTH, _BEYOND_INDENTATION = 2e-3, 1e-3
 # No contact of a device that is pushed with 5 N at most is harder than this, N.
 MAX_FORCE = 50.0
 
 
-def escaped(anatomy: Anatomy, centreline: np.ndarray, along: np.ndarray) -> np.ndarray:
+def escaped(
+    anatomy: Anatomy,
+    centreline: np.ndarray,
+    along: np.ndarray,
+    indentation: float | None = None,
+) -> np.ndarray:
     """Whether devices have left the lumen.
 
     Args:
         centreline: (..., n, 3), nodes of the devices, m, world frame.
         along: (3,) unit vector of the sheath, which need not stand as the vessel does.
+        indentation: Largest usual one of a compliant wall, m; None for a rigid one.
 
     Returns:
-        (...) bool: some node past the inlet lies more than 2 mm outside the lumen.
+        (...) bool: some node past the inlet lies more than 2 mm outside the lumen, or 1
+        mm more than the indentation.
     """
+    deep = indentation + _BEYOND_INDENTATION if indentation else _ESCAPE_DEPTH
     outside = past_sheath(anatomy, centreline, along)
-    outside[outside] = anatomy.lumen(centreline[outside]) < -_ESCAPE_DEPTH
+    outside[outside] = anatomy.lumen(centreline[outside]) < -deep
     return np.logical_or.reduce(outside, axis=-1)
 
 
@@ -42,6 +51,7 @@ def found(
     nodes: np.ndarray,
     warned: np.ndarray,
     force: np.ndarray,
+    indentation: float | None = None,
 ) -> tuple[str | None, ...]:
     """What went wrong in the last control step of N simulations, None for nothing.
 
@@ -51,6 +61,7 @@ def found(
         nodes: (N, n, 3), nodes of the devices where they are in the vessel at rest, m.
         warned: (N,) bool, whether MuJoCo has warned.
         force: (N,), largest contact force in any physics step, N.
+        indentation: See `escaped`.
     """
     errors: list[str | None] = [None] * len(steps)
     due: dict[Case, list[int]] = {}
@@ -65,7 +76,8 @@ def found(
             due.setdefault(case(index), []).append(index)
     for own, indices in due.items():
         scene = own.scene
-        left = escaped(scene.anatomy, nodes[indices], scene.placement.direction)
+        along = scene.placement.direction
+        left = escaped(scene.anatomy, nodes[indices], along, indentation)
         for index in np.array(indices)[left].tolist():
             errors[index] = ESCAPED
     return tuple(errors)
