@@ -24,7 +24,7 @@ EDGE, SHAPE, QUANTUM, ENDS = 3, 4, 7, 8
 END, FIRST_END = 8, 9
 FREE = 1.0  # m, clearance of a place behind an open end
 # m behind an open end, in which a device is free; farther off a vessel may pass.
-_NEAR = 28e-3
+BEHIND = 28e-3
 _THICK = 5e-3  # m, more than any wall past the plane of an open end
 
 
@@ -60,7 +60,7 @@ def behind(head, point):
     for number in range(int(head[ENDS])):
         level, across = _over(head, number, point)
         at = FIRST_END + END * number
-        if 0.0 < level < _NEAR and across < min(head[at + 6], head[at + 7]) ** 2:
+        if 0.0 < level < BEHIND and across < min(head[at + 6], head[at + 7]) ** 2:
             return level
     return 0.0
 
@@ -143,7 +143,7 @@ def walled_depth(field, point):
             continue
         level, across = _over(head, number, point)
         across = math.sqrt(max(across, 0.0))
-        if level < _NEAR and across <= radius:
+        if level < BEHIND and across <= radius:
             value = min(value, _cap_distance(level, across, hole))
     return value
 

@@ -133,6 +133,9 @@ class Stepper(abc.ABC):
             if not np.count_nonzero(coarse):
                 break
             indices = np.flatnonzero(coarse)
+            self.repeated[indices] += 1
+            # A warning resets the data, and with them the number of warnings, to one.
+            self.warnings[indices] = self._warnings_before[indices] = 0
             finer, _ = forces.wall_force(self._refine(indices, parts))
             again.append((indices, finer))
             warned, (force, depth) = self._warned(), self._forces()
@@ -266,9 +269,6 @@ class Stepper(abc.ABC):
 
     def _refine(self, indices: np.ndarray, parts: int) -> np.ndarray:
         """Does the control step of some simulations again, in steps so much shorter."""
-        self.repeated[indices] += 1
-        # A warning resets the data, and with them the number of warnings, to one.
-        self.warnings[indices] = self._warnings_before[indices] = 0
         self.set_states(indices, self.before[indices])
         self._shortened = True
         try:

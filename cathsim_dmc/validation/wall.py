@@ -12,7 +12,7 @@ from cathsim_dmc.anatomy.surface import sampled
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 from cathsim_dmc.entities import devices
-from cathsim_dmc.laws.field import FREE
+from cathsim_dmc.laws.field import BEHIND, FREE
 from cathsim_dmc.validation import convergence, friction, pressed, s_bend
 from cathsim_dmc.validation.checks import Check, Report
 
@@ -24,8 +24,8 @@ LARGEST_FIELD = 5.0  # MB
 ARCHES = ("type1", "type2")
 _NEAR_WALL = 1e-3  # m
 _PLACES = 20_000
-# m around an inlet, and behind it, where a cap or nothing may be the wall.
-_AT_INLET, _BEHIND_INLET = 2e-3, 28e-3
+# m around an inlet, where a cap or nothing may be the wall.
+_AT_INLET = 2e-3
 _DEEPEST = -0.5e-3  # m, depth of a place outside of the lumen
 # m, difference, and slope of the clearance, that make a wall another one. The slope of
 # a distance is 1.
@@ -56,7 +56,7 @@ def without_wall(anatomy: Anatomy, places: Places | None = None) -> int:
             local = points - end.position
             level = local @ end.direction
             across = np.linalg.norm(local - level[:, None] * end.direction, axis=1)
-            behind = (-_AT_INLET < level) & (level < _BEHIND_INLET)
+            behind = (-_AT_INLET < level) & (level < BEHIND)
             looked_at &= ~behind | (across > end.radius + _AT_INLET)
     points, exact = points[looked_at], exact[looked_at]
     capped = anatomy.lumen.with_hole(_HOLE)

@@ -287,8 +287,6 @@ class WarpStepper(Stepper):
 
     def _refine(self, indices: np.ndarray, parts: int) -> np.ndarray:
         """Does the control step of some simulations again, in shorter steps."""
-        self.repeated[indices] += 1
-        self.warnings[indices] = self._warnings_before[indices] = 0
         rows = np.stack(self._each(lambda i: self._again(i, parts), indices))
         last = np.ascontiguousarray(rows[:, parts - 1 :: parts])
         force, depth = forces.wall_force(last)
