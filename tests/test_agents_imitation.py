@@ -124,6 +124,34 @@ def test_a_clone_that_is_continued_learns_the_same(dataset, shapes, tmp_path):
         torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
+def test_a_clone_of_small_weights_errs_less_where_it_has_not_been(
+    dataset, shapes, tmp_path
+):
+    """One number of many tells what to do."""
+    like = load_transitions(dataset, "tracking", shapes)["observation_vector"]
+    draws = torch.randn(2, 200, shapes.vector, generator=torch.Generator())
+    tells = like.std(0).argmax()
+    wanted = draws[..., tells, None].tanh().expand(2, 200, shapes.actions)
+    names = "observation_vector", EXPERT_ACTION
+    states = TensorDict(
+        dict(zip(names, (like.mean(0) + like.std(0) * draws, wanted), strict=True)),
+        [2, 200],
+    )
+    errors = {}
+    for decay in (0.0, 1.0):
+        config = small(
+            "bc", demonstrations=dataset, gradient_steps=600, steps_per_env=1,
+            total_frames=1, learning_rate=1e-2, weight_decay=decay,
+        )  # fmt: skip
+        torch.manual_seed(0)
+        clone = BC(config, shapes, tmp_path)
+        clone.states = states[0]
+        clone.update(TensorDict({}, [1, 1]), 0.0)
+        mean, action = clone._means(states[1])
+        errors[decay] = (mean.tanh() - action).square().mean().item()
+    assert errors[1.0] < 0.7 * errors[0.0]
+
+
 def dagger(**changes):
     settings = {
         "steps_per_env": 8, "gradient_steps": 20, "total_frames": 48,
