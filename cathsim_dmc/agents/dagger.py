@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from typing_extensions import override
 
-from cathsim_dmc.agents.config import TrainingConfig, positive, require, within
+from cathsim_dmc.agents.config import positive, require, within
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION
 from cathsim_dmc.agents.imitation import CloningConfig, CloningLearner, decaying
 from cathsim_dmc.agents.networks import NetworkShapes
@@ -37,7 +37,6 @@ class DAggerConfig(CloningConfig):
         expert_share: Share of the control steps that the expert acts in, as a factor
             from round to round; in the first round it acts alone.
         gradient_steps: Number of gradient steps in a round.
-        final_gradient_steps: Number of further gradient steps in the last round.
         withdrawal_weight: Largest weight of the states in which the expert withdraws a
             device, among those in which it does not; together they weigh at most as
             much as the others.
@@ -49,9 +48,6 @@ class DAggerConfig(CloningConfig):
     """
 
     algorithm: ClassVar[str] = "dagger"
-    resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable | {
-        "final_gradient_steps"
-    }
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
         # What learns in a minute: points along the device, few and short episodes.
@@ -61,7 +57,6 @@ class DAggerConfig(CloningConfig):
     steps_per_env: int = positive(128)
     expert_share: float = within(0.5, low=0, high=1)
     gradient_steps: int = positive(2_000)
-    final_gradient_steps: int = within(0, low=0)
     withdrawal_weight: float = within(20.0, low=1, high=1_000)
     expert_lead: float = within(0.02, low=-0.1, high=0.1)
     replay_frames: int = 1_000_000
@@ -143,9 +138,7 @@ class DAgger(CloningLearner):
         config, share = self.config, self.share
         self.replay.extend(batch.select(*self._keys).reshape(-1))
         self.observe(batch)
-        left = (1.0 - progress) * config.total_frames - batch.numel()
-        steps = config.gradient_steps + (left < 1.0) * config.final_gradient_steps
-        rates = decaying(config.learning_rate, 0.0, steps)
+        rates = decaying(config.learning_rate, 0.0, config.gradient_steps)
         figures = self.fit(self.replay.sample, rates)
         return {
             **figures,
