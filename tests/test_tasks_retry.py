@@ -95,6 +95,18 @@ def test_a_shaft_that_buckles_is_taken_back_until_the_head_comes_with_it():
     assert memory.best[0] == pytest.approx(came_back)
 
 
+def test_later_attempts_give_a_shaft_more_slack():
+    """12, 18, 24 and 30 mm, and again from the first."""
+    slack = COAXIAL.slack * (1 + COAXIAL.slack_growth * np.array([0, 1, 2, 3, 0]))
+    for shift, buckles in ((-1e-4, False), (1e-4, True)):
+        memory = begun([0.1] * 5, [0.05] * 5, attempts=np.arange(5))
+        memory = goes_on(memory, 0.1, 0.05 + slack + shift, settings=COAXIAL)
+        assert (memory.retracting == buckles).all()
+    memory = begun([0.1], [0.05], attempts=[3], ostium=[0.09])
+    memory = goes_on(memory, 0.1, 0.05 + COAXIAL.slack + 1e-4, settings=COAXIAL)
+    assert memory.retracting[0]  # beside a close take-off
+
+
 def test_a_head_that_has_strayed_is_withdrawn_all_the_way():
     memory = begun([0.1], [0.05], lost=[COAXIAL.lost_patience])
     memory = goes_on(memory, 0.1, 0.05, excess=1.0, settings=COAXIAL)

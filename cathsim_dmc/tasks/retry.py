@@ -24,7 +24,7 @@ from cathsim_dmc.tasks.route import Place, Route
 from cathsim_dmc.tasks.take_offs import bend
 
 _WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
-_GROWING = 4  # retries over which the way back grows
+_GROWING = 4  # retries over which the way back, and the slack, grow
 _SAME_PLACE = 5e-3  # m of the route
 _PAST = 3e-3  # m from a close take-off on, where vessels lie side by side
 _ALONE = 20e-3  # m that a wire goes ahead from a held branch before it is followed
@@ -73,6 +73,9 @@ class RetrySettings:
         backoff_growth: of the way back from each retry to the next, up to the fourth.
         longest: control steps after which a withdrawal ends inside the tube.
         slack: Buckling threshold: advance of the base without the head, m.
+        slack_growth: of it from each attempt to the next, up to the fourth: a shaft
+            takes up more in a wide aorta before its end moves. Beside a take-off close
+            to the first one it does not grow, where slack pushes a catheter out.
         give: distance that the head may move back while slack is taken up, m.
         thorough: every n-th retry withdraws the whole way, not the slack alone.
         middle: excess below which a head past a take-off close to the first one is in
@@ -101,6 +104,7 @@ class RetrySettings:
     backoff_growth: float = 0.5
     longest: int = 120
     slack: float = np.inf
+    slack_growth: float = 0.0
     give: float = 0.0
     thorough: int = 1
     middle: float = -0.7
@@ -122,6 +126,7 @@ COAXIAL = RetrySettings(
     hard_push=0.2,
     most_pushed=16,
     slack=12e-3,
+    slack_growth=0.5,
     give=2e-3,
     thorough=4,
     lookahead=20e-3,
@@ -232,13 +237,15 @@ def advance(
     pressed = np.where((push > s.hard_push) & on, m.pressed + 1, 0)
     held = np.where(gained | m.retracting, np.minimum(insertion, m.held), m.held)
     held = np.where(gained, insertion, held)
-    buckled = on & (insertion > held + s.slack)
+    recent = m.attempts % _GROWING
+    more = np.where(np.isfinite(m.ostium), 0.0, s.slack_growth) * recent
+    buckled = on & (insertion > held + s.slack * (1 + more))
     strayed, forced = lost > s.lost_patience, pressed > s.push_patience
     give_up = on & ((stale > s.patience) | buckled) | strayed | forced
     attempts = m.attempts + give_up
     taking_up = ~strayed & (attempts % s.thorough != 0)
     taking_up = np.where(give_up, taking_up, m.taking_up)
-    growth = 1 + s.backoff_growth * (m.attempts % _GROWING)
+    growth = 1 + s.backoff_growth * recent
     turn = np.where(give_up, insertion - s.backoff * growth, m.turn)
     best = np.where(give_up | gained, place.arc_length, m.best)
     # Taking up slack ends when the head comes back with the shaft.
