@@ -71,8 +71,10 @@ def export(
             "seed": config.seed,
         }
     options = judgement.published_options(config.task_kwargs)
-    if suite.TASKS[config.task].random_arch:
-        options["arches"] = "test"
+    definition = suite.TASKS[config.task]
+    if definition.random_arch:
+        trained = {**definition.options, **config.task_kwargs}.get("arches")
+        options["arches"] = "test_neck" if trained == "neck" else "test"
         if not isinstance(options.get("goal", ""), str):  # one for each arch
             options["goal"] = "any"
     label = f"{pretrained.PREFIX}{name}"
