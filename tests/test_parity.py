@@ -142,7 +142,10 @@ def test_randomised_episodes_are_equal():
     ],
 )
 def test_shaped_devices_are_equal(name, options):
-    pair = Pair(name, observation=["internal", "tracking", "force"], **options)
+    observation = ["internal", "tracking", "force"]
+    if name.endswith("_pair"):
+        observation += ["route_coaxial", "route_retry", "route_turns"]
+    pair = Pair(name, observation=observation, **options)
     pair.reset()
     for index, action in enumerate(actions(24, count=pair.batch.num_actions)):
         pair.step(action)

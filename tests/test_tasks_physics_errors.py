@@ -63,6 +63,25 @@ def test_a_device_that_indents_a_compliant_wall_has_not_escaped():
     assert escaped(3e-3) == [False, False, False, True]
 
 
+@pytest.mark.parametrize(
+    "vessel, indentation",
+    [("rigid", None), ({"motion": True}, None), ({"wall": True}, 3e-3)],
+)
+def test_what_indents_is_told_by_the_wall(monkeypatch, vessel, indentation):
+    told, found = [], physics_errors.found
+
+    def keep(*given):
+        told.append(given[-1])
+        return found(*given)
+
+    monkeypatch.setattr(physics_errors, "found", keep)
+    task = suite.make_task("simple1_bca", vessel=vessel)
+    simulation = batch.BatchSimulation(task, 1, seeds=3)
+    simulation.reset()
+    simulation.step(np.zeros((1, simulation.num_actions)))
+    assert told == [indentation]
+
+
 def test_a_device_beside_the_sheath_may_neither_escape_nor_settle(task):
     """Both once counted nodes by rules of their own."""
     scene = task.scene

@@ -97,7 +97,7 @@ def test_a_shaft_that_buckles_is_taken_back_until_the_head_comes_with_it():
 
 def test_later_attempts_give_a_shaft_more_slack():
     """12, 18, 24 and 30 mm, and again from the first."""
-    slack = COAXIAL.slack * (1 + COAXIAL.slack_growth * np.array([0, 1, 2, 3, 0]))
+    slack = 1e-3 * np.array([12, 18, 24, 30, 12])
     for shift, buckles in ((-1e-4, False), (1e-4, True)):
         memory = begun([0.1] * 5, [0.05] * 5, attempts=np.arange(5))
         memory = goes_on(memory, 0.1, 0.05 + slack + shift, settings=COAXIAL)
@@ -232,6 +232,12 @@ def test_only_one_memory_is_observed():
     both = ["route_retry", "biplane_retry"]
     with pytest.raises(ValueError, match="route_retry and biplane_retry.*leave one"):
         BatchSimulation(suite.make_task("type1_bca", observation=both, **options), 1)
+    for others in ([], ["biplane_retry"]):
+        pair = suite.make_task(
+            "type1_bca_pair", observation=["route_turns", *others], **options
+        )
+        with pytest.raises(ValueError, match="add route_retry, and leave biplane"):
+            BatchSimulation(pair, 1)
 
 
 @pytest.fixture(scope="module")

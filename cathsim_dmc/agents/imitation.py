@@ -29,14 +29,14 @@ _SAMPLE = 4_096
 
 @dataclass(frozen=True, kw_only=True)
 class CloningConfig(TrainingConfig):
-    """Settings of what imitates an expert.
+    """Settings of the algorithms that imitate an expert.
 
     Attributes:
         gradient_steps: Number of gradient steps.
         batch_size: Number of states per gradient step.
-        weight_decay: Decay of the weights in a gradient step, as a factor of the
-            learning rate; "Decoupled Weight Decay Regularization" (Loshchilov and
-            Hutter, 2019).
+        weight_decay: Each gradient step multiplies weights and biases by 1 - learning
+            rate · weight_decay, as AdamW does ("Decoupled Weight Decay Regularization",
+            Loshchilov and Hutter, 2019).
     """
 
     gradient_steps: int = positive(10_000)

@@ -19,7 +19,7 @@ class AttemptSettings:
     """How fast to drive.
 
     Attributes:
-        retry: What attempts differ in, see `tasks.retry`.
+        retry: Of the attempts, and how far ahead they look, see `tasks.retry`.
         speed: fastest translation, as a part of what the carriage can do.
         creep: slowest, as a part of `speed`, when misaligned or pressing.
         aligned, misaligned: cosines of the error of direction between which the speed

@@ -193,8 +193,7 @@ def _directions(
     ahead: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotations (N, K) of the ends to the route, and its bends (N, K) away, rad."""
-    insertion = devices.insertion
-    gaps = insertion.max(axis=1, keepdims=True) - insertion
-    targets = plan.at(place.arc_length[:, None] - gaps + ahead[:, None])
-    ways = plan.ends.directions(readings, insertion, targets)
+    behind = coaxial_ends.gaps(devices.insertion)
+    targets = plan.at(place.arc_length[:, None] - behind + ahead[:, None])
+    ways = plan.ends.directions(readings, devices.insertion, targets)
     return coaxial_ends.turns(ways, devices.tip_rotation)

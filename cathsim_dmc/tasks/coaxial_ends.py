@@ -44,11 +44,11 @@ class CoaxialEnds:
             insertion: (N, K), of the devices, m.
             targets: (N, K, 3), m, world frame.
         """
-        gaps = insertion.max(axis=1, keepdims=True) - insertion
-        rows, last = np.arange(len(gaps)), len(self.nodes) - 2
+        behind_first = gaps(insertion)
+        rows, last = np.arange(len(insertion)), len(self.nodes) - 2
         frames, ways = [readings.head_frame], np.empty(targets.shape)
-        for k in range(gaps.shape[1]):
-            behind = gaps[:, k] + self.shaped[k]
+        for k in range(behind_first.shape[1]):
+            behind = behind_first[:, k] + self.shaped[k]
             link = np.maximum((self.nodes[:-1] > behind[:, None]).sum(axis=1) - 1, 0)
             while len(frames) <= last - link.min():
                 frames.append(before(frames[-1], readings.joint_positions, len(frames)))
@@ -56,6 +56,11 @@ class CoaxialEnds:
             way = targets[:, k] - readings.centreline[rows, link]
             ways[:, k] = np.einsum("nij,ni->nj", frame, way)
         return ways
+
+
+def gaps(insertion: np.ndarray) -> np.ndarray:
+    """By how much the ends (N, K) of coaxial devices are behind the first, m."""
+    return insertion.max(axis=1, keepdims=True) - insertion
 
 
 def before(frame: np.ndarray, joints: np.ndarray, number: int) -> np.ndarray:

@@ -14,9 +14,9 @@ EXPLODED = "exploding force"
 
 # Control steps between two checks for an escape.
 ESCAPE_INTERVAL = 50
-# Deeper outside the lumen than this, m, the axis of the device is behind the wall:
-# in a rigid one penetration stays below 1 mm, and a compliant one may be indented by as
-# much as control steps are simulated in one go, which the axis is less deep than.
+# Depth of the axis outside the lumen, m, from which a device is behind the wall. A
+# rigid wall is penetrated by less than 1 mm; a compliant one may be indented up to the
+# depth from which control steps are repeated, here with 1 mm to spare.
 _ESCAPE_DEPTH, _BEYOND_INDENTATION = 2e-3, 1e-3
 # No contact of a device that is pushed with 5 N at most is harder than this, N.
 MAX_FORCE = 50.0
@@ -33,13 +33,16 @@ def escaped(
     Args:
         centreline: (..., n, 3), nodes of the devices, m, world frame.
         along: (3,) unit vector of the sheath, which need not stand as the vessel does.
-        indentation: Largest usual one of a compliant wall, m; None for a rigid one.
+        indentation: Of a compliant wall, from which control steps are repeated, m; None
+            for a rigid one.
 
     Returns:
-        (...) bool: some node past the inlet lies more than 2 mm outside the lumen, or 1
-        mm more than the indentation.
+        (...) bool: some node past the inlet lies more than 2 mm outside the lumen, in a
+        compliant wall more than the indentation and 1 mm.
     """
-    deep = indentation + _BEYOND_INDENTATION if indentation else _ESCAPE_DEPTH
+    deep = _ESCAPE_DEPTH
+    if indentation is not None:
+        deep = indentation + _BEYOND_INDENTATION
     outside = past_sheath(anatomy, centreline, along)
     outside[outside] = anatomy.lumen(centreline[outside]) < -deep
     return np.logical_or.reduce(outside, axis=-1)

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from cathsim_dmc.physics.readings import CoaxialReadings, Readings
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings, part
 from cathsim_dmc.tasks import coaxial_ends, observations, retry, take_offs
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.coaxial_ends import CoaxialEnds
@@ -21,8 +21,7 @@ from cathsim_dmc.tasks.route import (
 
 _NARROW_AHEAD = 10e-3  # m along the route within which a narrow lumen is seen
 _ROOM = 1.5  # radii of the device; a lumen with less room is too narrow for it
-# Observations of the memory, and those that follow from it.
-_OF_ROUTE, _OF_IMAGES = ("route_retry", "route_turns"), ("biplane_retry",)
+_SHOWN = ("route_retry", "biplane_retry")
 
 
 class Progress:
@@ -41,19 +40,23 @@ class Progress:
         """Prepares what observations of these names and the end of episodes need.
 
         Raises:
-            ValueError: if an objective is not `Routed`, or two memories are observed.
+            ValueError: if an objective is not `Routed`, two memories are observed, or
+                what is left to turn without the memory that it follows from.
         """
         self._cases, self._count, self.ends = cases, count, ends
-        of_route, of_images = (
-            [name for name in kind if name in names] for kind in (_OF_ROUTE, _OF_IMAGES)
-        )
-        if of_route and of_images:
+        shown = [name for name in _SHOWN if name in names]
+        if len(shown) > 1:
             raise ValueError(
-                f"observation has {' and '.join(of_route + of_images)}, but there is "
-                "one memory of attempts; leave one of the two out"
+                f"observation has {' and '.join(shown)}, but there is one memory of "
+                "attempts; leave one of the two out"
             )
-        self.shown, self._of_images = bool(of_route or of_images), bool(of_images)
+        self.shown, self._of_images = bool(shown), shown == ["biplane_retry"]
         self._turns = "route_turns" in names
+        if self._turns and shown != ["route_retry"]:
+            raise ValueError(
+                "observation has route_turns, which belong to an attempt of the memory "
+                "of the route; add route_retry, and leave biplane_retry out"
+            )
         chain = cases[0].scene.catheter
         self._coaxial, self._radius = chain.coaxial, chain.devices[0].outer_radius
         self.settings = retry.COAXIAL if self._coaxial else retry.SINGLE
@@ -226,10 +229,13 @@ class Progress:
         state: Readings,
         devices: CoaxialReadings,
     ) -> np.ndarray:
-        """Ways (N, K, 3), m, to the points (N,) ahead of the ends of the devices."""
+        """Ways (N, K, 3), m, to the route, see `CoaxialEnds.directions`.
+
+        Args:
+            ahead: (N, 1) or one, way along the route from each end to its point, m.
+        """
         assert self._ends is not None
-        gaps = devices.insertion.max(axis=1, keepdims=True) - devices.insertion
-        ends = (place.arc_length + ahead)[:, None] - gaps
+        ends = place.arc_length[:, None] - coaxial_ends.gaps(devices.insertion) + ahead
         targets = np.empty((*ends.shape, 3))
         for number in np.unique(chosen).tolist():
             rows = chosen == number
@@ -250,11 +256,10 @@ class Progress:
         ahead = np.empty(self._count)
         for number in np.unique(chosen).tolist():
             rows, route = chosen == number, self._routes[number]
-            memory = Memory._make(column[rows] for column in self.memory)
             ahead[rows] = retry.lookahead(
-                self.settings, memory, route, place.arc_length[rows]
+                self.settings, part(self.memory, rows), route, place.arc_length[rows]
             )
-        ways = self._ways(chosen, place, ahead, state, devices)
+        ways = self._ways(chosen, place, ahead[:, None], state, devices)
         error, away = coaxial_ends.turns(ways, devices.tip_rotation)
         error = error + retry.offset(self.settings, self.memory)[:, None]
         return np.stack([coaxial_ends.wrapped(error), away], axis=-1)

@@ -73,9 +73,10 @@ class RetrySettings:
         backoff_growth: of the way back from each retry to the next, up to the fourth.
         longest: control steps after which a withdrawal ends inside the tube.
         slack: Buckling threshold: advance of the base without the head, m.
-        slack_growth: of it from each attempt to the next, up to the fourth: a shaft
-            takes up more in a wide aorta before its end moves. Beside a take-off close
-            to the first one it does not grow, where slack pushes a catheter out.
+        slack_growth: share of `slack` that each attempt adds, over four attempts, then
+            anew: a shaft takes up more in a wide aorta before its end moves; none on
+            routes with a take-off close to the first one, where slack pushes a catheter
+            out.
         give: distance that the head may move back while slack is taken up, m.
         thorough: every n-th retry withdraws the whole way, not the slack alone.
         middle: excess below which a head past a take-off close to the first one is in

@@ -60,7 +60,8 @@ Tasks with the suffix `_wire` or `_pair` add these entries to `internal`, `track
 {{table}}
 
 `route_coaxial` has the entries of `route` and, in place of those, what does not depend
-on where the anatomy lies in the world:
+on where the anatomy lies in the world. `route_retry` and `route_turns` are observations
+of their own; `route_turns` needs `route_retry`, whose attempt it belongs to:
 
 {{relative}}
 """
