@@ -13,11 +13,13 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+# torchrl goes before dm_control.
+from cathsim_dmc.agents import protocols  # isort: skip
+
 import numpy as np
 import tyro
 
 from cathsim_dmc import policies, suite
-from cathsim_dmc.agents import protocols
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.cli.options import EVALUATION_SEED, show
 from cathsim_dmc.simulation import episodes
