@@ -124,12 +124,12 @@ CLIPS = (
     ),
     Clip(
         "pair_any",
-        "Wire in catheter, random arch that the policy has not seen",
+        "Wire in catheter, to a vertebral artery of an arch that the policy has not seen",
         "pretrained:navigator_pair",
-        "arch_any_pair",
+        "neck_any_pair",
         EVALUATION,
         own_task=True,
-        options={"first": 7, "pool": 1, "arches": "test"},
+        options={"first": 7, "pool": 1, "arches": "test_neck", "goal": "lva"},
     ),
 )
 

@@ -133,7 +133,7 @@ def main() -> None:
         }
         seen = cannulation("navigate", "pretrained:navigator_pair", **options)
         path = IMAGES / "pair_vertebral.png"
-        strip(last(seen, 0.1, 4), path, "below", around=0.08)
+        strip(last(seen, 0.06, 4), path, "below", around=0.08)
         return
     strip(simmons(), IMAGES / "pair_simmons.png")
     strip(last(cannulation()), IMAGES / "pair_cannulation.png")
