@@ -220,6 +220,19 @@ def test_a_policy_of_any_arch_goes_to_a_named_anatomy():
     assert there == ("type1_lcca", {"delay": 2})
 
 
+def test_a_policy_takes_its_devices_to_a_named_anatomy():
+    policy = policies.load_policy("pretrained:navigator_pair")
+    task, options = policies.task_and_options(policy, None, {"anatomy": "type2"})
+    assert (task, options["devices"]) == ("navigate", suite.COAXIAL["pair"][0])
+    made = suite.make_task(
+        task, **options, goal="bca", access="descending", observation=policy.observation
+    )
+    assert made.scene.catheter.coaxial
+    others = ("wire_014_micro", "microcatheter_2f4")
+    given = {"anatomy": "type2", "devices": others}
+    assert policies.task_and_options(policy, None, given)[1]["devices"] == others
+
+
 def test_one_condition_has_no_interval_over_its_episodes():
     options = {"task": "type1_bca", "task_kwargs": {"max_steps": 2}, "episodes": 3}
     one = evaluate("push", **options)

@@ -162,6 +162,10 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     return TrainedPolicy(Checkpoint.open(policy) if path is None else path)
 
 
+# Options of a task that say which devices a policy drives.
+_DEVICES = ("device", "devices", "rotation")
+
+
 def task_and_options(
     policy: Policy, task: str | None, options: Mapping[str, Any] | None
 ) -> tuple[str, dict[str, Any]]:
@@ -174,16 +178,20 @@ def task_and_options(
 
     Returns:
         Name of the task, and its options. What chose the anatomy of the training stays
-        behind where the task is another one.
+        behind where the task is another one; the devices go with the policy to
+        `navigate`.
 
     Raises:
         ValueError: `task` is None, and the policy was trained on none; or it is one of
             modules that are not imported, see `suite.known`.
     """
     options, trained = dict(options or {}), dict(policy.task_kwargs or {})
-    own = suite.TASKS[policy.task].own_options if policy.task in suite.TASKS else ()
+    known = suite.TASKS.get(policy.task) if policy.task is not None else None
+    own = known.own_options if known is not None else ()
     if task is None and "anatomy" in {*options} - {*own}:
         task = "navigate"
+        devices = {} if known is None else known.options
+        trained = {n: devices[n] for n in _DEVICES if n in devices} | trained
     task = task or policy.task
     if task is None:
         raise ValueError(
