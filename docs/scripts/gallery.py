@@ -124,7 +124,7 @@ CLIPS = (
     ),
     Clip(
         "pair_any",
-        "Wire in catheter, to a vertebral artery of an arch that the policy has not seen",
+        "Wire in catheter, to a vertebral artery of an arch not seen before",
         "pretrained:navigator_pair",
         "neck_any_pair",
         EVALUATION,
