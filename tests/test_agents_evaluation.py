@@ -224,6 +224,8 @@ def test_a_policy_takes_its_devices_to_a_named_anatomy():
     policy = policies.load_policy("pretrained:navigator_pair")
     task, options = policies.task_and_options(policy, None, {"anatomy": "type2"})
     assert (task, options["devices"]) == ("navigate", suite.COAXIAL["pair"][0])
+    named = policies.task_and_options(policy, "navigate", {"anatomy": "type2"})
+    assert named == (task, options)
     made = suite.make_task(
         task, **options, goal="bca", access="descending", observation=policy.observation
     )

@@ -11,12 +11,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from typing_extensions import override
 
-from cathsim_dmc.agents.config import (
-    ConfigError,
-    TrainingConfig,
-    positive,
-    within,
-)
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig, positive, within
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, load_transitions
 from cathsim_dmc.agents.learner import Learner, means
 from cathsim_dmc.agents.networks import NetworkShapes, bounded, network_of
@@ -32,14 +27,12 @@ class CloningConfig(TrainingConfig):
     """Settings of the algorithms that imitate an expert.
 
     Attributes:
-        gradient_steps: Number of gradient steps.
         batch_size: Number of states per gradient step.
         weight_decay: Each gradient step multiplies weights and biases by 1 - learning
             rate · weight_decay, as AdamW does ("Decoupled Weight Decay Regularization",
             Loshchilov and Hutter, 2019).
     """
 
-    gradient_steps: int = positive(10_000)
     batch_size: int = positive(256)
     weight_decay: float = within(0.0, low=0, high=100)
     hidden: tuple[int, ...] = (128, 128)
@@ -139,6 +132,7 @@ class BCConfig(CloningConfig):
     resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable - {"total_frames"}
 
     demonstrations: str | None = None
+    gradient_steps: int = positive(10_000)
     steps_per_env: int = positive(128)
     total_frames: int = 20_480
     checkpoint_frames: int = 10_240

@@ -186,11 +186,12 @@ def task_and_options(
             modules that are not imported, see `suite.known`.
     """
     options, trained = dict(options or {}), dict(policy.task_kwargs or {})
-    known = suite.TASKS.get(policy.task) if policy.task is not None else None
-    own = known.own_options if known is not None else ()
+    definition = suite.TASKS.get(policy.task or "")
+    own = definition.own_options if definition else ()
     if task is None and "anatomy" in {*options} - {*own}:
         task = "navigate"
-        devices = {} if known is None else known.options
+    if task == "navigate" and definition:  # which names no devices of its own
+        devices = definition.options
         trained = {n: devices[n] for n in _DEVICES if n in devices} | trained
     task = task or policy.task
     if task is None:

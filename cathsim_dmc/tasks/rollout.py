@@ -273,9 +273,8 @@ class Rollout(Restorable):
         self._way = self._way + straight(before, self.resting.head)
         old, nodes = self._errors, self.resting.centreline
         self._errors = physics_errors.found(
-            self.case, self.steps, nodes, warned, force.peak_max,
-            self._config.vessel.deepest,
-        )  # fmt: skip
+            self.case, self.steps, nodes, warned, force.peak_max, self._stepper.deepest
+        )
         if logs and any(self._errors):
             for error, last, steps in zip(self._errors, old, self.steps, strict=True):
                 if error is not None and last is None:
