@@ -65,13 +65,17 @@ class Ways:
         depth = self.depth[self.links].mean(axis=1)
         deep = self._graph(self._lengths * (LATTICE / depth) ** 4)
         # Of a node: lengths (n,) m of the shortest ways, predecessors on the deepest.
-        self.lengths_from = cache(lambda node: dijkstra(self._near, False, node))
+        self.lengths_from = cache(lambda node: dijkstra(self._near, indices=node))
         self.deepest_from = cache(lambda node: _before(deep, node))
 
     def _graph(self, weights: np.ndarray) -> csr_matrix:
-        """The lattice's links with ``weights`` (e,), in one direction."""
+        """The lattice's links with ``weights`` (e,), in both directions.
+
+        Dijkstra's algorithm is faster on these than on one direction taken as both.
+        """
         shape, order = (len(self.points),) * 2, self._order
-        return csr_matrix((weights[order], self.links[order, 1], self._starts), shape)
+        graph = csr_matrix((weights[order], self.links[order, 1], self._starts), shape)
+        return graph + graph.T
 
     def node(self, position: np.ndarray) -> int:
         """Lattice point nearest to ``position`` (3,) m in the largest piece."""
@@ -149,7 +153,7 @@ class Ways:
 
 
 def _before(graph: csr_matrix, node: int) -> np.ndarray:
-    return dijkstra(graph, directed=False, indices=node, return_predecessors=True)[1]
+    return dijkstra(graph, indices=node, return_predecessors=True)[1]
 
 
 def in_reach(points: np.ndarray, centres: np.ndarray, reach: np.ndarray) -> np.ndarray:
