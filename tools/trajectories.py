@@ -37,6 +37,10 @@ CASES = {
     "pair": ("type1_lcca_pair", {}),
     "pair tracking": ("type1_lcca_pair", {"observation": ["tracking", "force"]}),
     "pair randomised": ("femoral_type1_lcca_pair", ALL),
+    "pair memory": (
+        "type1_lcca_pair",
+        {"observation": ["route_coaxial", "route_retry", "route_turns"]},
+    ),
     "pool": ("arch_lcca", {"pool": 3}),
     "pool randomised": ("arch_lcca", {"pool": 3, "observation": "route", **ALL}),
 }
