@@ -32,7 +32,7 @@ The command `cathsim --help` does most of this without Python.
 import importlib
 import warnings
 
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"
 
 # MuJoCo's window library warns at import on a machine without a screen. Nothing here
 # needs one before a viewer is asked for, which then says so itself.
@@ -68,4 +68,5 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_SUBMODULES, *_FUNCTIONS])
+    public = {name for name in globals() if name not in ("importlib", "warnings")}
+    return sorted(public.union(_SUBMODULES, _FUNCTIONS))

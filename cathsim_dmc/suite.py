@@ -158,9 +158,11 @@ def make_task(
     definition = TASKS[known(name)]
     options = {**definition.options, **options}
     if unknown := sorted(set(options) - {*task_options(name)}):
+        having = [task for task in TASKS if {*unknown} <= {*task_options(task)}]
+        others = f"; {', '.join(having)} have it" if having else ""
         raise ValueError(
-            f"no task option {', '.join(map(repr, unknown))}; there are random, "
-            f"{', '.join(task_options(name))}"
+            f"{name} has no task option {', '.join(map(repr, unknown))}; there are "
+            f"random, {', '.join(task_options(name))}{others}"
         )
     own = {key: options.pop(key) for key in definition.own_options if key in options}
     config = NavigationConfig(

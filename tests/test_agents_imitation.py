@@ -264,6 +264,9 @@ def test_demonstrations_of_another_task_are_refused(dataset, shapes, tmp_path):
         SAC(small("sac", **shown), shapes, tmp_path)
     with pytest.raises(DatasetError, match="its task is '.*_bca', not '.*_lcca'"):
         BC(small("bc", task="simple1_lcca", **shown), shapes, tmp_path)
+    closer = {"task_kwargs": {"goal_radius": 4e-3}, **shown}
+    with pytest.raises(DatasetError, match="its goal_radius is 0.045, not 0.004"):
+        BC(small("bc", **closer), shapes, tmp_path)
 
 
 def test_half_of_sacs_minibatch_is_shown(dataset, shapes, tmp_path):

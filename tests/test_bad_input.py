@@ -40,7 +40,7 @@ TASK = {
     "cameras": options() | NONE,
     "randomisation": options() | NONE,
     "vessel": options() | NONE,
-    "goal_radius": number(positive=True, optional=True),  # None: the usual one
+    "goal_radius": number(0, 1, positive=True, optional=True),  # None: the usual one
     "reward": options() | NONE,
     "start_along_route": span(0, 0.95),
     "devices": st.sampled_from(["x", 1, [], [1], (None,), {}, ["x"], True]),

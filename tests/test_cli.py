@@ -31,7 +31,9 @@ def test_list_shows_every_task_with_a_line_and_variants_once(cathsim):
     assert code == 0 and not err
     for name in (*(n for n in TASKS if not n.endswith(("_wire", "_pair"))), "navigate"):
         assert name in out
-    assert out.count("_pair") == out.count("_wire") == 1
+    tasks, policies = out.split("Policies that ship:")
+    assert tasks.count("_pair") == tasks.count("_wire") == 1
+    assert "pretrained:navigator_pair" in policies
     assert "brachiocephalic" in out
 
 
@@ -316,6 +318,14 @@ BAD = {
     "a value out of range": ([*TRAIN, "--gamma", 2], ["gamma is 2.0", "at most 1"]),
     "an option of another algorithm": ([*TRAIN, "--tau", 0.1], ["--tau"]),
     "nothing to resume": ([*TRAIN, "--resume"], ["no run in OUT to resume"]),
+    "nothing to resume, no task": (
+        ["train", "--out", "OUT", "--resume"],
+        ["no run in OUT to resume"],
+    ),
+    "a goal of a task that has one": (
+        ["eval", "random", "--task", "type1_bca", "--goal", "lsa"],
+        ["type1_bca has no task option 'goal'", "navigate have it"],
+    ),
     "settings as JSON": ([*TRAIN, "--settings", "{}"], ["--settings"]),
     "no such scan": (
         ["phantom", "import", "OUT.obj", "--out", "OUT"],

@@ -33,6 +33,8 @@ from cathsim_dmc.tasks.observation_kind import Sizes
 DEMONSTRATION_SEED = 2_000_000  # apart from the seeds of evaluation
 # Among the infos: what the expert would do, where noise was added to what it did.
 EXPERT_ACTION = "expert_action"
+# Options that demonstrations share with what learns from them.
+_ALIKE = ("device", "devices", "goal", "access", "goal_radius")
 _SIMULATIONS = 16
 
 
@@ -193,6 +195,12 @@ def _buffer(seed: int, row: int, columns: Mapping[str, Any]) -> Any:
     chosen = own.pop("chosen")
     infos[EXPERT_ACTION] = np.append(chosen, chosen[-1:], axis=0)
     return EpisodeBuffer(seed=seed, observations=shown, infos=infos, **own)
+
+
+def alike(task_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Options that demonstrations must have been recorded with, None for a default."""
+    given = {name: task_kwargs.get(name) for name in _ALIKE}
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in given.items()}
 
 
 def load_transitions(

@@ -12,7 +12,7 @@ from torch import nn
 from typing_extensions import override
 
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig, positive, within
-from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, load_transitions
+from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, alike, load_transitions
 from cathsim_dmc.agents.learner import Learner, means
 from cathsim_dmc.agents.networks import NetworkShapes, bounded, network_of
 
@@ -151,7 +151,11 @@ class BC(CloningLearner):
                 "`cathsim demos` writes one."
             )
         self.states = load_transitions(
-            config.demonstrations, config.observation, shapes, task=config.task
+            config.demonstrations,
+            config.observation,
+            shapes,
+            task=config.task,
+            **alike(config.task_kwargs),
         ).exclude("next")
         super().__init__(config, shapes, directory)
         self.observe(self.states)

@@ -17,7 +17,7 @@ from cathsim_dmc.agents.config import (
     positive,
     require,
 )
-from cathsim_dmc.agents.demonstrations import load_transitions
+from cathsim_dmc.agents.demonstrations import alike, load_transitions
 from cathsim_dmc.agents.learner import Learner, means
 from cathsim_dmc.agents.networks import NetworkShapes, make_critic
 from cathsim_dmc.agents.replay import ReplayMemory
@@ -126,8 +126,9 @@ class SAC(Learner):
         self.demonstrations: TensorDictBase | None = None
         if config.demonstrations is not None:
             names, options = config.collected_observation, config.training_kwargs
-            alike = {"task": config.task, "reward": options.get("reward")}
-            shown = load_transitions(config.demonstrations, names, shapes, **alike)
+            own = {"task": config.task, "reward": options.get("reward")}
+            own |= alike(config.task_kwargs)
+            shown = load_transitions(config.demonstrations, names, shapes, **own)
             self.demonstrations = shown.select(*self.replay_keys)
             self.observe(shown)
         self.owed_steps = 0.0

@@ -173,6 +173,14 @@ def _only_process(run: Path) -> Iterator[None]:
         lock.release()
 
 
+def no_run(path: str | Path) -> str:
+    """What is wrong with resuming in a directory without a run."""
+    return (
+        f"there is no run in {path} to resume: give the directory of one, or start a "
+        "new one without resume."
+    )
+
+
 def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | None:
     """Check the directory against the request; return where to continue from."""
     existing, alone = checkpoints_in(run), config.initial_policy is None
@@ -184,10 +192,7 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
             f"{run} already holds a run: resume it, or choose another directory."
         )
     if resume and not existing and not (run / CONFIG_FILE).exists():
-        raise ConfigError(
-            f"there is no run in {run} to resume: give the directory of one, or start "
-            "a new one without resume."
-        )
+        raise ConfigError(no_run(run))
     if not existing:
         return None
     checkpoint = Checkpoint.open(existing[-1])

@@ -2,6 +2,7 @@
 
 import math
 import sys
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -12,17 +13,21 @@ from cathsim_dmc.cli.options import Json, Modules, print_json
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.devices import DEVICES
 
+# `agents.pretrained_names` would load torch.
+_SHIPPED = Path(__file__).parents[1] / "pretrained"
+
 
 def show(devices: bool = False, json: Json = False, modules: Modules = ()) -> int:
-    """List the tasks, or the devices with their properties.
+    """List the tasks and the policies that ship, or the devices with their properties.
 
     Args:
         devices: Whether to list the devices in place of the tasks.
     """
     lines = {name: make.__doc__.splitlines()[0] for name, make in suite.SUITE.items()}
     rows = {name: figures(device) for name, device in DEVICES.items()}
+    policies = [f"pretrained:{each.stem}" for each in sorted(_SHIPPED.glob("*.json"))]
     if json:
-        tasks = {"domain": suite.DOMAIN, "tasks": lines}
+        tasks = {"domain": suite.DOMAIN, "tasks": lines, "policies": policies}
         print_json({"devices": rows} if devices else tasks)
         return 0
     if devices:
@@ -37,6 +42,7 @@ def show(devices: bool = False, json: Json = False, modules: Modules = ()) -> in
     for suffix, (_, words) in suite.COAXIAL.items():
         table.add_row(f"…_{suffix}", f"Each task but navigate, {words}.")
     Console().print(table)
+    Console().print("\nPolicies that ship: " + ", ".join(policies), highlight=False)
     return 0
 
 

@@ -17,7 +17,9 @@ from tyro import conf
 from cathsim_dmc import agents  # isort: skip
 
 from cathsim_dmc import files
+from cathsim_dmc.agents.checkpoint import checkpoints_in
 from cathsim_dmc.agents.learners import config_from_dict
+from cathsim_dmc.agents.training import no_run
 from cathsim_dmc.cli.options import INTERRUPTED, Modules
 from cathsim_dmc.cli.task_options import field_helps, task_kind
 
@@ -129,6 +131,12 @@ def _settings(arguments: list[str]) -> tuple[agents.TrainingConfig, bool]:
             config = config_from_dict(dict(json.loads(path.read_text())))
         if found.algo in (None, config.algorithm):
             return config, True
+    if (
+        found.resume
+        and found.out
+        and not (path.is_file() or checkpoints_in(Path(found.out)))
+    ):
+        raise ValueError(no_run(found.out))  # or its task would be missed first
     given = {"algorithm": found.algo, "preset": found.preset}.items()
     chosen = {name: value for name, value in given if value is not None}
     return agents.make_config(**chosen), False

@@ -18,6 +18,7 @@ from cathsim_dmc.physics.readings import part
 
 _NOTHING = np.zeros(())
 GOAL_RADIUS = 8e-3  # m, δ of the published task
+_FARTHEST = 1.0  # m; a larger δ is one in millimetres
 GENTLE = 0.1  # N, sum of all contacts above which a push counts as hard
 # Weights of the published reward: minus the distance in metres, or 10 at success.
 PUBLISHED_REWARD: Mapping[str, float] = MappingProxyType(
@@ -245,7 +246,9 @@ class Cannulation(Shiftable, Routed):
     UNTIL_SUCCESS: ClassVar[frozenset[str]] = frozenset({"distance", "path"})
 
     def __post_init__(self):
-        bounds.number("goal_radius", self.goal_radius, positive=True)
+        bounds.number(
+            "goal_radius", self.goal_radius, 0.0, _FARTHEST, "m", positive=True
+        )
         known = (*self.TERMS, "success")
         if not bounds.mapping("reward", self.weights, known):
             bounds.refuse("reward", self.weights, f"some of {', '.join(known)}")
