@@ -117,6 +117,12 @@ def test_only_a_pinned_commit_is_fetched(local, text, said):
     assert not local.made
 
 
+@pytest.mark.parametrize("text", ["hf:me", "me/nav", f"hf:me@{COMMIT}"])
+def test_an_upload_asks_for_no_commit(text):
+    with pytest.raises(ValueError, match="give hf:OWNER/NAME, without a commit"):
+        sharing.upload("pretrained:navigator", text)
+
+
 def test_episodes_of_a_hand_are_learnt_from_where_they_lie(local, by_hand, tmp_path):  # noqa: F811
     shutil.copytree(by_hand, tmp_path / "hand")
     (tmp_path / "hand" / "notes.py").write_text("raise SystemExit")
