@@ -84,6 +84,7 @@ def test_a_batch_is_answered_and_the_card_travels_in_the_model(exported):
     (held,) = onnx.load(str(exported / "policy.onnx")).metadata_props
     card = json.loads(held.value)
     assert held.key == "card" and card["policy"] == "pretrained:femoral_type1_lcca"
+    assert card == json.loads((exported / "card.json").read_text())
 
 
 def test_what_cannot_be_exported_is_said(exported, tmp_path, cathsim):

@@ -122,7 +122,7 @@ def write_onnx(
     }  # fmt: skip
     directory.parent.mkdir(parents=True, exist_ok=True)
     with files.atomic_directory(directory) as folder:
-        _write_model(player, folder / MODEL, samples, card)
+        _write_model(player, folder / MODEL, samples)
         np.savez_compressed(folder / SAMPLES, allow_pickle=False, **samples)
         shutil.copyfile(onnx_selftest.__file__, folder / "selftest.py")
         largest = float(onnx_selftest.differences(folder).max())
@@ -133,6 +133,7 @@ def write_onnx(
             )
         card["self_test"]["largest_difference"] = largest
         files.write_json(folder / CARD, card)
+        _put_card(folder / MODEL, card)
     return directory
 
 
@@ -223,9 +224,7 @@ def _inputs(player: TrainedPolicy) -> list[str]:
     return [VECTOR] * (shapes.vector > 0) + [PIXELS] * (shapes.pixels is not None)
 
 
-def _write_model(player: TrainedPolicy, path: Path, samples: Any, card: Any) -> None:
-    import onnx
-
+def _write_model(player: TrainedPolicy, path: Path, samples: Any) -> None:
     names = _inputs(player)
     batch = torch.export.Dim("N")
     with _quiet():
@@ -241,6 +240,12 @@ def _write_model(player: TrainedPolicy, path: Path, samples: Any, card: Any) -> 
             verbose=False,
             dynamic_shapes=(tuple({0: batch} for _ in names),),
         )
+
+
+def _put_card(path: Path, card: Mapping[str, Any]) -> None:
+    """Add a card to the metadata of a model."""
+    import onnx
+
     model = onnx.load(str(path))
     onnx.helper.set_model_props(model, {"card": json.dumps(card)})
     onnx.checker.check_model(model, full_check=True)
