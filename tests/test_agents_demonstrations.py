@@ -111,6 +111,8 @@ def test_what_does_not_fit_is_refused(recorded, shapes, tmp_path):
         load_transitions(recorded.path, "tracking", other)
     with pytest.raises(DatasetError, match="no dataset in"):
         load_transitions(tmp_path, "tracking", shapes)
+    with pytest.raises(DatasetError, match="a.npz is a file: .*into a folder"):
+        load_transitions("a.npz", "tracking", shapes)
     with pytest.raises(FileExistsError, match="choose another"):
         record_demonstrations(TASK, recorded.path, 1)
     with pytest.raises(FileNotFoundError, match="create it"):

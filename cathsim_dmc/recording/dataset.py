@@ -110,6 +110,11 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
 
     data = next(Path(path).glob("data"), Path(path)) / "metadata.json"
     if not data.is_file():
+        if Path(path).suffix == SUFFIX:
+            raise DatasetError(
+                f"{path} is a file: put episodes of `cathsim play` or `cathsim record` "
+                "into a folder and give that (--demonstrations)"
+            )
         raise DatasetError(
             f"no dataset in {path}: give one of `cathsim demos`, also to a run that is "
             "resumed (--demonstrations)"
