@@ -2,6 +2,8 @@
 
 import contextlib
 import json
+import os
+import signal
 import socket
 import struct
 import threading
@@ -12,7 +14,7 @@ import pytest
 
 from cathsim_dmc import bridge
 from cathsim_dmc.bridge import device as device_module
-from cathsim_dmc.bridge import messages
+from cathsim_dmc.bridge import fit, messages
 from cathsim_dmc.bridge.driver import Driver, connect
 
 PERIOD = 0.02
@@ -163,6 +165,8 @@ def test_a_device_stops_when_its_driver_falls_silent():
     for action in robot.taken[1:]:
         np.testing.assert_array_equal(action, [0.3, 0.0])
     assert done["missed"] == len(robot.taken) - 1 >= 2
+    assert done["reason"].startswith("watchdog: no action for")
+    assert f"stopped after {done['steps']} steps: watchdog" in served.said[0]
     kinds = []
     with contextlib.suppress(bridge.BridgeError):
         while message := link.receive(time.monotonic() + 1.0):
@@ -267,6 +271,191 @@ def test_a_driver_that_reads_nothing_is_left():
     link.close()
 
 
+@pytest.fixture
+def interrupts():
+    """Ctrl-C raises, also where the tests run in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(
+    ("name", "error"), [("SIGTERM", SystemExit), ("SIGINT", KeyboardInterrupt)]
+)
+def test_a_signal_that_ends_the_program_stops_the_device(name, error, interrupts):
+    number = getattr(signal, name)
+    before = signal.getsignal(signal.SIGTERM)
+
+    def killed(observation):
+        os.kill(os.getpid(), number)
+        time.sleep(WAIT)
+
+    # The program of the driver.
+    robot = Robot(steps=10_000)
+    served = Served(robot, watchdog=WAIT)
+    with pytest.raises(error) as raised:
+        bridge.drive(killed, served.address, options=bridge.DriveOptions(warm_up=0))
+    (done,) = served.joined()
+    assert done["end"] == "stopped" and robot.stops and name[3:4] in done["reason"]
+    if name == "SIGTERM":
+        assert raised.value.code == 143
+        assert done["reason"] == "driver: Ended: SIGTERM"
+        assert served.said[0].endswith("stopped after 0 steps: driver: Ended: SIGTERM")
+    # The program of the device; only the first signal is raised.
+    robot = Robot(steps=10_000)
+    robot.read = lambda: os.kill(os.getpid(), number)
+    stop = robot.stop
+    robot.stop = lambda: (os.kill(os.getpid(), signal.SIGTERM), stop())
+    if name == "SIGINT":
+        robot.stop = stop
+    with device_module.listen("127.0.0.1", 0) as listener:
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
+
+        def driven():
+            with contextlib.suppress(bridge.BridgeError):
+                bridge.drive(push, address, options=SLOW)
+
+        thread = threading.Thread(target=driven, daemon=True)
+        thread.start()
+        with pytest.raises(error):
+            bridge.serve(robot, listener, bridge.ServeOptions(watchdog=WAIT))
+        thread.join(WAIT)
+    assert robot.stops and signal.getsignal(signal.SIGTERM) is before
+
+
+def test_an_action_before_the_start_is_out_of_order_at_once(monkeypatch):
+    served = Served(Robot(steps=2), episodes=3, lockstep=True)
+    link = served.raw()
+    link.send(1.0, "action", step=0, action=[0, 0])
+    began = time.monotonic()
+    with pytest.raises(bridge.BridgeError, match="out_of_order: action came, expected"):
+        link.receive(time.monotonic() + WAIT)
+    assert time.monotonic() - began < 5.0
+    # After an episode those of its steps have no effect, others are refused.
+    link = served.raw()
+    for late in (1, 3):
+        link.send(1.0, "start", seed=None)
+        for step in range(3):
+            assert link.receive(time.monotonic() + WAIT)["step"] == step
+            link.send(1.0, "action", step=step, action=[0, 0])
+        link.send(1.0, "action", step=late, action=[0, 0])
+    with pytest.raises(bridge.BridgeError, match="step 3, but the episode ended at"):
+        link.receive(time.monotonic() + WAIT)
+    bridge.drive(push, served.address, options=SLOW)
+    assert [one["end"] for one in served.joined()] == ["success"] * 3
+    monkeypatch.setattr(device_module, "IDLE", 0.2)
+    served = Served(Robot(steps=2))
+    link = served.raw()
+    with pytest.raises(bridge.BridgeError, match=r"idle: no start came within 0.2 s"):
+        link.receive(time.monotonic() + WAIT)
+    bridge.drive(push, served.address, options=SLOW)
+    served.joined()
+
+
+def test_an_end_that_is_none_is_refused_on_both_sides():
+    robot = Robot()
+    robot._state = lambda: bridge.State({}, {}, 0.0, "finished")
+    session = device_module._Session(robot, None, None, bridge.ServeOptions(), None)
+    session._seed = None
+    with pytest.raises(ValueError, match="end of a State is 'finished'.*success, trun"):
+        session.episode()
+    assert robot.stops
+    with pytest.raises(bridge.BridgeError, match='end of state is "finished".*null, s'):
+        messages.require_end("finished")
+    for end in (None, *messages.ENDS):
+        messages.require_end(end)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b'{"step": 0}', "kind is missing; it must be one of hello, welcome, start"),
+        (b"[1, 2]", r"a frame holds \[1, 2\]; it must be an object with a kind"),
+        (b'{"kind": "action", "step": "0", "action": []}', 'is "0"; .*whole number$'),
+        (b'{"kind": "action", "step": 0.0, "action": []}', "is 0.0; .*whole number$"),
+        (b'{"kind": "action", "step": -1, "action": []}', "is -1; it must be 0 or"),
+        (b'{"kind": "action", "step": 0, "action": 0.5}', "is 0.5; it must be a list$"),
+        (b'{"kind": "start", "seed": "a"}', 'is "a"; .*whole number or null$'),
+        ('{"kind": "start", "seed": 1}'.encode("utf-16"), "no JSON in UTF-8"),
+        ('{"kind": "start", "seed": 1}'.encode("utf-16-be"), "no JSON in UTF-8"),
+    ],
+)  # fmt: skip
+def test_what_is_no_message_is_said_with_what_it_must_be(data, said):
+    with pytest.raises(bridge.BridgeError, match=said):
+        messages.parse(data)
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (["0", 0], r'wrong_shape: action\[0\] is "0"; action must be numbers of shape'),
+        ([0, None], r"action\[1\] is null"),
+        ([True, 0.0], r"action\[0\] is true"),
+        ([0.0, 1e400], r"not_finite: action\[1\] is inf; it must be finite"),
+        ([10**400, 0.0], r"wrong_shape: action\[0\] is 10000"),
+        ([[0.0], 1.0], "wrong_shape: action is .*must be numbers of shape"),
+        ([0.0], r"action has shape \[1\]; it must be \[2\]"),
+    ],
+)
+def test_the_entry_that_is_no_number_is_named(value, said):
+    with pytest.raises(bridge.BridgeError, match=said):
+        messages.to_array("action", value, (2,), "float64")
+
+
+WANTED = fit.Interface(
+    0.04,
+    [{"name": "bend", "unit": "N·m", "scale": 1e-3, "low": -1.0, "high": 1.0},
+     {"name": "push", "unit": "m/s", "scale": 0.04, "low": -1.0, "high": 1.0}],
+    [{"key": "place", "shape": [3], "dtype": "float64", "unit": "m"}],
+)  # fmt: skip
+PLACE = {"key": "place", "shape": [3], "dtype": "float64"}
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, None),
+        ({"period": 0.0401}, None),
+        ({"action": [{"unit": "N m"}, {"scale": 0.041}]}, None),
+        ({"action": [{}, {}], "observation": [PLACE, {**PLACE, "key": "more"}]}, None),
+        ({"period": 0.1}, "period is 0.1 s, not 0.04 s"),
+        ({"action": [{}, {"scale": 0.4}]}, "scale of action 1 (push) is 0.4, not 0.04"),
+        ({"action": [{"name": "push"}, {}]}, "name of action 0 (bend) is push, not"),
+        ({"action": [{}, {"low": 0}]}, "low of action 1 (push) is 0, not -1"),
+        ({"action": [{}, {"scale": "x"}]}, "scale of action 1 (push) is x, not 0.04"),
+        ({"observation": [{**PLACE, "unit": "mm"}]}, "unit of place is mm, not m"),
+        ({"observation": [{**PLACE, "shape": [2]}]}, "place has shape [2], not [3]"),
+        ({"observation": [{**PLACE, "dtype": "uint8"}]}, "place is uint8, not float64"),
+        ({"action": [{}]}, "an action has 1 entries, not 2"),
+    ],
+)
+def test_a_device_that_announces_something_else_does_not_fit(given, said):
+    table = {"action": WANTED.action, "observation": WANTED.observation}
+    welcome = {"period": 0.04, **table, **given}
+    wrong = fit.sizes(WANTED, welcome) or fit.meanings(WANTED, welcome)
+    assert [one[: len(said or "")] for one in wrong] == ([] if said is None else [said])
+
+
+def test_a_welcome_without_tables_is_refused():
+    welcome = {"action": ["push"], "observation": [PLACE]}
+    with pytest.raises(bridge.BridgeError, match="action of welcome is .'push'.*list"):
+        fit.sizes(WANTED, welcome)
+
+
+def test_a_driver_gets_the_arrays_that_it_reads_alone():
+    served = Served(Robot(steps=3), lockstep=True)
+    link = connect(served.address)
+    driver = Driver(link)
+    driver.read_only({"place"})
+    seen = []
+    choose = lambda given: seen.append(set(given)) or [0.0, 0.0]  # noqa: E731
+    driver.warm_up(choose, 1)
+    assert driver.episode(choose, None, SLOW).end == "success"
+    assert seen == [{"place"}] * 4
+    served.joined()
+    link.close()
+
+
 def frame(data):
     return struct.pack(">I", len(data)) + data
 
@@ -294,7 +483,12 @@ BAD = {
     "wrong_shape    ": action(action=[True, False]),
     "out_of_order": action(step=7),
     "out_of_order ": frame(b'{"kind": "start", "seed": 3}'),
-    "flood": action(step=-1) * 200,
+    "bad_message    ": action(step=-1),
+    "bad_message     ": action(step=0.0),
+    "bad_message      ": action(action=0.5),
+    "not_json   ": frame('{"kind": "stop", "reason": "x"}'.encode("utf-16-le")),
+    "wrong_shape     ": action(action=[True, 0.0]),
+    "flood": action() * 200,  # all but the first are late
 }
 
 
@@ -321,7 +515,8 @@ def test_what_is_no_action_is_refused_by_name_and_stops_the_device(patient, name
             assert link.receive(time.monotonic() + WAIT)
     assert wrong.value.fault in (name.strip(), "peer_lost" if name == "flood" else "")
     link.close()
-    assert patient.robot.stops > before and len(patient.robot.taken) == taken
+    assert patient.robot.stops > before
+    assert len(patient.robot.taken) - taken <= (name == "flood")
 
 
 def test_another_version_another_program_and_a_stranger_are_refused(monkeypatch):
@@ -375,6 +570,20 @@ def test_options_are_checked(kind):
         kind(**{"missed" if kind is bridge.ServeOptions else "overrun": "faster"})
 
 
+def test_what_was_driven_is_a_table_in_milliseconds(capsys):
+    from rich.console import Console
+
+    from cathsim_dmc.cli.bridging import _table
+
+    served = Served(Robot(steps=3), lockstep=True)
+    one = vars(bridge.drive(push, served.address, options=SLOW))
+    served.joined()
+    Console(width=80).print(_table([one, {**one, "compute": None}]))
+    told = capsys.readouterr().out
+    assert "state to action, ms: p50" in told and "state to state, ms: max" in told
+    assert "success" in told and "{" not in told and "reason" not in told
+
+
 def test_a_shipped_policy_drives_its_task_as_it_plays_it(cathsim, shared_environment):
     """Lockstep over a socket gives the episode of the suite, bit for bit."""
     from cathsim_dmc import agents
@@ -400,6 +609,15 @@ def test_a_shipped_policy_drives_its_task_as_it_plays_it(cathsim, shared_environ
     np.testing.assert_array_equal(taken, wanted)
     # What does not fit is refused before the start.
     table = {"action": device.action, "observation": device.observation}
+    announced = {"name": "x", "period": 0.04, **table}
+    assert require_fit(policy, announced) == {one["key"] for one in device.observation}
+    welcome = {**announced, "period": 0.1}
+    with pytest.raises(ValueError, match="period is 0.1 s, not 0.04 s.*--unchecked"):
+        require_fit(policy, welcome)
+    assert require_fit(policy, welcome, unchecked=True)
+    welcome["action"] = device.action[:4]
+    with pytest.raises(ValueError, match="'x'.*an action has 4 entries, not 21"):
+        require_fit(policy, welcome, unchecked=True)
     for name in ("type1_lcca", "navigator"):
         other = agents.load_policy(f"pretrained:{name}")
         with pytest.raises(ValueError, match="of the suite: cathsim serve"):

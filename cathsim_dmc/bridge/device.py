@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from cathsim_dmc import bounds
-from cathsim_dmc.bridge import messages
+from cathsim_dmc.bridge import messages, signals
 from cathsim_dmc.bridge.messages import BridgeError, Connection
 from cathsim_dmc.bridge.records import Log, milliseconds
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
@@ -34,8 +34,8 @@ class State(NamedTuple):
         force: Newtons by name, those that are measured: "largest", the largest contact
             with the wall, "sum", of all contacts, and "push", at the base.
         time: Clock of the device, s.
-        end: Why the episode is over, such as "success" or "truncated"; None while it
-            goes on.
+        end: Why the episode is over: "success", "truncated", "physics_error" or
+            "force_limit"; None while it goes on.
     """
 
     observation: Mapping[str, np.ndarray]
@@ -51,10 +51,10 @@ class Device(Protocol):
         name: Name for people.
         period: Duration of a control step, s.
         action: A dictionary for each entry of an action, see `interface.action_table`:
-            "name", "unit", "low" and "high". Entries whose unit is a speed are 0 where
-            the device is to hold still.
+            "name" and "unit"; "scale", "low" and "high" where they are known. Entries
+            whose unit is a speed are 0 where the device is to hold still.
         observation: A dictionary for each array, see `interface.observation_table`:
-            "key", "shape" and "dtype".
+            "key", "shape" and "dtype", and "unit" where it is known.
     """
 
     name: str
@@ -157,6 +157,8 @@ def serve(
 ) -> list[dict[str, Any]]:
     """Serve one driver after the other.
 
+    What ends it from outside, SIGTERM as well as Ctrl-C, stops the device before.
+
     Args:
         listener: A socket that listens, see `listen`.
         episodes: Number of episodes after which it returns; None for ever.
@@ -164,12 +166,23 @@ def serve(
         say: Function that is called with a line of progress.
 
     Returns:
-        For each episode "end", "steps", "missed", "late", "force" (largest, N), and
-        percentiles of "answer" (from a state to its action) and "tick" (by how much a
-        period begins late), ms.
+        For each episode "end", "reason" (why it was stopped, else None), "steps",
+        "missed", "late", "force" (largest, N), and percentiles of "answer" (from a
+        state to its action) and "tick" (by how much a period begins late), ms.
     """
+    with signals.raised():
+        return _serve(device, listener, options, episodes, log or Log(None), say)
+
+
+def _serve(
+    device: Device,
+    listener: socket.socket,
+    options: ServeOptions | None,
+    episodes: int | None,
+    log: Log,
+    say: Callable[[str], None],
+) -> list[dict[str, Any]]:
     done: list[dict[str, Any]] = []
-    log = log or Log(None)
     while episodes is None or len(done) < episodes:
         listener.settimeout(_SLICE)
         try:
@@ -183,17 +196,23 @@ def serve(
             session.greet()
             while (episodes is None or len(done) < episodes) and session.begins():
                 done.append(session.episode())
-                say(f"{peer}:{port}: {done[-1]['end']} after {done[-1]['steps']} steps")
+                say(f"{peer}:{port}: {_told(done[-1])}")
         except BridgeError as error:
             wrong = error
             say(f"{peer}:{port}: {error}")
             log.write("refused", fault=error.fault, reason=error.text)
             if session.running is not None:
-                done.append(session.summary(error.fault))
+                done.append(session.summary(error.fault, error.text))
         finally:
             device.stop()
             link.close(wrong)
     return done
+
+
+def _told(episode: Mapping[str, Any]) -> str:
+    """How an episode went, in words."""
+    reason = "" if episode["reason"] is None else f": {episode['reason']}"
+    return f"{episode['end']} after {episode['steps']} steps{reason}"
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -227,6 +246,7 @@ class _Session:
     """One driver."""
 
     running: _Running | None = None
+    played: int | None = None  # steps of the last episode
 
     def __init__(
         self,
@@ -255,9 +275,11 @@ class _Session:
     def begins(self) -> bool:
         """Wait for the start of an episode; False if the driver has left."""
         try:
-            # Actions on their way when the last episode ended have no effect.
             message = self._wait(IDLE, "start", "action", "stop")
             while message["kind"] != "start":
+                # Those on their way when the last episode ended have no effect.
+                if message["kind"] == "action":
+                    self._require_past(message["step"])
                 message = self._wait(IDLE, "start", "action", "stop")
         except BridgeError as error:
             if error.fault == "peer_lost":
@@ -271,16 +293,26 @@ class _Session:
         self._seed = message["seed"]
         return True
 
+    def _require_past(self, step: int) -> None:
+        """BridgeError for an action between episodes that answers none of the last."""
+        if self.played is None:
+            raise BridgeError("out_of_order", "action came, expected start")
+        if step > self.played:
+            text = f"action of step {step}, but the episode ended at step {self.played}"
+            raise BridgeError("out_of_order", text)
+
     def episode(self) -> dict[str, Any]:
         """Play one; whatever happens, the device stands still afterwards."""
         device, options = self._device, self._options
         self.running = run = _Running()
         self._heard = due = time.monotonic()
-        last = np.zeros(len(self._speeds))
+        last, reason = np.zeros(len(self._speeds)), None
         try:
             state = device.start(self._seed)
             self._heard = due = time.monotonic()
             while True:
+                if state.end is not None:
+                    bounds.choice("end of a State", state.end, messages.ENDS)
                 end = state.end or self._too_much(state.force)
                 self._send(run.step, state, end)
                 if end is not None:
@@ -310,15 +342,15 @@ class _Session:
         finally:
             device.stop()
         self._log.write("end", step=run.step, reason=end)
-        found = self.summary(end)
-        self.running = None
+        found = self.summary(end, reason)
+        self.running, self.played = None, run.step
         return found
 
-    def summary(self, end: str) -> dict[str, Any]:
+    def summary(self, end: str, reason: str | None) -> dict[str, Any]:
         run = self.running or _Running()
         return {
-            "end": end, "steps": run.step, "missed": run.missed, "late": run.late,
-            "force": run.force, "answer": milliseconds(run.answers),
+            "end": end, "reason": reason, "steps": run.step, "missed": run.missed,
+            "late": run.late, "force": run.force, "answer": milliseconds(run.answers),
             "tick": milliseconds(run.ticks),
         }  # fmt: skip
 
@@ -377,7 +409,7 @@ class _Session:
             self._turn_away()
             if message is not None:
                 return messages.require_kind(message, *kinds)
-        return messages.require_kind(None, *kinds)
+        raise BridgeError("idle", f"no {kinds[0]} came within {seconds:g} s")
 
     def _turn_away(self) -> None:
         """Tell another driver that there is one already."""

@@ -5,13 +5,13 @@ import dataclasses
 import math
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
 
 from cathsim_dmc import __version__, bounds
-from cathsim_dmc.bridge import messages
+from cathsim_dmc.bridge import messages, signals
 from cathsim_dmc.bridge.device import (
     FORCE_LIMIT,
     HANDSHAKE,
@@ -61,6 +61,7 @@ class Driven:
     Attributes:
         end: Why it ended: what the device said ("success", "truncated", …), or
             "stopped", "watchdog", "force_limit", "overrun".
+        reason: Why the device has stopped, as it says; None where it has not.
         steps: Number of states that were answered.
         skipped: Number of states that were not answered, because newer ones were there.
         late: Number of answers that took longer than a period.
@@ -70,6 +71,7 @@ class Driven:
     """
 
     end: str
+    reason: str | None
     steps: int
     skipped: int
     late: int
@@ -143,6 +145,10 @@ class Driver:
         self._size = len(self.welcome["action"])
         self._log.write("welcome", **{k: self.welcome[k] for k in ("name", "period")})
 
+    def read_only(self, keys: Collection[str]) -> None:
+        """Leave all arrays but these out of what a policy gets."""
+        self._table = {key: self._table[key] for key in self._table if key in keys}
+
     def warm_up(self, choose: Choose, count: int) -> dict[str, float] | None:
         """Compute actions from zeros; percentiles of their times, ms."""
         kinds = {
@@ -164,6 +170,8 @@ class Driver:
     ) -> Driven:
         """Drive an episode; whatever ends it here, the device is told to stop.
 
+        So do SIGTERM and Ctrl-C.
+
         Raises:
             BridgeError: the device is gone or sends what is no state, or the action is
                 not finite or of another size.
@@ -172,9 +180,10 @@ class Driver:
         self._link.send(HANDSHAKE, "start", seed=seed)
         self._log.write("start", seed=seed)
         try:
-            found = self._loop(choose, options)
+            with signals.raised():
+                found = self._loop(choose, options)
         except BaseException as error:
-            self._stop(f"{type(error).__name__}: {error}"[:200])
+            self._stop(f"{type(error).__name__}: {error}"[:200].removesuffix(": "))
             raise
         self._log.write("end", reason=found.end, steps=found.steps)
         return found
@@ -191,7 +200,9 @@ class Driver:
             message = messages.require_kind(message, "state", "stop")
             if message["kind"] == "stop":
                 self._log.write("stopped", reason=message["reason"])
-                return self._ended(run, "stopped", told=True)
+                reason = message["reason"][:200]
+                return self._ended(run, "stopped", told=True, reason=reason)
+            messages.require_end(message["end"])
             largest = run.arrived(message, arrived)
             if message["end"] is not None:
                 return self._ended(run, message["end"], told=True)
@@ -220,17 +231,19 @@ class Driver:
             message, run.skipped = newer, run.skipped + 1
         raise BridgeError("flood", f"over {MOST_FRAMES} states at once")
 
-    def _ended(self, run: "_Run", end: str, told: bool = False) -> Driven:
+    def _ended(
+        self, run: "_Run", end: str, told: bool = False, reason: str | None = None
+    ) -> Driven:
         if not told:
             self._stop(end)
         figures = milliseconds(run.times), milliseconds(run.gaps)
         counts = len(run.times), run.skipped, run.late, run.force
-        return Driven(end, *counts, *figures)
+        return Driven(end, reason, *counts, *figures)
 
     def _observation(self, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        if given.keys() != self._table.keys():
-            text = f"a state has {sorted(given)}, the welcome {sorted(self._table)}"
-            raise BridgeError("wrong_shape", text)
+        if missing := sorted(self._table.keys() - given.keys()):
+            text = f"a state lacks {', '.join(missing)}, which the welcome names; "
+            raise BridgeError("wrong_shape", f"{text}it has {', '.join(sorted(given))}")
         return {
             key: messages.to_array(key, given[key], *kind)
             for key, kind in self._table.items()

@@ -13,15 +13,24 @@ import socket
 import struct
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
+
+from cathsim_dmc import bounds
 
 PROTOCOL = 1
 MAX_FRAME = 4 * 2**20  # bytes
 _LENGTH = struct.Struct(">I")
 _CHUNK = 65536  # bytes
+_SHOWN = 80  # characters of a value in an error
 _NUMBER, _TEXT = (int, float), (str,)
+_NAMES: Mapping[type, str] = {
+    int: "a whole number", float: "a number", str: "a text", list: "a list",
+    dict: "an object", type(None): "null",
+}  # fmt: skip
+# Why an episode is over, beside a stop.
+ENDS = ("success", "truncated", "physics_error", "force_limit")
 # Fields that a message must have, and their types.
 KINDS: Mapping[str, Mapping[str, tuple[type, ...]]] = {
     "hello": {"protocol": (int,), "name": _TEXT},
@@ -67,26 +76,49 @@ def pack(message: Mapping[str, Any]) -> bytes:
 def parse(data: bytes) -> dict[str, Any]:
     """The message in a frame, without its length; BridgeError if it is none."""
     try:
-        message = json.loads(data, parse_constant=_no_constant)
+        # From bytes, json.loads would take UTF-16 and UTF-32 as well.
+        message = json.loads(data.decode(), parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
         text = " ".join(str(error).split())[:200]
-        raise BridgeError("not_json", f"a frame holds no JSON: {text}") from error
-    kind = message.get("kind") if isinstance(message, dict) else None
+        text = f"a frame holds no JSON in UTF-8: {text}"
+        raise BridgeError("not_json", text) from error
+    if not isinstance(message, dict):
+        text = f"a frame holds {_shown(message)}; it must be an object with a kind"
+        raise BridgeError("bad_message", text)
+    kind = message.get("kind", KINDS)
     if not isinstance(kind, str) or kind not in KINDS:
-        raise BridgeError(
-            "bad_message", f"kind is {str(kind)[:80]!r}; it must be one of {[*KINDS]}"
-        )
+        _refuse("kind", kind, f"one of {', '.join(KINDS)}")
     for name, types in KINDS[kind].items():
         value = message.get(name, KINDS)
         if not isinstance(value, types) or isinstance(value, bool):
-            names = " or ".join(one.__name__ for one in types)
-            given = "missing" if value is KINDS else f"{str(value)[:80]!r}"
-            raise BridgeError(
-                "bad_message", f"{name} of {kind} is {given}; it must be {names}"
-            )
+            names = " or ".join(_NAMES[one] for one in types if one is not float)
+            names = names.replace("whole ", "") if float in types else names
+            _refuse(f"{name} of {kind}", value, names)
         if isinstance(value, float) and not math.isfinite(value):
             raise BridgeError("not_finite", f"{name} of {kind} is {value}")
+    if "step" in KINDS[kind] and message["step"] < 0:
+        _refuse(f"step of {kind}", message["step"], "0 or more")
     return message
+
+
+def require_end(end: Any) -> None:
+    """BridgeError unless it is why an episode is over, or None."""
+    if end is not None and end not in ENDS:
+        _refuse("end of state", end, f"null, {', '.join(ENDS)}")
+
+
+def _refuse(name: str, value: Any, allowed: str) -> NoReturn:
+    given = "missing" if value is KINDS else _shown(value)
+    raise BridgeError("bad_message", f"{name} is {given}; it must be {allowed}")
+
+
+def _shown(value: Any) -> str:
+    """A value as in the JSON that came, at most 80 characters."""
+    try:
+        text = json.dumps(value, ensure_ascii=False)
+    except (TypeError, ValueError):  # of a function in this program
+        return bounds.shown(value)
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
 
 
 def _no_constant(text: str) -> float:
@@ -111,24 +143,54 @@ def to_json(array: Any) -> Any:
 
 def to_array(name: str, value: Any, shape: Sequence[int], dtype: str) -> np.ndarray:
     """The inverse of `to_json`; BridgeError for another shape, type, or NaN."""
+    if dtype == "uint8":
+        return _image(name, value, tuple(shape))
     try:
-        if dtype == "uint8":
-            data = base64.b64decode(value["base64"], validate=True)
-            found = np.frombuffer(data, np.uint8).reshape(value["shape"]).copy()
-        else:
-            found = np.array(value)
-            if found.dtype.kind not in "iuf":  # texts, switches, integers without end
-                raise ValueError(found.dtype)
-            found = found.astype(np.float64)
-    except (ValueError, TypeError, KeyError, binascii.Error) as error:
-        raise BridgeError("wrong_shape", f"{name} is no array of {dtype}") from error
-    if found.shape != tuple(shape):
-        raise BridgeError(
-            "wrong_shape", f"{name} has shape {found.shape}; it must be {tuple(shape)}"
-        )
+        found = np.array(value)
+        if found.dtype.kind not in "iuf" or _has_switch(value):
+            raise ValueError(found.dtype)  # texts, integers without end
+        found = found.astype(np.float64)
+    except (ValueError, TypeError) as error:
+        odd, given = _odd(name, value) or (name, value)
+        text = f"{odd} is {_shown(given)}; {name} must be numbers of shape {[*shape]}"
+        raise BridgeError("wrong_shape", text) from error
+    _require_shape(name, found, tuple(shape))
     if not np.isfinite(found).all():
-        raise BridgeError("not_finite", f"{name} holds what is not finite")
+        odd, given = _odd(name, found) or (name, found)
+        raise BridgeError("not_finite", f"{odd} is {given}; it must be finite")
     return found
+
+
+def _image(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        data = base64.b64decode(value["base64"], validate=True)
+        found = np.frombuffer(data, np.uint8).reshape(value["shape"]).copy()
+    except (ValueError, TypeError, KeyError, binascii.Error) as error:
+        text = f"{name} is {_shown(value)}; it must be an image: an object with "
+        text += f'"shape": {[*shape]} and as many bytes in "base64"'
+        raise BridgeError("wrong_shape", text) from error
+    _require_shape(name, found, shape)
+    return found
+
+
+def _require_shape(name: str, found: np.ndarray, shape: tuple[int, ...]) -> None:
+    if found.shape != shape:
+        text = f"{name} has shape {[*found.shape]}; it must be {[*shape]}"
+        raise BridgeError("wrong_shape", text)
+
+
+def _has_switch(value: Any) -> bool:
+    """Whether numbers have true or false among them, which would count as 1 and 0."""
+    return isinstance(value, list) and bool in map(type, value)
+
+
+def _odd(name: str, value: Any) -> tuple[str, Any] | None:
+    """Name and value of the first entry that is no finite number, if there is one."""
+    value = value.tolist() if isinstance(value, np.ndarray) else value
+    if not isinstance(value, list):
+        return None if bounds.is_number(value) else (name, value)
+    each = (_odd(f"{name}[{place}]", one) for place, one in enumerate(value))
+    return next(filter(None, each), None)
 
 
 class Connection:

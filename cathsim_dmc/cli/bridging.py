@@ -3,27 +3,30 @@
 import dataclasses
 import json as json_
 import shlex
-import types
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
-import numpy as np
+from rich.console import Console
+from rich.table import Table
 from tyro import conf
 
 # torchrl goes before dm_control.
 from cathsim_dmc import agents  # isort: skip
 
 from cathsim_dmc import bounds, bridge, suite
-from cathsim_dmc.agents.policies import FunctionPolicy
+from cathsim_dmc.agents.policies import FunctionPolicy, task_and_options
+from cathsim_dmc.bridge import fit
 from cathsim_dmc.bridge.device import listen
 from cathsim_dmc.bridge.driver import Driver, connect
 from cathsim_dmc.cli.options import CHECK_FAILED, Json, Modules, Task, print_json, say
 from cathsim_dmc.cli.task_options import TaskOptions, task_kind
-from cathsim_dmc.policies import Policy, View
-from cathsim_dmc.tasks import observations
+from cathsim_dmc.policies import Policy
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.interface import action_table, observation_table
 
 _GOOD = ("success", "truncated")
+_MOST = 5  # differences that an error names
 
 
 def serve(
@@ -74,7 +77,9 @@ def drive(
     episodes: int = 1,
     seed: int | None = None,
     log: Path | None = None,
+    unchecked: bool = False,
     json: Json = False,
+    modules: Modules = (),
     *,
     how: Annotated[bridge.DriveOptions, conf.arg(name="")] = bridge.DriveOptions(),  # noqa: B008
 ) -> int:
@@ -87,6 +92,9 @@ def drive(
         seed: Seed of the first episode, from which the others count up; by default the
             device chooses.
         log: File of JSON lines to write, with what was sent.
+        unchecked: Whether to drive a device that announces another period, or other
+            names, units or scales of actions or observations, than the policy was
+            trained with. It gets the policy's actions in [-1, 1] as they are.
         how: How the device is driven.
     """
     bounds.whole("episodes", episodes, 1)
@@ -102,15 +110,21 @@ def drive(
     with bridge.Log(log) as kept:
         try:
             driver = Driver(link, kept)
-            require_fit(player, driver.welcome)
+            keys = require_fit(player, driver.welcome, unchecked)
+            if keys is not None:
+                driver.read_only(keys)
             choose = _choose(player)
             warm = driver.warm_up(choose, how.warm_up)
-            say(f"{driver.welcome['name']}: warm, {warm}")
+            if warm is not None:
+                figures = ", ".join(f"{name} {ms:.1f}" for name, ms in warm.items())
+                say(f"{driver.welcome['name']}: warm, ms of an action: {figures}")
             for number in range(episodes):
                 own = None if seed is None else seed + number
                 found = driver.episode(choose, own, how)
                 done.append(dataclasses.asdict(found))
-                say(f"{found.end} after {found.steps} steps, force {found.force:.3f} N")
+                reason = "" if found.reason is None else f": {found.reason}"
+                text = f"{found.end} after {found.steps} steps{reason}"
+                say(f"{text}; largest force {found.force:.3f} N")
                 if found.end not in _GOOD:
                     break
         finally:
@@ -118,8 +132,7 @@ def drive(
     if json:
         print_json({"checks": [], "warm_up": warm, "episodes": done})
     else:
-        for one in done:
-            print(*(f"{name}: {value}" for name, value in one.items()), sep="\n")
+        Console().print(_table(done))
     return 0 if all(one["end"] in _GOOD for one in done) else CHECK_FAILED
 
 
@@ -127,15 +140,57 @@ def _choose(player: Policy) -> Any:
     return lambda observation: player.act(observation)[0]
 
 
-def require_fit(player: Policy, welcome: Mapping[str, Any]) -> None:
-    """ValueError unless a device gives what a policy reads and takes its actions."""
-    view = types.SimpleNamespace(num_simulations=1, num_actions=len(welcome["action"]))
-    player.reset(cast(View, view), np.ones(1, dtype=bool))
+def _table(episodes: Sequence[Mapping[str, Any]]) -> Table:
+    """Figures of episodes that were driven, side by side."""
+    table = Table("", *(f"episode {n}" for n in range(1, len(episodes) + 1)))
+    for name in ("end", "reason", "steps", "skipped", "late"):
+        if any(one[name] is not None for one in episodes):
+            table.add_row(name, *(str(one[name]) for one in episodes))
+    table.add_row("largest force, N", *(f"{one['force']:.3f}" for one in episodes))
+    for name, what in (
+        ("compute", "state to action, ms"),
+        ("period", "state to state, ms"),
+    ):
+        for figure in next((one[name] for one in episodes if one[name]), ()):
+            cells = (
+                f"{one[name][figure]:.1f}" if one[name] else "" for one in episodes
+            )
+            table.add_row(f"{what}: {figure}", *cells)
+    return table
+
+
+def require_fit(
+    player: Policy, welcome: Mapping[str, Any], unchecked: bool = False
+) -> set[str] | None:
+    """Require that a device gives what a policy reads and takes its actions.
+
+    Args:
+        player: A policy; nothing is checked where it names no observation.
+        welcome: What the device says of itself, see `bridge.Driver`.
+        unchecked: Whether its period and the names, units and scales of what it gives
+            and takes may be others than those of the training.
+
+    Returns:
+        Keys of the arrays that the policy reads; None where they are not known.
+
+    Raises:
+        ValueError: it does not fit; says what was given, what is wanted, and a way out.
+    """
     if player.observation is None:
-        return
-    names = observations.resolve(player.observation)
-    given = {one["key"] for one in welcome["observation"]}
-    missing = {one.key for one in observations.entries(names)} - given
+        return None
+    try:
+        wanted = _interface(player)
+    except (ValueError, OSError) as error:
+        if unchecked:
+            return None
+        raise ValueError(
+            f"what {player.name} was trained with cannot be told here, so the device "
+            f"{welcome['name']!r} cannot be compared with it; give what is missing, or "
+            f"drive it --unchecked: {error}"
+        ) from error
+    keys = {one["key"] for one in wanted.observation}
+    wrong = fit.sizes(wanted, welcome)
+    missing = keys - {one["key"] for one in welcome["observation"]}
     if missing:
         options = {"observation": player.observation, **(player.task_kwargs or {})}
         words = [f"--{k.replace('_', '-')} {shlex.quote(_text(v))}"
@@ -145,6 +200,35 @@ def require_fit(player: Policy, welcome: Mapping[str, Any]) -> None:
             f"{welcome['name']!r} does not give; of the suite: cathsim serve "
             f"{player.task} {' '.join(words)}"
         )
+    if wrong:
+        raise ValueError(_misfit(player, welcome, wrong, "mend what it announces"))
+    wrong = [] if unchecked else fit.meanings(wanted, welcome)
+    if wrong:
+        way = "convert on the device, or leave out what is announced wrongly; "
+        way += "--unchecked drives it as it is"
+        raise ValueError(_misfit(player, welcome, wrong, way))
+    return keys
+
+
+def _misfit(
+    player: Policy, welcome: Mapping[str, Any], wrong: Sequence[str], way: str
+) -> str:
+    more = f"; {len(wrong) - _MOST} more" if len(wrong) > _MOST else ""
+    return (
+        f"the device {welcome['name']!r} is not one that {player.name} was trained "
+        f"for: {'; '.join(wrong[:_MOST])}{more} (docs/robots.md): {way}"
+    )
+
+
+def _interface(player: Policy) -> fit.Interface:
+    """What a policy was trained with; ValueError or OSError if its task is not here."""
+    given = {"observation": player.observation}
+    name, options = task_and_options(player, None, given)
+    if suite.TASKS[suite.known(name)].random_arch and "numbers" not in options:
+        options["pool"] = 1  # one arch tells, and more take longer
+    task = suite.make_task(name, **options)
+    chain = task.scene.catheter
+    return fit.Interface(CONTROL_TIMESTEP, action_table(chain), observation_table(task))
 
 
 def _text(value: Any) -> str:

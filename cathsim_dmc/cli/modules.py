@@ -16,7 +16,10 @@ from cathsim_dmc.cli.options import say
 
 GROUP = "cathsim.tasks"
 # Commands that name a task.
-COMMANDS = tuple("train list eval record demos play serve export replay-error".split())
+COMMANDS = (
+    *"train list eval record demos play serve drive export".split(),
+    "replay-error",
+)
 
 
 class Own(NamedTuple):
