@@ -58,8 +58,8 @@ def sizes(wanted: Interface, welcome: Mapping[str, Any]) -> list[str]:
 def meanings(wanted: Interface, welcome: Mapping[str, Any]) -> list[str]:
     """What a device announces otherwise than a policy was trained with.
 
-    What it does not announce is not looked at. Arguments and result as of `sizes`, of
-    which there must be none.
+    What it does not announce, or as None, is not looked at. Arguments and result as of
+    `sizes`, of which there must be none.
     """
     wrong = []
     period = welcome.get("period", wanted.period)
@@ -69,14 +69,14 @@ def meanings(wanted: Interface, welcome: Mapping[str, Any]) -> list[str]:
         zip(wanted.action, welcome["action"], strict=True)
     ):
         for field in ("name", "unit", "scale", "low", "high"):
-            value, wants = given.get(field, own[field]), own[field]
-            if not _same(value, wants):
+            value, wants = given.get(field), own[field]
+            if value is not None and not _same(value, wants):
                 which = f"{field} of action {place} ({own['name']})"
                 wrong.append(f"{which} is {_text(value)}, not {_text(wants)}")
     there = {one["key"]: one for one in welcome["observation"]}
     for own in wanted.observation:
-        unit = there[own["key"]].get("unit", own["unit"])
-        if not _same(unit, own["unit"]):
+        unit = there[own["key"]].get("unit")
+        if unit is not None and not _same(unit, own["unit"]):
             wrong.append(f"unit of {own['key']} is {_text(unit)}, not {own['unit']}")
     return wrong
 
