@@ -233,6 +233,39 @@ def test_a_driver_stops_when_its_device_falls_silent_or_is_lost():
     assert [one["kind"] for one in heard] == ["action", "stop", "action"]
 
 
+def test_the_end_counts_of_a_device_that_closes_while_the_policy_computes():
+    listener = device_module.listen("127.0.0.1", 0)
+    computing, closed = threading.Event(), threading.Event()
+
+    def run():
+        sock, _ = listener.accept()
+        link = bridge.Connection(sock)
+        link.receive(time.monotonic() + WAIT)
+        table = {"action": Robot.action, "observation": Robot.observation}
+        link.send(1.0, "welcome", protocol=1, name="x", period=PERIOD, **table)
+        state = Robot().start(link.receive(time.monotonic() + WAIT)["seed"])
+        seen = {k: messages.to_json(v) for k, v in state.observation.items()}
+        common = {"time": 0, "observation": seen, "force": {}}
+        link.send(1.0, "state", step=0, end=None, **common)
+        computing.wait(WAIT)
+        link.send(1.0, "state", step=1, end="success", **common)
+        off = struct.pack("ii", 1, 0)  # so that the driver's action cannot be sent
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, off)
+        link.close()
+        closed.set()
+
+    def choose(observation):
+        computing.set()
+        closed.wait(WAIT)
+        return push(observation)
+
+    threading.Thread(target=run, daemon=True).start()
+    address = f"127.0.0.1:{listener.getsockname()[1]}"
+    how = bridge.DriveOptions(warm_up=0, watchdog=WAIT)
+    assert bridge.drive(choose, address, options=how).end == "success"
+    listener.close()
+
+
 def test_a_slow_policy_answers_the_newest_state_or_stops():
     def slow(observation):
         time.sleep(4 * PERIOD)
@@ -302,7 +335,7 @@ def test_a_signal_that_ends_the_program_stops_the_device(name, error, interrupts
         assert done["reason"] == "driver: Ended: SIGTERM"
         assert served.said[0].endswith("stopped after 0 steps: driver: Ended: SIGTERM")
     # The program of the device; only the first signal is raised.
-    robot = Robot(steps=10_000)
+    robot, heard = Robot(steps=10_000), []
     robot.read = lambda: os.kill(os.getpid(), number)
     stop = robot.stop
     robot.stop = lambda: (os.kill(os.getpid(), signal.SIGTERM), stop())
@@ -312,14 +345,16 @@ def test_a_signal_that_ends_the_program_stops_the_device(name, error, interrupts
         address = f"127.0.0.1:{listener.getsockname()[1]}"
 
         def driven():
-            with contextlib.suppress(bridge.BridgeError):
+            with pytest.raises(bridge.BridgeError) as told:
                 bridge.drive(push, address, options=SLOW)
+            heard.append(str(told.value))
 
         thread = threading.Thread(target=driven, daemon=True)
         thread.start()
         with pytest.raises(error):
             bridge.serve(robot, listener, bridge.ServeOptions(watchdog=WAIT))
         thread.join(WAIT)
+    assert heard[0].startswith("peer_lost: the device's program ends: ")
     assert robot.stops and signal.getsignal(signal.SIGTERM) is before
 
 
@@ -416,7 +451,7 @@ PLACE = {"key": "place", "shape": [3], "dtype": "float64"}
     [
         ({}, None),
         ({"period": 0.0401}, None),
-        ({"action": [{"unit": "N m"}, {"scale": 0.041}]}, None),
+        ({"action": [{"unit": "N m"}, {"scale": 0.041, "name": None}]}, None),
         ({"action": [{}, {}], "observation": [PLACE, {**PLACE, "key": "more"}]}, None),
         ({"period": 0.1}, "period is 0.1 s, not 0.04 s"),
         ({"action": [{}, {"scale": 0.4}]}, "scale of action 1 (push) is 0.4, not 0.04"),

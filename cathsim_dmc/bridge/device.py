@@ -203,6 +203,10 @@ def _serve(
             log.write("refused", fault=error.fault, reason=error.text)
             if session.running is not None:
                 done.append(session.summary(error.fault, error.text))
+        except BaseException as error:  # of the device, or a signal
+            text = f"the device's program ends: {type(error).__name__}: {error}"
+            wrong = BridgeError("peer_lost", text.removesuffix(": "))
+            raise
         finally:
             device.stop()
             link.close(wrong)
@@ -322,7 +326,8 @@ class _Session:
                 if reason is not None:
                     end = "stopped"
                     self._log.write("stop", step=run.step, reason=reason)
-                    self._link.send(device.period, "stop", reason=reason)
+                    with contextlib.suppress(BridgeError):  # it may have left
+                        self._link.send(device.period, "stop", reason=reason)
                     break
                 if action is None:
                     run.missed += 1

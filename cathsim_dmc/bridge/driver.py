@@ -210,7 +210,12 @@ class Driver:
                 return self._ended(run, "force_limit")
             action = self._checked(choose(self._observation(message["observation"])))
             values, step = action.tolist(), message["step"]
-            self._link.send(options.watchdog, "action", step=step, action=values)
+            try:
+                self._link.send(options.watchdog, "action", step=step, action=values)
+            except BridgeError as error:
+                if error.fault != "peer_lost":
+                    raise
+                continue  # it may have said why: its last state is there to be read
             run.times.append(time.monotonic() - arrived)
             self._log.write(
                 "sent", step=step, action=values, force=message["force"],
