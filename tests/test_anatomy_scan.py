@@ -211,6 +211,14 @@ def test_other_trunks_keep_their_names(names):
     assert name_trunk(tree) is tree
 
 
+def test_an_aberrant_subclavian_artery_keeps_what_it_shares_with_its_vertebral():
+    tree = fork("rsa", "rva")
+    rcca = Vessel("rcca", tube_line((0, 0, -10), (0, -30, -10), 3.0), "aorta", 8e-3)
+    other = VesselTree({**tree.vessels, "rcca": rcca})
+    assert "bca" in name_trunk(tree).vessels
+    assert name_trunk(other) is other
+
+
 def test_a_bovine_trunk_is_the_brachiocephalic():
     """The left carotid leaves it before the right branches part."""
     tree = name_trunk(fork("rcca", "lcca", "rsa"))

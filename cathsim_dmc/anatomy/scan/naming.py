@@ -23,7 +23,16 @@ PATTERNS = {
     ("bca", "lcca", "lva", "lsa"): (0.04, "an arch with its own left vertebral artery"),
     ("rcca", "lcca", "lsa", "rsa"): (0.02, "an aberrant right subclavian artery"),
     ("bovine", "lva", "lsa"): (0.01, "a bovine arch with its own left vertebral"),
+    ("bicarotid", "lsa", "rsa"): (
+        0.004,
+        "an aberrant right subclavian artery with a common trunk of both carotids",
+    ),
+    (): (0.003, "none of these"),
 }
+TRUNKS = {"bovine": "trunk of bca and lcca", "bicarotid": "trunk of rcca and lcca"}
+# Any branch of an arch: radius, m, log deviation, and how often a fork is seen; and
+# the distance between neighbours, m, with its log deviation.
+OTHER, OTHER_FORKS, OTHER_SPACE = (4.2e-3, 0.5), 0.5, (18e-3, 0.8)
 CUT = 0.03  # probability that the scan shows nothing of a branch
 SHORT = 0.04  # that it is cut short
 # Of thin arteries without a name: radius, m, and log deviation of a wider one.
@@ -45,6 +54,7 @@ BRANCHES = {
     "lva": (1.9e-3, 0.0, (150e-3, 30e-3, 0.99)),
     "rcca": (3.9e-3, 10e-3, (120e-3, 30e-3, 0.95)),
     "rsa": (4.8e-3, 6e-3, (38e-3, 10e-3, 0.5)),
+    "bicarotid": (5.3e-3, 14e-3, (18e-3, 11e-3, 0.02)),
 }
 AORTA = 13.3e-3
 APART = 0.5  # deviation of the logarithm of a distance between neighbours
@@ -53,6 +63,10 @@ APART = 0.5  # deviation of the logarithm of a distance between neighbours
 # subclavian artery leaves the back of the aorta and runs behind to the right.
 SIDES = {"way": (0.0, 0.35), "ostium": (0.0, 0.3)}
 SIDES_OF_RSA = {"way": (0.55, 0.3), "ostium": (0.6, 0.25)}
+# How often such a branch is seen to lead aside, to an arm, where as much of it is seen
+# as `Offshoot.aside` asks for; half of any others.
+TO_ARM = {"bca": 0.8, "lsa": 0.7, "rsa": 0.7}
+TO_ARM |= dict.fromkeys(("lcca", "rcca", "bicarotid", "lva"), 0.05)
 _SIDES = np.log(2.0 / np.sqrt(2.0 * np.pi))  # against one of any side
 VESSEL_NAME = re.compile("[a-z][a-z0-9_]*")
 _FORK_DENSITY = 1.0 / 60e-3  # 1/m, to which densities of forks are compared
@@ -94,7 +108,7 @@ def name_branches(
         sure = odds[label]
         if not one.curves:
             continue
-        if sure < SURE or label == "extra":
+        if sure < SURE or label in ("extra", "other"):
             asks = True
             continue
         if label == "bca" and len(one.curves) > 1:
@@ -114,9 +128,11 @@ def name_branches(
         notes.append(question(share, seen, names))
     for label, one in forked:
         own = " and ".join(sorted(names[i] for i in one.curves))
-        label = "trunk of bca and lcca" if label == "bovine" else label
+        called = TRUNKS.get(label, label)
+        if mixed := offshoots.MIXED.get(label):
+            called = f"{label}, or trunk of {label} and {mixed}, or one with a bypass,"
         notes.append(
-            f"question: the {label} that leaves the arch at {shown(one.place)} leads "
+            f"question: the {called} that leaves the arch at {shown(one.place)} leads "
             f"to {own}: which is which? Name them (--rename)"
         )
     return Naming([names[i] for i in range(len(curves))], notes, tuple(right))
@@ -166,15 +182,23 @@ def hypotheses(
         seen, right = list(found), sides
         if last:
             seen, right = seen[::-1], [-values for values in sides[::-1]]
-        for pattern, labels, weight in _labellings(seen, right, scale):
+        for pattern, labels, weight in _labellings(seen, right, scale, bend.head):
             weights[Hypothesis(last, pattern, labels)] = weight + more
     return offshoots.normalised(weights)
 
 
-def _labellings(seen: Sequence[Offshoot], right: Sequence[np.ndarray], scale: float):
+def _labellings(
+    seen: Sequence[Offshoot],
+    right: Sequence[np.ndarray],
+    scale: float,
+    head: np.ndarray,
+):
     """Every (pattern, labels, log weight) of offshoots in order from the heart."""
     count = len(seen)
     for pattern, (frequency, _) in PATTERNS.items():
+        if not pattern:
+            yield pattern, ("other",) * count, _unlisted(seen, frequency, scale)
+            continue
         for kept in range(min(count, len(pattern)) + 1):
             for whole in combinations(range(len(pattern)), kept):
                 for at in combinations(range(count), kept):
@@ -184,7 +208,7 @@ def _labellings(seen: Sequence[Offshoot], right: Sequence[np.ndarray], scale: fl
                     weight = np.log(frequency)
                     weight += np.log(CUT) * (len(pattern) - kept)
                     weight += sum(
-                        _fit(one, label, scale, side)
+                        _fit(one, label, scale, side, head)
                         for one, label, side in zip(seen, labels, right, strict=True)
                     )
                     weight += _spacings(seen, pattern, whole, at, scale)
@@ -192,6 +216,22 @@ def _labellings(seen: Sequence[Offshoot], right: Sequence[np.ndarray], scale: fl
                     if "lva" in labels and "lsa" not in labels:
                         weight += np.log(ALONE)
                     yield pattern, tuple(labels), float(weight)
+
+
+def _unlisted(seen: Sequence[Offshoot], frequency: float, scale: float) -> float:
+    """Log weight of offshoots that follow no pattern of the list."""
+    radius, spread = OTHER
+    space, apart = OTHER_SPACE
+    weight = np.log(frequency)
+    for one in seen:
+        weight += normal(np.log(one.radius / (scale * radius)), spread)
+        if one.curves:
+            weight += np.log(1.0 - OTHER_FORKS if one.fork is None else OTHER_FORKS)
+        else:
+            weight += np.log(SHORT)
+    for gap in np.abs(np.diff([one.s for one in seen])):
+        weight += normal(np.log(max(gap, 2e-3) / (scale * space)), apart)
+    return float(weight)
 
 
 def _between(seen: Sequence[Offshoot], labels: Sequence[str]) -> int:
@@ -204,8 +244,10 @@ def _between(seen: Sequence[Offshoot], labels: Sequence[str]) -> int:
     )
 
 
-def _fit(one: Offshoot, label: str, scale: float, sides: np.ndarray) -> float:
-    """Log probability of the calibre, the fork and the sides of an offshoot."""
+def _fit(
+    one: Offshoot, label: str, scale: float, sides: np.ndarray, head: np.ndarray
+) -> float:
+    """Log probability of the calibre, the fork and the ways of an offshoot."""
     if label == "extra":
         if not one.curves:
             return float(np.log(BUMP))
@@ -219,6 +261,10 @@ def _fit(one: Offshoot, label: str, scale: float, sides: np.ndarray) -> float:
         usual = SIDES_OF_RSA if label == "rsa" else SIDES
         for side, (mean, deviation) in zip(sides, usual.values(), strict=True):
             weight += normal(float(side) - mean, deviation) + _SIDES
+        arm = TO_ARM.get(label, 0.5)
+        aside = one.aside(head)
+        if aside is not None:
+            weight += np.log(2.0 * (arm if aside else 1.0 - arm))
     if one.fork is None:
         return weight + np.log(none if one.curves else SHORT)
     density = np.exp(-0.5 * ((one.fork - length) / spread_of_it) ** 2)
@@ -253,19 +299,34 @@ def question(
     """What the notes ask about offshoots, from the heart on, that have no name."""
 
     def text(key: Hypothesis) -> str:
-        missing = [name for name in key.pattern if name not in key.labels]
+        missing = [
+            TRUNKS.get(name, name) for name in key.pattern if name not in key.labels
+        ]
         without = f" without its {' and '.join(missing)}" if missing else ""
         return PATTERNS[key.pattern][1] + without
 
     best = sorted(offshoots.summed(share, text).items(), key=lambda item: -item[1])
     texts = [f"{text} ({value:.2f})" for text, value in best[:3] if value > 0.02]
+    return f"{left_by(seen, names)}: {', or '.join(texts)}? Name them (--rename)"
+
+
+def right_sided(seen: Sequence[Offshoot], curves: Sequence[np.ndarray]) -> Naming:
+    """Neutral names of curves of a right-sided arch, and what the notes ask.
+
+    Its branches are `seen` from the heart on.
+    """
+    names = neutral_names(curves)
+    which = left_by(seen, dict(enumerate(names)))
+    side = "it is taken for a right-sided one, as its heart and axes are given"
+    return Naming(names, [f"{which}; {side}: which is which? Name them (--rename)"])
+
+
+def left_by(seen: Sequence[Offshoot], names: Mapping[int, str]) -> str:
+    """A question's beginning: the offshoots of an arch, from the heart on."""
     places = []
     for one in seen:
         own = ", ".join(names[i] for i in one.curves) or "a branch that is cut short"
         places.append(f"{own} at {shown(one.place)}")
     few = ("one branch leaves", "two branches leave")
     count = few[len(seen) - 1] if len(seen) < 3 else f"{len(seen)} branches leave"
-    return (
-        f"question: {count} the arch, from the heart on {'; '.join(places)}: "
-        f"{', or '.join(texts)}? Name them (--rename)"
-    )
+    return f"question: {count} the arch, from the heart on {'; '.join(places)}"

@@ -52,11 +52,20 @@ PARTS = {
 LEADS = {
     "bca": ("rcca", "rsa", "rva"),
     "bovine": ("lcca", "bca", "rcca", "rsa", "rva"),
-    "lsa": ("lsa", "lva"),
-    "rsa": ("rsa", "rva"),
-    "lcca": ("lcca", "lva"),  # only where they part `AT_ONCE`
+    "bicarotid": ("rcca", "lcca"),
+    "lsa": ("lsa", "lva", "lcca"),
+    "rsa": ("rsa", "rva", "rcca"),
+    "lcca": ("lcca", "lva", "lsa"),  # only where they part `AT_ONCE`
 }
 AT_ONCE = 8e-3  # m past the ostium; what leaves a carotid artery later is no vertebral
+# Of a branch that leads to an arm: m of its end over which its direction is taken,
+# least length, m, and most cosine between that direction and the head's. And m past its
+# fork from which on one that leads to none is told.
+TAIL, ARM_SEEN, ASIDE, NO_ARM = 25e-3, 60e-3, 0.5, 65e-3
+# Of such an arm past a fork: least radius, m, and angle from the head, degrees.
+ARM_RADIUS, ARM_ANGLE = 2.2e-3, 50.0
+# What a branch may also lead to, by a common trunk or a bypass, and how often it does.
+MIXED, MIXES = {"lsa": "lcca", "rsa": "rcca", "lcca": "lsa"}, 0.02
 TWINS = 85e-3  # m that two curves share after all others have left: one vessel
 
 
@@ -70,6 +79,20 @@ class Offshoot:
     curves: tuple[int, ...]  # rows of the centrelines in it; none if it was cut short
     fork: float | None  # past the ostium, the first place at which it parts
     rows: tuple[np.ndarray, ...]  # (n_i, 3), its curves from the ostium on
+
+    def aside(self, head: np.ndarray) -> bool | None:
+        """Whether one of its curves leads aside in the end; the `head` is at (3,).
+
+        None if none does, and all are too short past their fork to tell.
+        """
+        long = False
+        for row in self.rows:
+            s = arc_lengths(row)
+            way = row[-1] - row[np.searchsorted(s, s[-1] - TAIL)]
+            if s[-1] > ARM_SEEN and way @ head < ASIDE * np.linalg.norm(way):
+                return True
+            long |= bool(s[-1] - (self.fork or 0.0) > NO_ARM)
+        return False if long else None
 
 
 def offshoots(
@@ -206,13 +229,18 @@ def leads(
     aorta by that of a usual one, `heart_last` whether its last point is at the heart.
     """
     label, sure = called
-    single = label == "lcca" and (one.fork or 0.0) >= AT_ONCE
-    kept = without_twins(one.rows) if label in LEADS and not single else [0]
+    single = label == "rcca" or label == "lcca" and (one.fork or 0.0) >= AT_ONCE
+    kept = without_twins(one.rows) if label in LEADS or single else [0]
     rows, numbers = [one.rows[k] for k in kept], [one.curves[k] for k in kept]
-    if len(rows) == 1:
-        return {numbers[0]: ("bca" if label == "bovine" else label, sure)}
     share = _shares(rows)
+    if len(rows) == 1:
+        name = "bca" if label == "bovine" else label
+        return {} if label == "bicarotid" else {numbers[0]: (name, sure)}
     seen = [_look(ways, bend, row, max(share[i])) for i, row in enumerate(rows)]
+    if single:
+        # A carotid artery leads to no arm, but by a common trunk or a bypass.
+        arm = any(r > scale * ARM_RADIUS and angle > ARM_ANGLE for r, angle in seen)
+        return {} if arm else {one.curves[0]: (label, sure)}
     downstream = bend.along * (-1.0 if heart_last else 1.0)
     aside = np.array([(row[-1] - row[0]) @ downstream for row in rows])
     weights = {}
@@ -222,9 +250,13 @@ def leads(
         if not twice and not ("bca" in order and {"rcca", "rsa", "rva"} & set(order)):
             weights[order] = _assignment(order, label, seen, share, aside, scale)
     odds = normalised(weights)
+    doubt = MIXED.get(label)
     found = {}
     for place, number in enumerate(numbers):
-        by = summed(odds, lambda order, place=place: order[place])
+        by = summed(
+            odds,
+            lambda order, place=place: "extra" if doubt in order else order[place],
+        )
         name = max(by, key=by.__getitem__)
         if sure * by[name] >= SURE and name != "extra":
             found[number] = (name, sure * by[name])
@@ -308,6 +340,14 @@ def _assignment(order, label, seen, share, aside, scale) -> float:
     if label in ("bca", "bovine") and "bca" not in place:
         weight -= 1.0 if "rsa" not in place else 0.0
         weight -= 4.0 if "rcca" not in place else 0.0
+    if MIXED.get(label) in place:
+        weight += np.log(MIXES)
+    if label == "bicarotid":
+        missing = {"rcca", "lcca"} - set(place)
+        weight -= 4.0 * len(missing)
+        if not missing:
+            gap = aside[place["lcca"]] - aside[place["rcca"]]
+            weight += float(np.clip(gap / 8e-3, -4.0, 4.0))
     missing = "lcca" if label == "bovine" else label
     if label in ("lcca", "lsa", "rsa", "bovine") and missing not in place:
         weight -= 4.0

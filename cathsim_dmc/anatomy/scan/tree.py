@@ -181,6 +181,8 @@ def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
         own = [key for key in names if key in right or _RIGHT.fullmatch(key)]
         if vessel.parent != root or name not in own or len(own) < 2:
             continue
+        if "rcca" in tree.vessels and "rcca" not in names:
+            continue  # an aberrant subclavian artery with its vertebral one
         line = vessel.centreline
         split = min(tree.origin(key) for key in own[1:])
         # Only the left carotid, of a bovine arch, leaves the trunk before it.
