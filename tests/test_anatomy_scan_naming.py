@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy.arch.arch import ArchSeed
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.scan.aorta import Bend, heart_odds, mirrored
+from cathsim_dmc.anatomy.scan.arches import Arch
 from cathsim_dmc.anatomy.scan.naming import hypotheses, name_branches
 from cathsim_dmc.anatomy.scan.offshoots import Offshoot, leads, offshoots
 
@@ -206,6 +207,91 @@ def test_a_vertebral_artery_of_its_own_and_an_aberrant_subclavian(bend):
     last = (4.8, (4.4, [(20, 20, 85)]))
     found = named(bend, carotid, LCCA, LSA, last)[0]
     assert found == ["rcca", "lcca", "lsa", "rsa"]
+
+
+UP = [(-20, 0, 60)]
+BICAROTID = (5.2, (3.7, [*UP, (-34, 0, 150)]), (3.7, [*UP, (-2, 0, 150)]))
+ARM = [(12, 0, 80), (70, 0, 95)]
+RIGHT_ARM = [(20, 24, 70), (-60, 30, 90)]
+LEFT_VERTEBRAL = (1.9, [ARM[0], (30, 0, 84), (30, 8, 170)])
+RIGHT_VERTEBRAL = (1.9, [RIGHT_ARM[0], (-10, 26, 78), (-10, 26, 165)])
+
+
+@pytest.mark.parametrize("vertebrals", [False, True])
+def test_a_trunk_of_both_carotids_is_no_brachiocephalic(bend, vertebrals):
+    """It leads to no arm; the right subclavian artery leaves last."""
+    last = (4.9, (4.6, ARM)), (4.8, (4.4, RIGHT_ARM))
+    if vertebrals:
+        last = ((*last[0], LEFT_VERTEBRAL), (*last[1], RIGHT_VERTEBRAL))
+    wanted = ["rcca", "lcca", "lsa", *["lva"] * vertebrals]
+    wanted += ["rsa", *["rva"] * vertebrals]
+    names, notes = named(bend, BICAROTID, *last)
+    assert names == wanted and "question" not in notes
+
+
+@pytest.mark.parametrize("fork", [55, 68, 90])
+@pytest.mark.parametrize("stub", [(), (STUB,)])
+def test_a_carotid_artery_with_a_bypass_to_the_arm_is_asked_for(bend, fork, stub):
+    """What is as wide as a carotid artery, beside an arm, is no vertebral artery."""
+    up = [(0, 0, fork)]
+    both = (
+        4.0,
+        (3.6, [*up, (10, 0, 150)]),
+        (4.2, [*up, (20, 0, fork + 6), (75, 0, 99)]),
+    )
+    names, notes = named(bend, BCA, both, *stub)
+    assert not {"lcca", "lsa", "lva"} & set(names)
+    assert "question" in notes
+    assert fork == 55 or "bypass, that leaves the arch" in notes
+
+
+def test_an_arm_that_parts_at_once_from_a_carotid_artery_is_no_vertebral(bend):
+    arm = (4.2, [(0, 0, 50), (20, 0, 58), (75, 0, 70)])
+    names, notes = named(bend, BCA, (5.0, (3.6, [(0, 0, 50), (5, 0, 150)]), arm), STUB)
+    assert not {"lcca", "lsa", "lva"} & set(names) and "question" in notes
+
+
+def test_branches_that_fit_no_pattern_are_asked_for(bend):
+    """Three arteries as wide as each other that leave to either side."""
+    sides = [(-20, -60, 60), (0, 60, 60), (20, -60, 60)]
+    names, notes = named(bend, *((4.2, (4.0, [end])) for end in sides))
+    assert all(name.startswith("branch_") for name in names)
+    assert "none of these (" in notes
+
+
+def bent(bend, heart, *branches):
+    """An aorta with branches of `built`, of whose heart so much is known."""
+    ways, found, curves = built(*branches)
+    width = np.full(len(bend.line), 13e-3)
+    return Arch(ways, (), None, curves, bend, width, found, heart)
+
+
+def test_a_kinked_aorta_with_visceral_branches_is_no_arch(bend):
+    """They leave to either side, or all towards the feet; an arch's do not."""
+    sides = [(2.8, (2.7, [(-20, 60, 50)])), (3.9, (3.6, [(0, -60, 40)]))]
+    assert "no arch" in bent(bend, 0.7, *sides)._unlike()
+    usual = (BCA, LCCA, LSA)
+    assert bent(bend, 0.7, *usual)._unlike() == ""
+    flip = np.diag([1.0, -1.0, -1.0])
+    down = Bend(bend.line @ flip, bend.apex, bend.turn, bend.up @ flip, bend.along)
+    arch = bent(bend, 0.7, *usual)
+    turned = Arch(arch.ways, (), None, [], down, arch.width, arch.branches, 0.7)
+    assert "towards the feet" in turned._unlike() and "--heart" in turned._unlike()
+
+
+def test_a_right_sided_arch_is_taken_where_heart_and_axes_are_given():
+    flip = np.diag([-1.0, 1.0, 1.0])
+    for tree in arches():
+        line_ = tree.root.centreline.points[::-1] @ flip
+        arch = Arch(None, (), None, [], Bend.of(line_), np.empty(0), [], 1.0)
+        assert arch.on_its_side(certain=True).right
+        with pytest.raises(ValueError, match="right-sided arch, give its heart and"):
+            arch.on_its_side(certain=False)
+        # With the heart at the other end, or front for back, it is none.
+        for wrong in (line_[::-1], line_ @ np.diag([1.0, -1.0, 1.0])):
+            arch = Arch(None, (), None, [], Bend.of(wrong), np.empty(0), [], 1.0)
+            with pytest.raises(ValueError, match="mirrored"):
+                arch.on_its_side(certain=True)
 
 
 def test_a_thin_last_branch_is_the_subclavian_more_than_a_vertebral_artery(bend):

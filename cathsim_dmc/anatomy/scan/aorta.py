@@ -31,6 +31,7 @@ LEG = 80e-3  # m of each leg that are compared, from 10 mm past the branches on
 LIMB, COUNTS, FULL = 50e-3, 40e-3, 60e-3
 CHORD = 60e-3  # m of a branch over which its direction is taken
 UPRIGHT = 0.9  # cosine between the limbs of the aorta and +z of a scan that stands
+DOWN = -0.5  # cosine from which on a bend points to the feet, in a scan that stands
 # Longest usual ascending aorta, m, and what more makes it e times less likely.
 ASCENDING, LONGER = 70e-3, 18e-3
 # Way from the middle of the arch's branches to the top, m: the more, the steeper the
@@ -190,12 +191,20 @@ def mirrored(azimuth: float | None) -> str | None:
         return None
     side = "left" if azimuth > 0 else "right"
     face = "back" if abs(azimuth) < np.pi / 2 else "front"
+    certain = "; if it is a right-sided arch, give its heart and its axes both (--heart"
+    certain = f"{certain} and --axes, LPS where it stands upright)"
     return (
         f"the arch leads from the heart to the {side} and {face} "
         f"({np.degrees(azimuth):.0f} degrees from back to left; 50 are usual): the "
         "scan is mirrored, turned, or in another frame (--frame, --axes), or its heart "
         "is at the other end (--heart)"
+        f"{certain if right_sided(azimuth) else ''}"
     )
+
+
+def right_sided(azimuth: float) -> bool:
+    """Whether an arch leads from the heart to the right and back."""
+    return bool(AZIMUTH[0] <= -azimuth <= AZIMUTH[1])
 
 
 def heart_odds(bend: Bend, depth: np.ndarray, places: Sequence[float]) -> float:

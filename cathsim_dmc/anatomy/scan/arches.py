@@ -20,6 +20,8 @@ from cathsim_dmc.anatomy.scan.offshoots import (
 from cathsim_dmc.anatomy.scan.units import mm, shown
 from cathsim_dmc.anatomy.scan.ways import Ways
 
+LIKE_NONE = 0.85  # probability of no pattern from which on a bend is no arch
+
 
 @dataclass(frozen=True)
 class Arch:
@@ -33,6 +35,7 @@ class Arch:
     width: np.ndarray  # (n,) m, depth along the bend's line
     branches: list[Offshoot]  # of the arch
     heart: float  # probability that the heart is at the last end
+    right: bool = False  # whether it is known to be a right-sided arch
 
     @classmethod
     def of(
@@ -101,8 +104,11 @@ class Arch:
                 f"{shown(limb[0])}, where that bends; the branches of an arch are much "
                 "narrower than the aorta"
             )
+        if unlisted := self._unlisted():
+            return unlisted
         count = len(self.branches)
-        if bend.turn < aorta.TURN and mm(float(np.median(width))) > aorta.ADULT:
+        cut = bend.turn < aorta.TURN and mm(float(np.median(width))) > aorta.ADULT
+        if count and cut:
             # Cut off past its branches, where it would turn.
             count = len(list(departures(bend, width, self.found)))
         if not count or (count == 1 and bend.turn < aorta.LOOP):
@@ -112,6 +118,32 @@ class Arch:
                 f"{np.degrees(bend.turn):.0f} degrees"
             )
         return ""
+
+    def _unlisted(self) -> str:
+        """Why its branches are those of no arch, or nothing."""
+        if not self.branches:
+            return ""
+        share = _shares(self.bend, self.width, self.branches)
+        none = sum(value for key, value in share.items() if not key.pattern)
+        ask = "if it is an arch, give a point near its end at the heart (--heart)"
+        if none > LIKE_NONE:
+            return f"its branches at the bend are those of no arch ({none:.2f}); {ask}"
+        if self.heart < SURE and self.bend.up[2] < aorta.DOWN:
+            return f"the widest way bends towards the feet; {ask}, or its axes (--axes)"
+        return ""
+
+    def on_its_side(self, certain: bool) -> Self:
+        """The arch, right-sided if it leads to the right; ValueError if it may not.
+
+        It may if the user says where its heart is and how it stands, both: `certain`.
+        """
+        azimuth = self.bend.azimuth(heart_last=True)
+        wrong = aorta.mirrored(azimuth)
+        if azimuth is None or not wrong or self.heart < SURE:
+            return self
+        if not (certain and aorta.right_sided(azimuth)):
+            raise ValueError(wrong)
+        return replace(self, right=True)
 
     def entered(self, inlet: np.ndarray | None, planned: LumenEntry) -> LumenEntry:
         """Where the device enters: by default at the end that is not at the heart.
@@ -144,6 +176,8 @@ class Arch:
             bend, width, found = _branches(self.ways, start, ends[toward], curves)
         if not found:
             return Naming(naming.neutral_names(curves))
+        if self.right:
+            return naming.right_sided(found[::-1] if toward else found, curves)
         if self.heart < SURE:
             names = naming.neutral_names(curves)
             share = {

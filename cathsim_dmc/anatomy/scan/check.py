@@ -139,8 +139,22 @@ def _sides(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
         names = ", ".join(vessel.name for vessel in vessels)
         yield f"{names} do not leave {root.name} in this order"
     bend = Bend.of(root.centreline.points, [v.centreline.points for v in vessels])
+    if _right_sided(anatomy):
+        return
     if bend.turn > TURN and (text := mirrored(bend.azimuth(bool(along.sum() < 0)))):
         yield text
+
+
+def _right_sided(anatomy: Anatomy) -> bool:
+    """Whether the carotid arteries leave as those of a right-sided arch: left first."""
+    tree = anatomy.tree
+    vessels = [tree.vessels.get(key) for key in ("lcca", "rcca", "lsa")]
+    own = [v for v in vessels if v is not None and v.parent == tree.root.name]
+    if len(own) < len(vessels):
+        return False
+    ostia = np.array([vessel.mouth.position for vessel in own])
+    left, right, arm = tree.root.centreline.project(ostia).arc_length
+    return bool((right - left) * (arm - left) > 0.0)
 
 
 def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:

@@ -15,8 +15,8 @@ from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.parts import FileFrame, Inlet, Surface
 from cathsim_dmc.anatomy.reach import unreachable
 from cathsim_dmc.anatomy.scan import extract, naming
-from cathsim_dmc.anatomy.scan.aorta import bend_of, mirrored, unproven
-from cathsim_dmc.anatomy.scan.arches import SURE, Arch
+from cathsim_dmc.anatomy.scan.aorta import bend_of, unproven
+from cathsim_dmc.anatomy.scan.arches import Arch
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.curves import inside_part, read_curves
 from cathsim_dmc.anatomy.scan.extract import listed
@@ -201,9 +201,7 @@ def _grown(
         }
         curves = wishes.curves
         curves = {k: inside_part(k, scale * c, measure) for k, c in curves.items()}
-        grown = _Growth(
-            measure, scale, wishes.device, places, wishes.changes, told.note
-        )
+        grown = _Growth(measure, scale, wishes, places, told.note)
         tree, at_end, arch = grown.tree(curves)
         turn = None if wishes.axes is None else upright(wishes.axes)
         if arch and (doubt := unproven(tree, turn)):
@@ -248,10 +246,11 @@ def _anatomy(name: str, parts: _Parts, bore: Calibre, told: _Told) -> Anatomy:
 class _Growth:
     """From an enlarged lumen to its tree: what is given, and the device that passes."""
 
-    def __init__(self, field, scale, device, places, changes, note):
+    def __init__(self, field, scale, wishes, places, note):
         self._field, self._scale, self._note = field, scale, note
-        self._places, self._changes = places, changes
-        self.device, self._given = device or USUAL, device is not None
+        self._places, self._changes = places, wishes.changes
+        self._certain = wishes.axes is not None and "heart" in places
+        self.device, self._given = wishes.device or USUAL, wishes.device is not None
         self._ways = Ways(field, scale * self.device.outer_radius)
         self._ends = extract.free_ends(self._ways)
 
@@ -321,10 +320,8 @@ class _Growth:
         else:
             if arch.entry.position is arch.ends[1].position:
                 end = ", at the heart: the descending aorta is cut off beside a branch"
+            arch = arch.on_its_side(self._certain)
             entry = arch.entered(places.get("inlet"), entry)
-            wrong = mirrored(arch.bend.azimuth(heart_last=True))
-            if wrong and arch.heart >= SURE:
-                raise ValueError(wrong)
         known = arch.found if arch is not None and entry is arch.entry else None
         if known is None:
             known = extract.centrelines(ways, ends, entry, rooted=arch is not None)
