@@ -37,7 +37,7 @@ STUB_WIDE = 30e-3  # m along the aorta: wider ones are no stub
 SURE = 0.95  # least probability of a name, and of the end at the heart
 EXTRA = 0.002  # probability that a branch is none of those that are looked for
 SPREAD = 0.3  # standard deviation of the logarithm of a radius
-VARIED = 0.45  # the same of vertebral arteries
+VARIED, WIDER = 0.45, 0.25  # the same of vertebral arteries, thinner or wider
 # Of the vessels that a branch leads to: radius (m), range of the angle of their way
 # from the head's direction (degrees), and the deviation beyond it.
 PARTS = {
@@ -320,8 +320,11 @@ def _assignment(order, label, seen, share, aside, scale) -> float:
     for name, k in place.items():
         radius, angle = seen[k]
         mean, least, most, deviation = PARTS[name]
-        spread = VARIED if name in ("rva", "lva") else SPREAD
-        weight += normal(np.log(radius / (scale * mean)), spread)
+        wide = float(np.log(radius / (scale * mean)))
+        spread = SPREAD
+        if name in ("rva", "lva"):
+            spread = WIDER if wide > 0.0 else VARIED
+        weight += normal(wide, spread)
         off = max(least - angle, angle - most, 0.0) / deviation
         weight += max(normal(off, 1.0), -6.0)
     for vertebral, artery in (("rva", "rsa"), ("lva", "lsa")):
