@@ -12,6 +12,7 @@ from cathsim_dmc.anatomy.scan.ways import CELL, Ways, in_reach
 
 REACH = (1.2, 1e-3)  # radii and m from a centreline, up to which lumen is its vessel's
 THIN = 10e-3  # m, least length of a vessel too thin for the device that is told
+SHORT = 2.0  # of its width: a vessel or an aneurysm that is no longer has no length
 WIDE = 98.0  # percentile of the depths of a vessel that is its radius
 
 
@@ -26,43 +27,71 @@ class LeftOut(NamedTuple):
 def left_out(ways: Ways, tree: VesselTree) -> list[LeftOut]:
     """Vessels longer than their own width that no vessel of a tree covers.
 
-    Their length is counted from the lumen of the tree on, the longest is first.
+    Their length is counted from the lumen of the tree on, or from a longer one that is
+    left out, too. The longest is first.
     """
     lines = [vessel.centreline for vessel in tree.vessels.values()]
     centres = np.concatenate([line.points for line in lines])
     radii = np.concatenate([line.radii for line in lines])
     taken = in_reach(ways.points, centres, REACH[0] * radii + REACH[1])
+    before = ways.deepest_from(ways.node(tree.root.centreline.points[0]))
+    found: list[LeftOut] = []
+    while more := _beyond(ways, taken, before):
+        for one, way in more:
+            found.append(one)
+            reach = REACH[0] * (ways.depth[way] + CELL) + REACH[1]
+            taken |= in_reach(ways.points, ways.points[way], reach)
+    return sorted(found, key=lambda one: -one.length)
+
+
+def _beyond(
+    ways: Ways, taken: np.ndarray, before: np.ndarray
+) -> list[tuple[LeftOut, np.ndarray]]:
+    """Of each piece of lumen that is not `taken` (n,) the longest vessel, and its way.
+
+    Ways follow the nodes `before` (n,) each.
+    """
     beyond = ways.main & ~taken
     links = ways.links[beyond[ways.links].any(axis=1)]
     if not len(links):
         return []
-    gone, before = ways.out_of(taken, links)
+    gone, near = ways.out_of(taken, links)
     label = groups(len(beyond), links[beyond[links].all(axis=1)])
     label[~beyond] = -1
     found = []
     for key in np.flatnonzero(np.bincount(label[beyond]) > 1):
         own = np.flatnonzero(label == key)
         far = int(own[np.where(np.isfinite(gone[own]), gone[own], -1.0).argmax()])
-        width = 2.0 * (float(np.percentile(ways.depth[own], WIDE)) + CELL)
+        way = ways.trace(before, far)
+        way = way[label[way] == key]
+        reach = REACH[0] * (ways.depth[way] + CELL) + REACH[1]
+        around = own[in_reach(ways.points[own], ways.points[way], reach)]
+        width = 2.0 * (float(np.percentile(ways.depth[around], WIDE)) + CELL)
         if gone[far] > width:
-            way = ways.trace(before, far)
-            middle = ways.points[way[len(way) // 2]]
-            found.append(LeftOut(middle, width, float(gone[far])))
-    return sorted(found, key=lambda one: -one.length)
+            path = ways.trace(near, far)
+            middle = ways.points[path[len(path) // 2]]
+            found.append((LeftOut(middle, width, float(gone[far])), way))
+    return found
 
 
-def said(found: list[LeftOut], device: str, radius: float) -> str | None:
-    """A note on vessels left out for a device with a radius (m), or None."""
+def said(
+    found: list[LeftOut], device: str, radius: float, *, drawn: bool = False
+) -> str | None:
+    """A note on vessels left out for a device with a radius (m), or None.
+
+    In a tree of drawn centrelines they are left out because they have none.
+    """
     found = [one for one in found if one.width > 2.0 * radius or one.length > THIN]
     if not found:
         return None
     texts = []
     for one in found:
         why = "too short" if one.length < BRANCH else "narrow on the way to it"
+        why = "short for its width" if one.length < SHORT * one.width else why
         why = "too thin" if one.width <= 2.0 * (radius + CELL) else why
-        texts.append(
-            f"{shown(one.position)}, {mm(one.width):.1f} mm wide, "
-            f"{mm(one.length):.0f} mm long ({why})"
-        )
+        text = f"{shown(one.position)}, {mm(one.width):.1f} mm wide, "
+        text += f"{mm(one.length):.0f} mm long"
+        texts.append(text if drawn else f"{text} ({why})")
     count = "a vessel is" if len(found) == 1 else f"{len(found)} vessels are"
-    return f"{count} left out for the {device}: {'; '.join(texts)}"
+    where = "of the drawn centrelines" if drawn else f"for the {device}"
+    return f"{count} left out {where}: {'; '.join(texts)}"

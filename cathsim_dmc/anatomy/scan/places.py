@@ -17,6 +17,9 @@ GOAL_DISTAL = 0.8  # of the passable part of a branch, its second goal
 ROOT_REST = 3.0  # radii, least length of a root past its last branch that has a goal
 INLET_WIDTH = 0.8  # of the lumen near the inlet; the rest of the blind end is cut off
 INLET_SEARCH = 40e-3  # m of the root in which that width is looked for
+# m, by which a goal may lie deeper in another vessel than in its own, a little less
+# than `check` allows; and the steps in which it is moved on to where it does not.
+DEEPER, MOVE = 0.4e-3, 1e-3
 SHARES = (1.0, 0.6, 0.3)  # of a blind end that are tried to be cut off at the inlet
 
 
@@ -103,11 +106,14 @@ def cut_open(
     return points, shell, cap
 
 
-def place_goals(tree: VesselTree, device: float = DEVICE_RADIUS) -> dict[str, Goal]:
+def place_goals(
+    tree: VesselTree, device: float = DEVICE_RADIUS, scale: float = 1.0
+) -> dict[str, Goal]:
     """One goal past the ostium of each branch and one far along it, by name.
 
     The root has one, past its last branch; none if it ends in its branches. A device
-    of a radius (m) passes on all ways to them.
+    of a radius (m) passes on all ways to them. A goal that would lie in the ostium of
+    another vessel is moved; `scale` is by how much the tree was enlarged.
     """
     goals = {}
     for key, vessel in tree.vessels.items():
@@ -118,7 +124,9 @@ def place_goals(tree: VesselTree, device: float = DEVICE_RADIUS) -> dict[str, Go
         places = {key: first}
         if GOAL_DISTAL * reach > 1.3 * (first - vessel.ostium):
             places[f"{key}_distal"] = vessel.ostium + GOAL_DISTAL * reach
+        end = vessel.ostium + reach
         for name, s in places.items():
+            s = _in_own_lumen(tree, vessel, s, (vessel.ostium, end), DEEPER / scale)
             goals[name] = Goal(name, key, vessel.centreline.at(s).position, float(s))
     root = tree.root
     last = max(
@@ -131,6 +139,26 @@ def place_goals(tree: VesselTree, device: float = DEVICE_RADIUS) -> dict[str, Go
         place = root.centreline.at(s).position
         goals[root.name] = Goal(root.name, root.name, place, float(s))
     return goals
+
+
+def _in_own_lumen(
+    tree: VesselTree, vessel: Vessel, s: float, limits: tuple[float, float], more: float
+) -> float:
+    """Arc length, m, nearest to `s` within limits at which no other vessel is deeper.
+
+    It is deeper by `more`, m, than the vessel itself. Where there is none, `s`.
+    """
+    line, (low, high) = vessel.centreline, limits
+
+    def own(places: np.ndarray) -> np.ndarray:
+        depths = tree.depths(line.at(places).position)
+        return np.asarray(depths[vessel.name] >= np.max([*depths.values()], 0) - more)
+
+    if own(np.array([s]))[0]:
+        return s
+    steps = np.arange(low, high, MOVE)
+    steps = steps[own(steps)]
+    return float(steps[np.abs(steps - s).argmin()]) if len(steps) else s
 
 
 def flat_ends(tree: VesselTree, opening: Inlet) -> tuple[End, ...]:
@@ -215,6 +243,20 @@ def opened_at_inlet(
         used, numbers = np.unique(np.concatenate([shell, cap]), return_inverse=True)
         cut = Surface(points[used], numbers.reshape(-1, 3))
         tips = [vessel.centreline.points[-1] for vessel in opened.vessels.values()]
-        if last or (SurfaceDepth(cut)(np.array(tips)) > 0.0).all():
+        begun = [v.centreline.points[0] for v in opened.vessels.values() if v.parent]
+        inside = SurfaceDepth(cut)(np.array([*tips, *begun])) > 0.0
+        if inside.all():
             break
+        if last and not inside[len(tips) :].all():
+            row = int(inside[len(tips) :].argmin())
+            raise ValueError(
+                f"a branch leaves the lumen at {shown(begun[row])}, where its end is "
+                f"cut off for the inlet at {shown(inlet.position)}. Choose an inlet "
+                f"farther from it (inlet; --inlet X Y Z), such as {_listed(tips)}."
+            )
     return opened, inlet, cut
+
+
+def _listed(places: list[np.ndarray]) -> str:
+    """The first places (3,) m for a message."""
+    return ", ".join(map(shown, places[:8]))
