@@ -8,13 +8,17 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.centreline import arc_lengths
+from cathsim_dmc.anatomy.reach import AHEAD_RADII, OSTIUM_AHEAD
 from cathsim_dmc.anatomy.scan.rings import COVER, Cover, rings, round_ring
 from cathsim_dmc.anatomy.scan.topology import groups
-from cathsim_dmc.anatomy.scan.units import mm, shown
+from cathsim_dmc.anatomy.scan.units import enlargement, mm, shown
 from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common, in_reach
 
 END_SEARCH = 15e-3  # m from a blind end in which its width is looked for
 STUB = 3e-3  # m, shortest own vessel beyond that
+# Of the width where a blind end and the branches beside it part: its least length from
+# there, and greatest width of these; and by how much it is wider than every other end.
+BLIND, BESIDE, WIDER = 1.3, 0.5, 1.2
 STUMP = 500  # lattice points beyond that, least of a wide vessel that is cut off
 WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
 ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
@@ -23,9 +27,13 @@ STARTS = 30e-3  # m along the lumen; curves that start nearer to an end start th
 # of the main vessel on, if it is also so many times as long as wide.
 BRANCH, WIDTHS = 15e-3, 1.5
 EVEN = 0.6  # of the wider one's width: two branches of a fork that share its trunk
+INLET_CUT = 1.8  # radii of the trunk, about what is cut off at its inlet
 EVEN_PART = (1.5, 4.0)  # radii of the trunk past the fork, between which they compare
 TRUNK_LENGTH = 3.0  # of its radii, least
 FITS = 0.5  # of the length of the vessels, that a device must pass to be the default
+# A sac is about as long as wide: every way out of it is so much narrower than its
+# widest place, so many radii of that from its end.
+NECK, SAC_LENGTH = 0.5, 3.2
 
 
 class FreeEnd(NamedTuple):
@@ -80,7 +88,58 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
         part = (along > 0.5 * local) & (along < END_SEARCH)
         radius = float(np.median(depth[part])) if part.any() else local
         ends.append(FreeEnd(ways.points[node], radius, narrow))
-    return ends
+    blind = _blind_end(ways, ends, tips[np.argsort(-reach[tips])], back)
+    return ends if blind is None else [*ends, blind]
+
+
+def _blind_end(
+    ways: Ways, ends: Sequence[FreeEnd], tips: np.ndarray, back: np.ndarray
+) -> FreeEnd | None:
+    """The end of the widest vessel, if thin branches that leave beside it cover it.
+
+    So is the root of the aorta by the coronary arteries. `tips` (n,) are nodes, `back`
+    (m,) those before each on the deepest ways from the first of the ends.
+    """
+    traces = [ways.trace(back, ways.node(end.position)) for end in ends[1:]]
+    known = np.array([end.position for end in ends])
+    widest = WIDER * max(end.bottleneck for end in ends)
+    for tip in tips:
+        path = ways.trace(back, tip)
+        shared = [common(path[:, None], way[:, None]) for way in traces]
+        at = max(shared, default=1) - 1
+        place, wide = ways.points[path[at]], ways.depth[path[at]]
+        away = np.linalg.norm(ways.points[path[at:]] - ways.points[tip], axis=1)
+        if wide < widest or away[0] < BLIND * wide:
+            continue
+        if np.linalg.norm(known - ways.points[tip], axis=1).min() < 2.0 * wide:
+            continue
+        # It is wide to its end, the ways to other ends leave it for thin branches, and
+        # it is no aneurysm: another end is joined to it by a wide lumen.
+        if (ways.depth[path[at:]] < BESIDE * np.minimum(wide, away)).any():
+            continue
+        beside = [
+            way[at:] for way, n in zip(traces, shared, strict=True) if n == at + 1
+        ]
+        if not all(_leaves_thin(ways, way, place, wide) for way in beside):
+            continue
+        before = ways.deepest_from(int(tip))
+        if any(_joined(ways, before, end, wide) for end in ends):
+            return FreeEnd(ways.points[tip], float(wide), float(wide))
+    return None
+
+
+def _leaves_thin(ways: Ways, way: np.ndarray, place: np.ndarray, wide: float) -> bool:
+    """Whether a way goes on, far from a wide place (3,) m, in a thin branch only."""
+    far = np.linalg.norm(ways.points[way] - place, axis=1) > 2.0 * wide
+    return bool(far.any() and (ways.depth[way[far]] < BESIDE * wide).all())
+
+
+def _joined(ways: Ways, before: np.ndarray, end: FreeEnd, wide: float) -> bool:
+    """Whether the deepest way to an end is about as wide as what it comes from (m)."""
+    way = ways.trace(before, ways.node(end.position))
+    inner = arc_lengths(ways.points[way])
+    inner = np.minimum(inner, inner[-1] - inner) > wide
+    return bool(inner.any() and (ways.depth[way[inner]] > BESIDE * wide).all())
 
 
 def stump(ways: Ways, ends: Sequence[FreeEnd]) -> FreeEnd | None:
@@ -107,12 +166,14 @@ def stump(ways: Ways, ends: Sequence[FreeEnd]) -> FreeEnd | None:
 class LumenEntry(NamedTuple):
     """Place (3,) m where the device enters, and `far` end (3,) m of the root, or None.
 
-    It is a free end (`at_end`), or a place where the lumen is cut.
+    It is a free end (`at_end`), or a place where the lumen is cut. `sacs` are wider
+    ends that are no vessel's.
     """
 
     position: np.ndarray
     at_end: bool
     far: np.ndarray | None
+    sacs: tuple[FreeEnd, ...] = ()
 
 
 def plan_inlet(
@@ -125,7 +186,8 @@ def plan_inlet(
 
     It enters by the free end near the `inlet` (3,) m, or where that lies in a vessel,
     which is cut there. None chooses the end at which drawn curves (n_i, 3) m start,
-    else the wide end farthest from their starts, and without curves the widest.
+    else the wide end farthest from their starts, and without curves the widest that is
+    no sac.
     ValueError lists the ends if none can be chosen.
     """
     nodes = [ways.node(end.position) for end in ends]
@@ -137,7 +199,7 @@ def plan_inlet(
         gap = np.array([np.linalg.norm(end.position - curve[-1]) for end in ends])
         nearest = int((gap / close).argmin())
         free[nearest] &= gap[nearest] >= close[nearest]
-    cut = False
+    cut, sacs = False, []
     if inlet is not None:
         gap = np.array([np.linalg.norm(end.position - inlet) for end in ends])
         chosen = int(gap.argmin())
@@ -147,7 +209,9 @@ def plan_inlet(
     elif curves:
         chosen = _chosen_by_curves(ways, ends, nodes, width, free, curves)
     else:
-        chosen = int(width.argmax())
+        order = [int(k) for k in np.argsort(-width, kind="stable")]
+        chosen = next((k for k in order if not _sac(ways, nodes, k)), order[0])
+        sacs = [ends[k] for k in order[: order.index(chosen)]]
     position = inlet if inlet is not None and cut else ends[chosen].position
     # The root leads to the widest other end, if a wide vessel leads there.
     reach = ways.lengths_from(ways.node(position))
@@ -163,7 +227,23 @@ def plan_inlet(
             others &= ways.lengths_from(lasts[0])[nodes] < reach[lasts[0]]
     others &= width > floor
     far = ends[int(np.where(others, width, -np.inf).argmax())].position
-    return LumenEntry(position, not cut, far if others.any() else None)
+    return LumenEntry(position, not cut, far if others.any() else None, tuple(sacs))
+
+
+def _sac(ways: Ways, nodes: Sequence[int], row: int) -> bool:
+    """Whether the end in a row of the nodes of all ends is an aneurysm's, no vessel's.
+
+    A blind end of a vessel leads on as wide for longer.
+    """
+    before = ways.deepest_from(nodes[row])
+    for node in [*nodes[:row], *nodes[row + 1 :]]:
+        way = ways.trace(before, node)
+        depth = ways.depth[way]
+        wide = np.maximum.accumulate(depth)
+        away = np.linalg.norm(ways.points[way] - ways.points[way[0]], axis=1)
+        if not ((depth < NECK * wide) & (away < SAC_LENGTH * wide)).any():
+            return False
+    return len(nodes) > 1
 
 
 def _chosen_by_curves(ways, ends, nodes, width, free, curves) -> int:
@@ -210,8 +290,10 @@ def centrelines(
             known.append(entry.far)
             cover.add(toward)
             main = Cover(ways, toward)
-    todo = []
+    todo, sacs = [], {id(end) for end in entry.sacs}
     for end in ends:
+        if id(end) in sacs:
+            continue
         way = ways.trace(before, ways.node(end.position))
         apart = min(np.linalg.norm(end.position - place) for place in known)
         if apart < 1e-6 or len(way) <= 3:
@@ -272,7 +354,8 @@ def trunk(
     """End (3,) m of the trunk of a tree's curves (n_i, 3) m, and those that leave it.
 
     The trunk is the beginning of the bulkiest curve up to the first fork at which
-    another one goes on that is about as wide; the whole curve if there is none.
+    another one goes on that is about as wide, and that a device which enters can turn
+    into; the whole curve if there is none.
     """
     main, others = curves[0], list(curves[1:])
     depth = ways.depth[[ways.node(point) for point in main]]
@@ -286,11 +369,17 @@ def trunk(
             _width(s - s[at], depth, radius),
             _width(arc_lengths(other) - arc_lengths(other)[at], beside, radius),
         ]
-        if s[at] > TRUNK_LENGTH * radius and min(wide) > EVEN * max(wide):
+        least = max(TRUNK_LENGTH * radius, INLET_CUT * radius + _ahead_of_inlet(radius))
+        if s[at] > least and min(wide) > EVEN * max(wide):
             forks.append(at)
     if not forks:
         return main[-1], others
     return main[min(forks)], list(curves)
+
+
+def _ahead_of_inlet(radius: float) -> float:
+    """Least distance (m) of an ostium from the inlet of a trunk with a radius (m)."""
+    return min(OSTIUM_AHEAD * enlargement(), AHEAD_RADII * radius)
 
 
 def _width(past: np.ndarray, depth: np.ndarray, radius: float) -> float:

@@ -161,6 +161,7 @@ class _Parts(NamedTuple):
     opening: Inlet
     surface: Surface
     frame: FileFrame
+    scale: float  # by which it was enlarged to grow the tree
 
 
 def _checked(
@@ -208,7 +209,7 @@ def _grown(
             told.note(doubt)
         tree, opening, surface = opened_at_inlet(tree, at_end, surface)
         tree, opening, surface = resized(tree, opening, surface, 1.0 / scale)
-    return _Parts(tree, opening, surface, frame), grown.device
+    return _Parts(tree, opening, surface, frame, scale), grown.device
 
 
 def _anatomy(name: str, parts: _Parts, bore: Calibre, told: _Told) -> Anatomy:
@@ -222,7 +223,7 @@ def _anatomy(name: str, parts: _Parts, bore: Calibre, told: _Told) -> Anatomy:
         ]
         told.say(f"tree: {', '.join(sizes)}")
         ends = flat_ends(tree, parts.opening)
-        goals = place_goals(tree, bore.outer_radius)
+        goals = place_goals(tree, bore.outer_radius, parts.scale)
         anatomy = Anatomy(
             name, tree, parts.opening, goals, ends, parts.surface, parts.frame
         )
@@ -233,6 +234,13 @@ def _anatomy(name: str, parts: _Parts, bore: Calibre, told: _Told) -> Anatomy:
             )
             goals = {k: goal for k, goal in anatomy.goals.items() if k not in missed}
             anatomy = replace(anatomy, goals=goals)
+        if not anatomy.goals:
+            listing = ", ".join(shown(end.position) for end in ends[1:][:8])
+            raise ValueError(
+                f"no goal can be reached from the inlet {shown(ends[0].position)}: all "
+                "branches leave beside it. Enter by another end of the lumen (inlet; "
+                f"--inlet X Y Z), such as {listing}."
+            )
         for check, wrong in check_tree(anatomy).items():
             if wrong:
                 raise ValueError(
@@ -266,13 +274,12 @@ class _Growth:
         root, right, arch = ROOT, frozenset(), True
         if not drawn:
             entry, curves, right, root, arch = self._computed(entry)
-        elif "heart" in self._places or set(self._changes) - {ROOT, TRUNK}:
+        elif "heart" in self._places:
             raise ValueError(
-                "heart is for computed centrelines, and so is rename, but for the "
-                f"root ({ROOT} or {TRUNK}); with drawn ones rename the files, and give "
-                "the inlet."
+                "heart is for computed centrelines; with drawn ones give the inlet."
             )
         else:
+            curves = self._relabelled(curves)
             curves, added = extract.continued(ways, ends, curves, entry)
             for key, length in added.items():
                 self._note(
@@ -284,15 +291,22 @@ class _Growth:
         if drawn:
             arch = bend_of(tree) is not None or bool({*naming.BRANCHES} & set(curves))
             root = ROOT if arch else TRUNK
-            (wanted,) = naming.renamed([root], self._changes)
-            tree = with_root(tree, wanted)
+            tree = with_root(tree, self._changes.get(root, root))
         elif root != ROOT:
             tree = with_root(tree, root)
-        if not drawn:
-            missed = said(left_out(ways, tree), self.device.name, ways.device)
-            if missed is not None:
-                self._note(missed)
+        missed = left_out(ways, tree)
+        text = said(missed, self.device.name, ways.device, drawn=drawn)
+        if text is not None:
+            self._note(text)
         return tree, entry.at_end, arch
+
+    def _relabelled(self, curves) -> dict[str, np.ndarray]:
+        """Drawn curves by the names that the user wants; the root is renamed later."""
+        names = naming.renamed([ROOT, TRUNK, *curves], self._changes)[2:]
+        for old, new in zip(curves, names, strict=True):
+            if old != new:
+                self._note(f"{old} is renamed {new}")
+        return dict(zip(names, curves.values(), strict=True))
 
     def _choose_device(self, entry) -> None:
         """The thinnest device where the usual one passes less than half of the tree."""
@@ -317,6 +331,12 @@ class _Growth:
                 f"no aortic arch recognised, so vessels get no anatomical names: {seen}"
             )
             end = ", the widest end"
+            if entry.sacs:
+                sacs = ", ".join(
+                    f"{shown(sac.position)}, {mm(2.0 * sac.bottleneck):.1f} mm wide"
+                    for sac in entry.sacs
+                )
+                end += f" that is no aneurysm's, as is that at {sacs}"
         else:
             if arch.entry.position is arch.ends[1].position:
                 end = ", at the heart: the descending aorta is cut off beside a branch"
