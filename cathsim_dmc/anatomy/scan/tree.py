@@ -58,7 +58,10 @@ def grow_tree(
     lines, trunk = {ROOT: root}, _finish(field, root, None, tail)
     vessels = {ROOT: Vessel(ROOT, trunk)}
     first = TRUNKS if drawn else (*TRUNKS, *STEMS)
-    ranks = {k: (k not in TRUNKS, k not in first, -_bulk(field, raw[k])) for k in raw}
+    ranks = {
+        k: (k not in TRUNKS, k not in first, k != BCA, -_bulk(field, raw[k]))
+        for k in raw
+    }
     for name in sorted(raw, key=ranks.__getitem__):
         curve = raw[name]
         parent, at = _parent(curve, lines, vessels, field)

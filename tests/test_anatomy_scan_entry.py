@@ -1,0 +1,188 @@
+"""Where an import enters a lumen, where its goals lie, and what it leaves out."""
+
+import re
+
+import numpy as np
+import pytest
+from synthetic_scans import marched, write_markup, write_obj, y_tree
+
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.scan import importer
+from cathsim_dmc.anatomy.scan.extract import free_ends, plan_inlet, trunk
+from cathsim_dmc.anatomy.scan.importer import import_scan
+from cathsim_dmc.anatomy.scan.left_out import left_out
+from cathsim_dmc.anatomy.scan.places import opened_at_inlet, place_goals
+from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.surface import lumen_surface
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+
+
+def tube(points, radii):
+    """A centreline through corners, mm."""
+    line = Centreline(np.array(points) * 1e-3, np.array(radii) * 1e-3)
+    return line.resampled(0.5e-3)
+
+
+def ways_of(vessels, spacing=1.5e-3):
+    return Ways(SurfaceDepth(lumen_surface(VesselTree(vessels), spacing)))
+
+
+def sac(start, direction, radius):
+    """A ball of a radius (mm) whose wall is at a place: a line of its widths."""
+    s = np.linspace(0.05, 1.95, 20)
+    points = np.array(start) + radius * s[:, None] * np.array(direction)
+    return tube(points, radius * np.sqrt(1.0 - (1.0 - s) ** 2))
+
+
+def test_an_aneurysm_is_no_inlet():
+    """At the tip of the basilar artery: wider than the artery, and as long as wide."""
+    arms = {
+        name: Vessel(
+            name, tube([(0, 0, 60), (side * 20, 0, 66), (side * 60, 0, 60)], [3.5] * 3)
+        )
+        for name, side in (("left", 1), ("right", -1))
+    }
+    vessels = {"trunk": Vessel("trunk", tube([(0, 0, 0), (0, 0, 64)], [5, 5]))}
+    vessels |= {k: Vessel(k, v.centreline, "trunk", 5e-3) for k, v in arms.items()}
+    dome = Vessel("dome", sac((0, 0, 62), (0, 0, 1), 12.0), "trunk", 5e-3)
+    ways = ways_of({**vessels, "dome": dome})
+    ends = free_ends(ways)
+    widest = max(ends, key=lambda end: end.bottleneck)
+    assert widest.position[2] > 75e-3
+    entry = plan_inlet(ways, ends, [], None)
+    assert entry.sacs == (widest,)
+    assert np.linalg.norm(entry.position) < 8e-3
+    # Who wants to enter there says so.
+    given = plan_inlet(ways, ends, [], widest.position)
+    assert given.sacs == () and given.position is widest.position
+    # A vessel that leads on as wide is one, however thin its branches are.
+    stem = Vessel("trunk", tube([(0, 0, 0), (0, 0, 64)], [12, 12]))
+    ways = ways_of({**vessels, "trunk": stem})
+    entry = plan_inlet(ways, free_ends(ways), [], None)
+    assert entry.sacs == () and np.linalg.norm(entry.position) < 18e-3
+
+
+@pytest.mark.parametrize("beside", [18, 24])
+def test_an_aorta_ends_at_its_root_though_coronaries_leave_beside_it(beside):
+    aorta = tube([(0, 0, 0), (0, 0, 60), (0, 0, 200)], [15, 14, 11])
+    left = tube([(0, 0, beside), (30, 0, beside), (45, 0, -50)], [2.2, 2.2, 2])
+    right = tube([(0, 0, beside), (-30, 0, beside), (-45, 0, -50)], [2.2, 2.2, 2])
+    vessels = {
+        "aorta": Vessel("aorta", aorta),
+        "left": Vessel("left", left, "aorta", 15e-3),
+        "right": Vessel("right", right, "aorta", 15e-3),
+    }
+    ends = free_ends(ways_of(vessels))
+    assert len(ends) == 4
+    root = min(ends, key=lambda end: np.linalg.norm(end.position))
+    assert np.linalg.norm(root.position) < 16e-3 and root.bottleneck > 12e-3
+
+
+def test_a_trunk_whose_fork_is_beside_the_inlet_leads_on():
+    """No device could turn into a branch there; a fork farther on ends the trunk."""
+    for length, whole in ((18, False), (40, True)):
+        vessels = {
+            "stem": Vessel("stem", tube([(0, 0, 0), (0, 0, length)], [4.5, 4.5])),
+            "one": Vessel(
+                "one", tube([(0, 0, length - 1), (20, 0, length + 60)], [3, 3]), "stem"
+            ),
+            "other": Vessel(
+                "other",
+                tube([(0, 0, length - 1), (-20, 0, length + 50)], [3, 3]),
+                "stem",
+            ),
+        }
+        ways = ways_of(vessels)
+        before = ways.deepest_from(ways.node(np.zeros(3)))
+        tips = [vessels[key].centreline.points[-1] for key in ("one", "other")]
+        curves = [ways.points[ways.trace(before, ways.node(tip))] for tip in tips]
+        end, leaving = trunk(ways, curves)
+        assert len(leaving) == (2 if whole else 1)
+        assert bool(end[2] < (length + 15) * 1e-3) is whole
+
+
+def test_a_goal_is_not_in_the_ostium_of_another_vessel():
+    one = tube([(0, 0, 50), (80, 0, 50)], [3, 3])
+    vessels = {
+        "trunk": Vessel("trunk", tube([(0, 0, 0), (0, 0, 100)], [8, 8])),
+        "one": Vessel("one", one, "trunk", 8e-3),
+        "other": Vessel(
+            "other", tube([(38, 0, 50), (38, 50, 60)], [6, 4]), "one", 3e-3
+        ),
+    }
+    tree = VesselTree(vessels)
+    for goal in place_goals(tree).values():
+        depths = tree.depths(goal.position)
+        assert depths[goal.vessel] > max(depths.values()) - 0.5e-3
+    moved = place_goals(tree)["one"]
+    assert 2e-3 < abs(moved.arc_length - 38e-3) < 12e-3
+    alone = VesselTree({k: vessels[k] for k in ("trunk", "one")})
+    assert place_goals(alone)["one"].arc_length == pytest.approx(38e-3)
+
+
+def test_less_is_cut_off_where_a_branch_begins():
+    """The branch leaves before the place where the lumen has its whole width."""
+    vessels = {
+        "trunk": Vessel("trunk", tube([(0, 0, 0), (0, 0, 100)], [8, 8])),
+        "near": Vessel(
+            "near", tube([(0, 0, 5), (8, 0, 20), (50, 0, 70)], [3] * 3), "trunk", 8e-3
+        ),
+    }
+    tree = VesselTree(vessels)
+    opened, inlet, cut = opened_at_inlet(tree, True, lumen_surface(tree, 1.5e-3))
+    start = opened.vessel("near").centreline.points[0]
+    assert float(SurfaceDepth(cut)(start[None])[0]) > 0.0
+    assert 1e-3 < inlet.position[2] < 5e-3
+    # Where a given inlet cuts it off, another one is asked for.
+    behind = {
+        **vessels,
+        "trunk": Vessel("trunk", tube([(0, 0, 9), (0, 0, 100)], [8, 8])),
+    }
+    with pytest.raises(
+        ValueError, match=r"cut off for the inlet.*--inlet X Y Z\), such"
+    ):
+        opened_at_inlet(VesselTree(behind), False, lumen_surface(tree, 1.5e-3))
+
+
+def test_every_vessel_left_out_has_its_own_entry():
+    """Two branches of one vessel that is left out are noted with it."""
+    vessels = {
+        "stem": Vessel("stem", tube([(0, 0, 0), (0, 0, 100)], [7, 7])),
+        "main": Vessel("main", tube([(0, 0, 50), (120, 0, 50)], [3, 3]), "stem", 7e-3),
+        "up": Vessel("up", tube([(35, 0, 50), (40, 0, 85)], [2, 2]), "main", 3e-3),
+        "down": Vessel("down", tube([(50, 0, 50), (50, 0, 18)], [2, 2]), "main", 3e-3),
+    }
+    missed = left_out(ways_of(vessels), VesselTree({"stem": vessels["stem"]}))
+    long = [one for one in missed if one.length > 20e-3]
+    assert len(long) == 3
+    for one, name in zip(long, ("main", "up", "down"), strict=True):
+        line = vessels[name].centreline
+        assert line.project(one.position).distance < 3e-3
+        radius = float(np.median(line.radii))
+        assert one.width == pytest.approx(2 * radius, abs=1.2e-3)
+        assert abs(one.length - line.length) < 12e-3
+
+
+def test_drawn_centrelines_are_renamed_and_what_has_none_is_noted(tmp_path):
+    tree = y_tree()
+    mesh = write_obj(tmp_path / "lumen.obj", *marched(tree))
+    route = tree.route("trunk", "left").points * 1e3
+    curve = write_markup(tmp_path / "vmtk_1.mrk.json", route)
+    notes = []
+    rename = {"vmtk_1": "lcca", "aorta": "cca"}
+    anatomy = import_scan(mesh, [curve], units="mm", rename=rename, notes=notes)
+    assert list(anatomy.tree.vessels) == ["cca", "lcca"]
+    assert "vmtk_1 is renamed lcca" in notes
+    (missed,) = [note for note in notes if "left out of the drawn centrelines" in note]
+    assert re.search(r"a vessel is .*mm wide, \d+ mm long$", missed)
+    with pytest.raises(
+        ValueError, match="no vessel 'lsa' to rename; there are.*vmtk_1"
+    ):
+        import_scan(mesh, [curve], units="mm", rename={"lsa": "lcca"})
+
+
+def test_an_import_without_a_goal_is_refused(tmp_path, monkeypatch):
+    mesh = write_obj(tmp_path / "lumen.obj", *marched(y_tree()))
+    monkeypatch.setattr(importer, "place_goals", lambda *arguments: {})
+    with pytest.raises(ValueError, match=r"no goal.*--inlet X Y Z\), such as \("):
+        import_scan(mesh, units="mm")
