@@ -226,8 +226,10 @@ def plan_inlet(
             # Ends behind it are nearer to the inlet than to where the curves end.
             others &= ways.lengths_from(lasts[0])[nodes] < reach[lasts[0]]
     others &= width > floor
-    far = ends[int(np.where(others, width, -np.inf).argmax())].position
-    return LumenEntry(position, not cut, far if others.any() else None, tuple(sacs))
+    for row in np.argsort(-np.where(others, width, -np.inf), kind="stable"):
+        if others[row] and not _sac(ways, nodes, int(row)):
+            return LumenEntry(position, not cut, ends[row].position, tuple(sacs))
+    return LumenEntry(position, not cut, None, tuple(sacs))
 
 
 def _sac(ways: Ways, nodes: Sequence[int], row: int) -> bool:
