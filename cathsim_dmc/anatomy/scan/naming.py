@@ -102,10 +102,12 @@ def name_branches(
     names: dict[int, str] = {}
     said, right, forked = [], [], []
     asks = False
-    for place, one in enumerate(seen):
+    labels: list[tuple[str, float]] = []
+    for place in range(len(seen)):
         odds = offshoots.summed(share, lambda key, place=place: key.labels[place])
-        label = max(odds, key=odds.__getitem__)
-        sure = odds[label]
+        labels.append(max(odds.items(), key=lambda item: item[1]))
+    others = {label for label, sure in labels if sure >= SURE}
+    for one, (label, sure) in zip(seen, labels, strict=True):
         if not one.curves:
             continue
         if sure < SURE or label in ("extra", "other"):
@@ -114,7 +116,8 @@ def name_branches(
         if label == "bca" and len(one.curves) > 1:
             right += one.curves
             said.append(f"bca {sure:.2f}")
-        parts = offshoots.leads(ways, bend, one, (label, sure), scale, heart_last)
+        called = label, sure
+        parts = offshoots.leads(ways, bend, one, called, scale, heart_last, others)
         for number, (name, surety) in parts.items():
             names[number] = name
             said.append(f"{name} {surety:.2f}")
@@ -129,7 +132,8 @@ def name_branches(
     for label, one in forked:
         own = " and ".join(sorted(names[i] for i in one.curves))
         called = TRUNKS.get(label, label)
-        if mixed := offshoots.MIXED.get(label):
+        mixed = offshoots.MIXED.get(label)
+        if mixed and mixed not in others:
             called = f"{label}, or trunk of {label} and {mixed}, or one with a bypass,"
         notes.append(
             f"question: the {called} that leaves the arch at {shown(one.place)} leads "

@@ -1,7 +1,7 @@
 """Branches as they leave an aorta: ostia, calibres, forks, and what they lead to."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 from typing import Any
@@ -37,7 +37,8 @@ STUB_WIDE = 30e-3  # m along the aorta: wider ones are no stub
 SURE = 0.95  # least probability of a name, and of the end at the heart
 EXTRA = 0.002  # probability that a branch is none of those that are looked for
 SPREAD = 0.3  # standard deviation of the logarithm of a radius
-VARIED, WIDER = 0.45, 0.25  # the same of vertebral arteries, thinner or wider
+# The same of vertebral arteries, and of wider ones where a carotid may be meant.
+VARIED, WIDER = 0.45, 0.25
 # Of the vessels that a branch leads to: radius (m), range of the angle of their way
 # from the head's direction (degrees), and the deviation beyond it.
 PARTS = {
@@ -53,9 +54,9 @@ LEADS = {
     "bca": ("rcca", "rsa", "rva"),
     "bovine": ("lcca", "bca", "rcca", "rsa", "rva"),
     "bicarotid": ("rcca", "lcca"),
-    "lsa": ("lsa", "lva", "lcca"),
-    "rsa": ("rsa", "rva", "rcca"),
-    "lcca": ("lcca", "lva", "lsa"),  # only where they part `AT_ONCE`
+    "lsa": ("lsa", "lva"),
+    "rsa": ("rsa", "rva"),
+    "lcca": ("lcca", "lva"),  # only where they part `AT_ONCE`
 }
 AT_ONCE = 8e-3  # m past the ostium; what leaves a carotid artery later is no vertebral
 # Of a branch that leads to an arm: m of its end over which its direction is taken,
@@ -64,7 +65,8 @@ AT_ONCE = 8e-3  # m past the ostium; what leaves a carotid artery later is no ve
 TAIL, ARM_SEEN, ASIDE, NO_ARM = 25e-3, 60e-3, 0.5, 65e-3
 # Of such an arm past a fork: least radius, m, and angle from the head, degrees.
 ARM_RADIUS, ARM_ANGLE = 2.2e-3, 50.0
-# What a branch may also lead to, by a common trunk or a bypass, and how often it does.
+# What a branch may also lead to, by a common trunk or a bypass, unless this leaves the
+# arch itself, and how often it does.
 MIXED, MIXES = {"lsa": "lcca", "rsa": "rcca", "lcca": "lsa"}, 0.02
 TWINS = 85e-3  # m that two curves share after all others have left: one vessel
 
@@ -222,13 +224,17 @@ def leads(
     called: tuple[str, float],
     scale: float,
     heart_last: bool,
+    others: Collection[str] = (),
 ) -> dict[int, tuple[str, float]]:
     """Names of the curves of a branch with their probabilities, by their rows.
 
-    The branch is `called` something with a probability; `scale` is the width of the
-    aorta by that of a usual one, `heart_last` whether its last point is at the heart.
+    The branch is `called` something with a probability, the `others` of the arch have
+    names of their own; `scale` is the width of the aorta by that of a usual one,
+    `heart_last` whether its last point is at the heart.
     """
     label, sure = called
+    mixed = MIXED.get(label)
+    doubt = None if mixed in others else mixed
     single = label == "rcca" or label == "lcca" and (one.fork or 0.0) >= AT_ONCE
     kept = without_twins(one.rows) if label in LEADS or single else [0]
     rows, numbers = [one.rows[k] for k in kept], [one.curves[k] for k in kept]
@@ -244,13 +250,13 @@ def leads(
     downstream = bend.along * (-1.0 if heart_last else 1.0)
     aside = np.array([(row[-1] - row[0]) @ downstream for row in rows])
     weights = {}
-    for order in product((*LEADS[label], "extra"), repeat=len(rows)):
+    choices = (*LEADS[label], *([doubt] if doubt else []), "extra")
+    for order in product(choices, repeat=len(rows)):
         names = [name for name in order if name != "extra"]
         twice = len(set(names)) < len(names)
         if not twice and not ("bca" in order and {"rcca", "rsa", "rva"} & set(order)):
-            weights[order] = _assignment(order, label, seen, share, aside, scale)
+            weights[order] = _assignment(order, label, seen, share, aside, scale, doubt)
     odds = normalised(weights)
-    doubt = MIXED.get(label)
     found = {}
     for place, number in enumerate(numbers):
         by = summed(
@@ -313,7 +319,7 @@ def _look(ways: Ways, bend: Bend, row: np.ndarray, shared: int) -> tuple[float, 
     return radius, float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def _assignment(order, label, seen, share, aside, scale) -> float:
+def _assignment(order, label, seen, share, aside, scale, doubt) -> float:
     """Log weight of names for the curves of one branch."""
     weight = np.log(EXTRA) * order.count("extra")
     place = {name: k for k, name in enumerate(order) if name != "extra"}
@@ -323,7 +329,7 @@ def _assignment(order, label, seen, share, aside, scale) -> float:
         wide = float(np.log(radius / (scale * mean)))
         spread = SPREAD
         if name in ("rva", "lva"):
-            spread = WIDER if wide > 0.0 else VARIED
+            spread = WIDER if doubt and wide > 0.0 else VARIED
         weight += normal(wide, spread)
         off = max(least - angle, angle - most, 0.0) / deviation
         weight += max(normal(off, 1.0), -6.0)
@@ -343,7 +349,7 @@ def _assignment(order, label, seen, share, aside, scale) -> float:
     if label in ("bca", "bovine") and "bca" not in place:
         weight -= 1.0 if "rsa" not in place else 0.0
         weight -= 4.0 if "rcca" not in place else 0.0
-    if MIXED.get(label) in place:
+    if doubt in place:
         weight += np.log(MIXES)
     if label == "bicarotid":
         missing = {"rcca", "lcca"} - set(place)
