@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.scan import vtk_files
 from cathsim_dmc.anatomy.scan.mesh import parsed
 from cathsim_dmc.anatomy.scan.naming import ROOT, TRUNK
@@ -142,11 +143,64 @@ def _markup(text: str) -> np.ndarray:
 
 
 def _table(text: str, units: str, frame: str) -> np.ndarray:
-    rows = [re.findall(r"[^,;\s]+", line) for line in text.splitlines()]
-    rows = [row for row in rows if row]
-    if rows and re.match("[A-Za-z]", rows[0][0]):
-        rows = rows[1:]  # a line of headings
-    table = np.array(rows, dtype=float)
-    if table.ndim != 2 or table.shape[1] not in (3, 4):
-        raise ValueError(f"a table of shape {table.shape}")
-    return table[:, :3] @ to_lps(units, frame).T
+    lines = [line.strip().lstrip("#").strip() for line in text.splitlines()]
+    lines = [line for line in lines if line]
+    names = lines.pop(0) if lines and re.match("[\"'A-Za-z]", lines[0]) else ""
+    table = _numbers(lines)
+    columns, frame = _columns(names, table.shape[1], frame)
+    return table[:, columns] @ to_lps(units, frame).T
+
+
+def _numbers(lines: list[str]) -> np.ndarray:
+    """Table (n, k) of lines of numbers; with ";" or tabs, commas may be decimal."""
+    text = "\n".join(lines)
+    if re.search(r"[;\t]", text) and "." not in text:
+        lines = [re.sub(r"(?<=\d),(?=\d)", ".", line) for line in lines]
+    rows = [re.findall(r"[^,;\s\"]+", line) for line in lines]
+    counts = {len(row) for row in rows}
+    if len(counts) != 1:
+        raise ValueError(
+            f"its lines have {' or '.join(map(str, sorted(counts)))} columns"
+            if counts
+            else "it holds no numbers"
+        )
+    return np.array(rows, dtype=float)
+
+
+# Headings of columns, {} for an axis: "X (mm)", ParaView's "Points:0".
+_HEADINGS = {
+    "xyz": r"(.*[^a-z]|p)?{}([^a-z].*)?",
+    "012": r"(.*[^a-z])?(points|coordinates)[^a-z0-9]*{}",
+    "ras": "{}",
+    "lps": "{}",
+}
+
+
+def _columns(names: str, count: int, frame: str) -> tuple[list[int], str]:
+    """Columns of x, y and z of `count`, by their headings, if any, and their frame.
+
+    The headings R, A, S and L, P, S say the frame.
+    """
+    if not names:
+        if count not in (3, 4):
+            raise ValueError(
+                f"{count} columns without headings; give x,y,z[,radius] or a first "
+                "line that names them, and ';' between decimal commas"
+            )
+        return [0, 1, 2], frame
+    mark = next((mark for mark in ";\t," if mark in names), None)
+    heads = [head.strip(" \"'").lower() for head in names.split(mark)]
+    for axes, form in _HEADINGS.items():
+        found = [
+            [k for k, head in enumerate(heads) if re.fullmatch(form.format(one), head)]
+            for one in axes
+        ]
+        if len(heads) == count and all(len(columns) == 1 for columns in found):
+            own = axes.upper() if axes in ("ras", "lps") else frame
+            return [k for (k,) in found], own
+    if count == 3 or (count == 4 and heads[-1].startswith("r")):
+        return [0, 1, 2], frame
+    raise ValueError(
+        f"of {count} columns, {bounds.shown(', '.join(heads))}, none are called x, y "
+        "and z; name three of them so"
+    )
