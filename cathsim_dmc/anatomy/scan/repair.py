@@ -9,7 +9,8 @@ from cathsim_dmc.anatomy.scan.units import enlargement, mm, shown
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 PART_AREA = 0.03  # of the surface's area: smaller separate parts are dropped
-PART_WIDTH = 12e-3  # m, and if they are not wider
+PART_WIDTH = 12e-3  # m, and if they are not wider, or lie in the largest part:
+PART_INSIDE = 0.25  # of such a part
 NON_MANIFOLD = 0.01  # of the triangles: more at non-manifold edges are not mended
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
@@ -61,6 +62,7 @@ class _Work:
         """One vertex per place, and no triangle without area or twice."""
         before = len(self.faces)
         self.vertices, self.faces = topology.merged(self.vertices, self.faces)
+        self.vertices, self.faces = topology.joined(self.vertices, self.faces)
         dropped = before - len(self.faces)
         self.faces, flipped = topology.without_slivers(self.vertices, self.faces)
         if dropped + flipped:
@@ -74,7 +76,10 @@ class _Work:
         area = topology.areas(self.vertices, self.faces)
         share = np.bincount(label, area) / area.sum()
         wide = topology.widths(self.vertices, self.faces, label) > PART_WIDTH
-        large = np.flatnonzero((share > PART_AREA) | wide)
+        # What lies in the lumen or its wall, such as calcifications, is no vessel.
+        inside = topology.inside(self.vertices, self.faces, label, int(share.argmax()))
+        inside = inside > PART_INSIDE
+        large = np.flatnonzero((share > PART_AREA) | (wide & ~inside))
         inner = None
         if len(large) == 2 and not quiet:
             shells = [self.faces[label == k] for k in large]
@@ -83,10 +88,18 @@ class _Work:
             self.notes.append("thick wall: the inner of two surfaces taken")
             large = large[[inner]]
         elif len(large) > 1:
+            remedy = (
+                "Keep the largest island (3D Slicer: Segment Editor, Islands), or join "
+                "them where a vessel is interrupted"
+            )
+            if topology.overlap(self.vertices, self.faces, label, large):
+                remedy = (
+                    "Some of them overlap: unite these (Blender: modifier Boolean, "
+                    "Union; 3D Slicer: import them as one segment)"
+                )
             raise ValueError(
                 f"{self.name} has {len(large)} separate parts; one connected lumen is "
-                "needed. Keep the largest island (3D Slicer: Segment Editor, Islands) "
-                "and export again."
+                f"needed. {remedy}, and export again."
             )
         elif len(share) > 1 and not quiet:
             self.notes.append(

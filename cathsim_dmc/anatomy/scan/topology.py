@@ -6,10 +6,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.parts import Surface
 
 MERGE = 1e-6  # of the mesh's size: vertices nearer than this are one
+JOIN = 1e-5  # of it: vertices of borders nearer than this are one
 ROUNDS = 6  # in which triangles without area are taken out, neighbours of others later
 TOUCH = 1e-6  # share of an edge or a triangle that counts as its border
 # Of the wall of a vessel with a thickness:
@@ -32,6 +34,44 @@ def merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
     faces = faces[np.sort(once)]
     used, renumbered = np.unique(faces, return_inverse=True)
     return vertices[first][used], renumbered.reshape(-1, 3)
+
+
+def joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface; corners of its borders that hardly differ are one.
+
+    Triangles that share no vertices have such corners where their coordinates were
+    rounded, or computed, differently.
+    """
+    edges, times = edge_counts(faces)
+    border = np.unique(edges[times == 1])
+    size = np.linalg.norm(np.ptp(vertices, axis=0))
+    pairs = cKDTree(vertices[border]).query_pairs(JOIN * size, output_type="ndarray")
+    if not len(pairs):
+        return vertices, faces
+    one = np.arange(len(vertices))
+    label = groups(len(border), pairs)
+    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
+    one[border] = border[first][inverse]
+    return merged(vertices, one[faces])
+
+
+def inside(
+    vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, part: int
+) -> np.ndarray:
+    """Share of each of n parts (n,) that lies inside one of them, of itself none.
+
+    Faces (F, 3) are labelled (F,) by their parts.
+    """
+    import igl
+
+    if label.max() == 0:
+        return np.zeros(1)
+    middles = vertices[faces].mean(axis=1)
+    own = np.ascontiguousarray(faces[label == part])
+    within = np.abs(igl.fast_winding_number(vertices, own, middles)) > 0.5
+    share = np.bincount(label, within) / np.bincount(label)
+    share[part] = 0.0
+    return share
 
 
 def areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -196,6 +236,25 @@ def inner_shell(vertices: np.ndarray, shells: Sequence[np.ndarray]) -> int | Non
     if max(share) < 0.9 or min(share) > 0.5:
         return None
     return int(share[1] > share[0])
+
+
+def overlap(
+    vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, chosen: np.ndarray
+) -> bool:
+    """Whether some of the chosen parts lie in others partly, but not wholly.
+
+    Faces (F, 3) are labelled (F,) by their parts.
+    """
+    import igl
+
+    middles = vertices[faces].mean(axis=1)
+    for part in chosen:
+        own = np.ascontiguousarray(faces[label == part])
+        within = np.abs(igl.fast_winding_number(vertices, own, middles)) > 0.5
+        shares = [within[label == other].mean() for other in chosen if other != part]
+        if any(0.0 < share < 1.0 for share in shares):
+            return True
+    return False
 
 
 def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
