@@ -31,8 +31,8 @@ def import_phantom(
     out: Path | None = None,
     centreline: tuple[Path, ...] = (),
     name: str | None = None,
-    units: Literal["mm", "cm", "m", "um"] | None = None,
-    frame: Literal["LPS", "RAS"] = "LPS",
+    units: Literal["mm", "cm", "m", "um", "inch"] | None = None,
+    frame: Literal["LPS", "RAS"] | None = None,
     axes: str | None = None,
     label: tuple[int, ...] = (),
     inlet: tuple[float, float, float] | None = None,
@@ -52,8 +52,9 @@ def import_phantom(
             centrelines (.vtp); without any they are computed from the surface.
         name: Name of the anatomy.
         units: Unit of a surface, and of CSV centrelines, inlet and heart; guessed if
-            not given. That of a label map is mm.
-        frame: Frame of a surface, and of CSV centrelines, inlet and heart.
+            not given. Of a label map only where its header is wrong or names none.
+        frame: Frame of a surface, and of CSV centrelines, inlet and heart; by default
+            what the file says (3D Slicer's do), else LPS.
         axes: Of a scan that does not stand upright: where +x, +y and +z of that frame
             point in the patient, three of L, R, A, P, S, I, such as ILA; or nine
             numbers, the patient's left, back and head as directions in that frame.

@@ -66,7 +66,7 @@ def import_scan(
     centreline_paths: Sequence[str | Path] = (),
     *,
     units: str | None = None,
-    mesh_frame: str = "LPS",
+    mesh_frame: str | None = None,
     axes: str | ArrayLike | None = None,
     labels: Sequence[int] = (),
     name: str | None = None,
@@ -85,9 +85,11 @@ def import_scan(
         centreline_paths: 3D Slicer markups or tables x,y,z[,radius], one per branch;
             the branch is called after the file (centreline-LCCA.mrk.json: "lcca").
             Without any they are computed, and named where the arch tells how.
-        units: of the mesh, of tables and of ``inlet``: "mm", "cm", "m" or "um";
-            None guesses by the width of the lumen and the size, and says so.
-        mesh_frame: "LPS" or "RAS", of the mesh, of tables and of ``inlet``.
+        units: of the mesh, of tables and of ``inlet``: "mm", "cm", "m", "um" or
+            "inch"; None takes that of a label map's header, or guesses by the width
+            of the lumen and the size, and says so.
+        mesh_frame: "LPS" or "RAS", of the mesh, of tables and of ``inlet``; None is
+            what the mesh's file says (3D Slicer's do), else LPS.
         axes: how that frame is turned in the patient, if the scan does not stand
             upright, such as "ILA", or nine numbers; see ``units.upright``.
         labels: of a label map, the values that are the lumen.
@@ -117,11 +119,11 @@ def import_scan(
     told = _Told([] if notes is None else notes, progress or (lambda text: None))
     given, changes = _checked(inlet, heart, rename, device)
     # Refused before the long steps; read again when the unit is known.
-    read_curves(centreline_paths, units or "mm", mesh_frame, axes)
+    read_curves(centreline_paths, units or "mm", mesh_frame or "LPS", axes)
     lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, told.say)
     told.notes.extend(lumen.notes)
-    frame = FileFrame(lumen.units, to_lps(lumen.units, mesh_frame, axes))
-    curves = read_curves(centreline_paths, lumen.units, mesh_frame, axes)
+    frame = FileFrame(lumen.units, to_lps(lumen.units, lumen.frame, axes))
+    curves = read_curves(centreline_paths, lumen.units, lumen.frame, axes)
     wishes = _Wishes(given, curves, changes, device, axes)
     parts, bore = _grown(lumen, frame, wishes, told)
     anatomy = _anatomy(name or Path(mesh_path).name.split(".")[0], parts, bore, told)

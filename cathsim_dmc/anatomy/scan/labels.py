@@ -6,30 +6,63 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.scan.mesh import parsed
-from cathsim_dmc.anatomy.scan.units import to_lps
+from cathsim_dmc.anatomy.scan.units import UNITS, to_lps
 
-LABEL_MAPS = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 BLUR = 0.7  # voxels, standard deviation that takes the steps off a surface
 MOST_VOXELS = 500_000_000  # of a label map: 512 x 512 x 1,900
 _PAD = 3  # voxels around the labels
 _MOST_LABELS = 500
 _DIFFER = 0.3  # of neighbours in an image, at least; of labels far less
 _HEADER = 16_384  # bytes of a MetaImage that hold its header
-_NIFTI_UNITS = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6, "unknown": 1e-3}
+# What files call units of length, and the axes of spaces of NRRD files in LPS.
+_UNITS = {
+    "mm": "mm millimeter millimetre millimeters millimetres",
+    "cm": "cm centimeter centimetre centimeters centimetres",
+    "m": "m meter metre meters metres",
+    "um": "um µm μm micron microns micrometer micrometre micrometers micrometres",
+    "inch": "in inch inches",
+}
+_SPACES = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0), "LAS": (1.0, -1.0, 1.0)}
+
+
+class Labelled(NamedTuple):
+    """The surface of labels: vertices (V, 3) m in LPS, faces (F, 3).
+
+    `notes` say what was taken, and ask what the file leaves open; `unit` is its own.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    notes: tuple[str, ...]
+    unit: str
+
+
+class _Voxels(NamedTuple):
+    """Voxels, matrix (3, 3) and origin (3,) to m in LPS, names of labels.
+
+    `unit` is what the header says, or none; `frame` a question, if it says none.
+    """
+
+    voxels: np.ndarray
+    matrix: np.ndarray
+    origin: np.ndarray
+    names: dict[int, str]
+    unit: str | None = None
+    frame: str = ""
 
 
 def label_surface(
-    path: str | Path, labels: Sequence[int] = ()
-) -> tuple[np.ndarray, np.ndarray, str]:
+    path: str | Path, labels: Sequence[int] = (), units: str | None = None
+) -> Labelled:
     """Surface of the labels of a label map that are the lumen, or of its only one.
 
-    Returns:
-        (vertices (V, 3) m in LPS, faces (F, 3), a line that says what was taken).
+    ``units`` are those of its header if that is wrong or names none.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -42,7 +75,11 @@ def label_surface(
     path = Path(path)
     ending = path.suffix.lower().lstrip(".")
     read, kind, extra = _READERS.get(ending, _READERS["nii"])
-    voxels, matrix, origin, names = parsed(path, kind, read, extra)
+    voxels, matrix, origin, names, said, frame = parsed(path, kind, read, extra)
+    unit = units or said or "mm"
+    factor = UNITS[unit] / UNITS[said or "mm"]
+    if factor != 1.0:
+        matrix, origin = factor * matrix, factor * origin
     if voxels.ndim != 3:
         raise ValueError(
             f"{path} has the shape {voxels.shape}; give one label map in three "
@@ -78,7 +115,28 @@ def label_surface(
     size = " x ".join(f"{x * 1e3:.2g}" for x in np.linalg.norm(matrix, axis=0))
     called = ", ".join(f"{k} {names.get(k, '')}".strip() for k in chosen)
     taken = f"label {called} of {path.name}: {int(mask.sum()):,} voxels of {size} mm"
-    return vertices, faces.astype(np.int64), f"{taken}; unit and frame are the file's"
+    taken += f"; {_source(units, said)}" + ("" if frame else "; frame is the file's")
+    notes = (taken, frame) if frame else (taken,)
+    return Labelled(vertices, faces.astype(np.int64), notes, unit)
+
+
+def _source(given: str | None, said: str | None) -> str:
+    """Where the unit of a label map comes from."""
+    if given is None:
+        return f"unit {said}, as its header says" if said else "no unit named: mm taken"
+    return f"unit {given}, as given" + (f" (its header says {said})" if said else "")
+
+
+def _unit(names: Sequence[str]) -> str | None:
+    """Key of `UNITS` of what a header calls its units, or None if it names none."""
+    names = sorted({name.strip().lower() for name in names} - {"", "none", "???"})
+    found = [k for k, called in _UNITS.items() if set(names) <= set(called.split())]
+    if names and not found:
+        raise ValueError(
+            f"the unit of its coordinates is {' and '.join(names)}; save it in one of "
+            f"{', '.join(UNITS)}"
+        )
+    return found[0] if names else None
 
 
 def _require_few(shape: Sequence[int]) -> int:
@@ -131,21 +189,28 @@ def _grey(voxels: np.ndarray, values: np.ndarray) -> str:
     return ""
 
 
-def _nifti(path: Path):
-    """Voxels, matrix (3, 3) and origin (3,) to m in LPS, names of labels."""
+def _nifti(path: Path) -> _Voxels:
     import nibabel
 
     image: Any = nibabel.load(path)
-    unit = _NIFTI_UNITS.get(image.header.get_xyzt_units()[0], 1e-3)
-    affine = unit * to_lps("m", "RAS") @ image.affine[:3]
+    unit = _unit([image.header.get_xyzt_units()[0].replace("unknown", "")])
+    affine = UNITS[unit or "mm"] * to_lps("m", "RAS") @ image.affine[:3]
+    frame = ""
+    if not (image.header["sform_code"] or image.header["qform_code"]):
+        frame = (
+            "question: its header gives no orientation (sform and qform are 0), so its "
+            "axes are taken as left, front and head, as old files have them. If they "
+            "are others, the patient is turned or mirrored: set them and import again"
+        )
     _require_few(image.shape)
     voxels = np.asanyarray(image.dataobj)
     shape = voxels.shape[:3] + tuple(n for n in voxels.shape[3:] if n != 1)
-    return voxels.reshape(shape), affine[:, :3], affine[:, 3], {}
+    matrix, origin = affine[:, :3], affine[:, 3]
+    return _Voxels(voxels.reshape(shape), matrix, origin, {}, unit, frame)
 
 
-def _nrrd(path: Path):
-    """As `_nifti`; Slicer's files name their labels."""
+def _nrrd(path: Path) -> _Voxels:
+    """Slicer's files name their labels."""
     import nrrd
 
     header = nrrd.read_header(str(path))
@@ -161,9 +226,23 @@ def _nrrd(path: Path):
     count = _require_few(np.atleast_1d(header["sizes"]).tolist())
     _require_end(data, count, str(header.get("encoding")), data is not path)
     voxels, header = nrrd.read(str(path))
-    space = str(header.get("space", "LPS")).upper()
-    space = "".join(re.findall(r"\b\w", space)) if "-" in space else space
-    to = to_lps("mm", space)
+    space, frame = header.get("space"), ""
+    if space is None:
+        space = "LPS"
+        frame = (
+            "question: its header names no space, so its axes are taken as left, back "
+            "and head (LPS). If they are others, the patient is turned or mirrored: "
+            "set it and import again"
+        )
+    letters = str(space).upper()
+    letters = "".join(re.findall(r"\b\w", letters)) if "-" in letters else letters
+    if letters not in _SPACES:
+        raise ValueError(
+            f"its space is {bounds.shown(space)}; save it in one of "
+            f"{', '.join(_SPACES)} (such as left-posterior-superior)"
+        )
+    unit = _unit(np.atleast_1d(header.get("space units", [])).tolist())
+    to = np.diag(_SPACES[letters]) * UNITS[unit or "mm"]
     if "space directions" not in header:
         raise ValueError(
             "its header lacks 'space directions', the size and place of its voxels"
@@ -175,11 +254,10 @@ def _nrrd(path: Path):
         for key, value in header.items()
         if key.endswith("_LabelValue")
     }
-    return voxels, to @ rows.T, to @ origin, names
+    return _Voxels(voxels, to @ rows.T, to @ origin, names, unit, frame)
 
 
-def _meta(path: Path):
-    """As `_nifti`, of a MetaImage."""
+def _meta(path: Path) -> _Voxels:
     from vtkmodules import vtkIOImage
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -210,7 +288,8 @@ def _meta(path: Path):
         raise ValueError("it is damaged, or no MetaImage")
     data = vtk_to_numpy(image.GetPointData().GetScalars())
     voxels = data.reshape(image.GetDimensions()[::-1]).transpose()
-    return voxels, 1e-3 * turn.reshape(3, 3).T * spacing, 1e-3 * origin, {}
+    matrix = 1e-3 * turn.reshape(3, 3).T * spacing
+    return _Voxels(voxels, matrix, 1e-3 * origin, {})
 
 
 _READERS = {

@@ -20,6 +20,8 @@ SIZE = (12e-3, 2.0)  # m across: an intracranial segment, an aorta with arms and
 WIDTH = (1.0e-3, 35e-3)  # m, 95th percentile of radii: cerebral artery, aneurysm
 NO_WIDTH = (0.5e-3, 50e-3)  # m: beyond this a unit that is given is refused
 VOLUME = 2e-3  # m^3, most that is searched for ways, at 10^9 points per m^3
+RARE = {"inch": 0.035}  # units that scans have less often than others, and how often
+POOR = 1e-3  # likelihood under which even the only unit is asked for
 # What is scanned, to tell units apart: that radius and the size, m, the deviations of
 # their logarithms, and how often.
 SCANS = {
@@ -31,12 +33,14 @@ SCANS = {
     "abdominal aorta and iliacs": ((9.5e-3, 260e-3), (0.3, 0.35), 1.0),
     "whole aorta": ((12e-3, 550e-3), (0.2, 0.25), 1.0),
     "aneurysm of the aorta": ((22e-3, 260e-3), (0.35, 0.4), 0.4),
+    "a mouse's aorta": ((0.8e-3, 25e-3), (0.25, 0.35), 0.015),
 }
 # m, radius of a lumen that is imported as it is, and to which narrower ones are
 # enlarged, so that every length of the import suits them as an adult's aorta.
 WIDE, ENLARGED = 8e-3, 12e-3
 MOST = 4e-4  # m^3 that a lumen is enlarged to at most, for the time that it takes
 SURE = 0.95  # probability of a unit that is not asked for
+UNLIKELY = 0.003  # probability of a unit that is not named as another one
 _SAMPLES = 1000
 _VERTICES = 20_000  # of the surface between those samples, about, at most
 _WIDEST = 0.2  # of the size: balls begin with this radius
@@ -48,19 +52,21 @@ _MOST = 100  # times
 class Lumen(NamedTuple):
     """A closed surface (m, LPS), its file's unit, and what was guessed and mended.
 
-    `scale` is by how much it is enlarged while it is imported.
+    `scale` is by how much it is enlarged while it is imported, `frame` that of its
+    file, "LPS" or "RAS".
     """
 
     surface: Surface
     units: str
     notes: tuple[str, ...]
     scale: float
+    frame: str
 
 
 def read_lumen(
     path: str | Path,
     units: str | None = None,
-    frame: str = "LPS",
+    frame: str | None = None,
     axes: str | ArrayLike | None = None,
     labels: Sequence[int] = (),
     say: Callable[[str], None] = lambda text: None,
@@ -71,11 +77,17 @@ def read_lumen(
         FileNotFoundError: if there is no such file.
         ValueError: if it is no such surface; says how to mend it.
     """
-    to_lps("mm" if units is None else units, frame, axes)  # before anything is read
-    if str(path).lower().endswith(label_maps.LABEL_MAPS):
-        vertices, faces, why = label_maps.label_surface(path, labels)
-        units, vertices = "mm", vertices @ upright(axes).T
+    to_lps(units or "mm", frame or "LPS", axes)  # before anything is read
+    if str(path).lower().endswith(mesh.LABEL_MAPS):
+        vertices, faces, notes, units = label_maps.label_surface(path, labels, units)
+        frame, vertices = frame or "LPS", vertices @ upright(axes).T
         radius = typical_radius(vertices, faces)
+        if radius < WIDTH[0] or radius > WIDTH[1]:
+            doubt = (
+                f"question: the widest lumen is {2e3 * radius:.3g} mm wide when the "
+                f"unit is {units!r}: is it another one (--units)?"
+            )
+            notes = (*notes, doubt)
     else:
         if len(labels):
             raise ValueError(
@@ -83,15 +95,18 @@ def read_lumen(
             )
         vertices, faces = mesh.read_triangles(path)
         say(f"mesh: {len(faces):,} triangles read")
+        frame, said = _frame(path, frame)
         units, why, radius = guess_units(str(path), vertices, faces, units)
+        notes = (why, *said)
         vertices = vertices @ to_lps(units, frame, axes).T
-    say(f"note: {why}")
+    for note in notes:
+        say(f"note: {note}")
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not SIZE[0] <= size <= SIZE[1]:
         raise ValueError(
             f"{path} is {size:.3g} m across when its unit is {units!r}, which no "
-            f"vessel tree is (allowed {SIZE[0]:g} to {SIZE[1]:g} m). Check the unit in "
-            f"which the mesh was exported ({why})."
+            f"vessel tree is (allowed {SIZE[0]:g} to {SIZE[1]:g} m){_else(size, units)}"
+            f". Check the unit in which it was exported ({notes[0]})."
         )
     scale = enlargement(radius, Surface(vertices - vertices.mean(axis=0), faces).volume)
     with file_frame(to_lps(units, frame, axes), units, scale):
@@ -102,9 +117,36 @@ def read_lumen(
         raise ValueError(
             f"{path} holds {surface.volume * 1e3:.3g} litres when its unit is "
             f"{units!r}, which no lumen does (at most {VOLUME * 1e3:g}). Check the "
-            f"unit in which the mesh was exported ({why})."
+            f"unit in which the mesh was exported ({notes[0]})."
         )
-    return Lumen(surface, units, (why, *changed), scale)
+    return Lumen(surface, units, (*notes, *changed), scale, frame)
+
+
+def _else(size: float, units: str) -> str:
+    """Units to pass for a size, m, that is none in the unit `units`."""
+    sizes = {unit: size / UNITS[units] * factor for unit, factor in UNITS.items()}
+    fits = [
+        f"{size:.3g} m across when it is {unit!r} (--units {unit})"
+        for unit, size in sizes.items()
+        if SIZE[0] <= size <= SIZE[1] and unit not in RARE
+    ]
+    return f"; it is {' or '.join(fits)}" if fits else ""
+
+
+def _frame(path: str | Path, given: str | None) -> tuple[str, list[str]]:
+    """Frame of a surface, "LPS" or "RAS", and a note if its file says which.
+
+    ValueError if another one is given.
+    """
+    said = mesh.stated_frame(path)
+    if said is None:
+        return given or "LPS", []
+    if given not in (None, said):
+        raise ValueError(
+            f"frame is {given!r}, but the header of {path} says SPACE={said}; leave "
+            f"the frame out or give {said!r} (--frame {said})."
+        )
+    return said, [f"frame: {said}, as the file says"]
 
 
 def enlargement(radius: float, volume: float) -> float:
@@ -125,23 +167,27 @@ def guess_units(
     """
     found = typical_radius(vertices, faces), np.linalg.norm(np.ptp(vertices, axis=0))
     scaled = {unit: scale * np.array(found) for unit, scale in UNITS.items()}
-    limits = np.transpose((WIDTH, SIZE))
+    usual = [unit for unit, x in scaled.items() if _within(x, WIDTH)]
     odds = {
-        unit: _likelihood(x)
+        unit: RARE.get(unit, 1.0) * _likelihood(x)
         for unit, x in scaled.items()
-        if (limits[0] <= x).all() and (x <= limits[1]).all()
+        if _within(x, NO_WIDTH)
     }
+    total = max(sum(odds.values()), 1e-30)
+    likely = [unit for unit in odds if odds[unit] > UNLIKELY * total]
     makes = {
         unit: f"the widest lumen {2e3 * radius:.3g} mm wide and the scan "
         f"{1e3 * size:.4g} mm across"
         for unit, (radius, size) in scaled.items()
     }
+    best = max(odds, key=lambda unit: odds[unit], default="")
+    fits = [unit for unit in usual if unit in likely] or usual or likely
     better = (
-        f"pass units={' or '.join(map(repr, odds))}" if odds else "check the export"
+        f"pass units={' or '.join(map(repr, fits))}" if fits else "check the export"
     )
     if np.isnan(found[0]):
         raise ValueError(f"{name} is no tube: too few walls face others; {better}.")
-    if units in odds:
+    if units in usual:
         return units, f"unit: {units}, as given", float(scaled[units][0])
     if units is not None:
         why = (
@@ -154,16 +200,32 @@ def guess_units(
         return units, why, float(scaled[units][0])
     if not odds:
         listed = "; ".join(f"{unit} makes {text}" for unit, text in makes.items())
-        raise ValueError(f"{name} has the size of a vessel tree in no unit: {listed}.")
-    best = max(odds, key=lambda unit: odds[unit])
-    sure = odds[best] / sum(odds.values())
+        raise ValueError(
+            f"{name} has the size of a vessel tree in no unit: {listed}. The widest "
+            f"lumen must be {2e3 * NO_WIDTH[0]:g} to {2e3 * NO_WIDTH[1]:g} mm wide and "
+            f"the scan {1e3 * SIZE[0]:g} mm to {SIZE[1]:g} m across: scale it."
+        )
+    sure = odds[best] / total
+    listed = "; ".join(f"{unit} makes {makes[unit]}" for unit in likely)
+    ask = " or ".join(map(repr, likely))
+    if odds[best] < POOR:
+        raise ValueError(
+            f"{name} fits no usual scan in any unit: {listed}; if that is right, pass "
+            f"units={ask} (--units)."
+        )
     if sure < SURE:
-        listed = "; ".join(f"{unit} makes {makes[unit]}" for unit in odds)
-        raise ValueError(f"{name} may be in several units: {listed}; {better}.")
+        raise ValueError(
+            f"{name} may be in several units: {listed}; pass units={ask} (--units)."
+        )
     said = f"unit guessed: {best}, which makes {makes[best]}"
-    others = " or ".join(repr(unit) for unit in odds if unit != best)
+    others = " or ".join(repr(unit) for unit in likely if unit != best)
     doubt = f" ({sure:.0%} sure; else pass units={others})" if sure < 0.995 else ""
     return best, said + doubt, float(scaled[best][0])
+
+
+def _within(seen: np.ndarray, width: tuple[float, float]) -> bool:
+    """Whether a radius and a size (2,) m are those of a lumen, by limits of radii."""
+    return width[0] <= seen[0] <= width[1] and SIZE[0] <= seen[1] <= SIZE[1]
 
 
 def _likelihood(seen: np.ndarray) -> float:

@@ -11,14 +11,29 @@ import numpy as np
 from cathsim_dmc import extras
 from cathsim_dmc.anatomy.scan import vtk_files
 
+LABEL_MAPS = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
+# What to do with files of other kinds.
+_OTHERS = {
+    "gz": "unpack it first",
+    "zip": "unpack it first",
+    "dcm": "that is an image: segment its lumen first (3D Slicer, TotalSegmentator)",
+    "vtu": "extract its surface first (ParaView: Extract Surface)",
+}
 # Endings, and the least bytes that a triangle takes where no header counts them.
 FORMATS = {"obj": 35, "stl": 50, "ply": 12, "vtp": 12, "vtk": 12}
 _STL_TEXT = 100  # seven lines
+_COMMENTS = 4096  # bytes at the start of a file in which it may say its frame
 MOST = 4_000_000  # triangles; reading more takes gigabytes
 
 
 def parsed(path: Path, kind: str, read: Callable[[Path], Any], extra: str) -> Any:
     """What a function reads from a file; errors say what to do, in one line."""
+    if path.is_dir():
+        raise ValueError(
+            f"{path} is a directory; give one file: a lumen's surface (STL, OBJ, PLY, "
+            "VTP or VTK) or a label map (NIfTI, NRRD, MHA), which 3D Slicer makes of "
+            "a series of DICOM images."
+        )
     if not path.is_file():
         raise FileNotFoundError(
             f"no mesh file {path}; give a lumen's surface (STL, OBJ, PLY, VTP or VTK), "
@@ -49,10 +64,12 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """
     path = Path(path)
     kind = path.suffix.lower().lstrip(".")
-    if kind not in FORMATS:
+    if kind not in FORMATS and not path.is_dir():
+        hint = _OTHERS.get(kind, "convert it (3D Slicer, MeshLab, ParaView)")
         raise ValueError(
             f"{path} has the ending {path.suffix!r}; give a mesh in one of the formats "
-            f"{', '.join(FORMATS)}."
+            f"{', '.join(FORMATS)}, or a label map in one of "
+            f"{', '.join(ending[1:] for ending in LABEL_MAPS)}: {hint}."
         )
     count = parsed(path, kind, _announced, "")
     if count > MOST:
@@ -61,6 +78,7 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
             f"{MOST / 1e6:g} million are read. Decimate it before export (3D Slicer: "
             "Surface Toolbox, Decimate)."
         )
+    parsed(path, kind, _require_end, "")
     read = vtk_files.triangles if kind in ("vtp", "vtk") else _read_mesh
     vertices, faces = parsed(path, kind, read, "vtp")
     if len(faces) < 4:
@@ -77,6 +95,79 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces
 
 
+def stated_frame(path: str | Path) -> str | None:
+    """Frame that a mesh file names, as those of 3D Slicer do: "LPS", "RAS" or None."""
+    path = Path(path)
+    kind = path.suffix.lower().lstrip(".")
+    with path.open("rb") as stream:
+        head = stream.read(-1 if kind == "vtp" else _COMMENTS)
+    if kind == "vtp":
+        named = b'"SPACE"' in head
+        said = parsed(path, kind, vtk_files.space, "vtp") if named else ""
+    else:
+        said = head[:80] if kind == "stl" else head.partition(b"end_header")[0]
+        lines = said.decode("latin-1").splitlines()
+        # A comment of OBJ or PLY, the title of VTK's old files.
+        starts = {"obj": "#", "ply": "comment", "vtk": "", "stl": ""}[kind]
+        lines = lines[1:2] if kind == "vtk" else lines
+        said = "\n".join(line for line in lines if line.startswith(starts))
+    found = re.search(r"(?i)\bSPACE=(LPS|RAS)\b", said)
+    return found[1].upper() if found else None
+
+
+def _require_end(path: Path) -> None:
+    """ValueError if a file of text is cut off."""
+    kind = path.suffix.lower().lstrip(".")
+    with path.open("rb") as stream:
+        head = stream.read(_COMMENTS)
+    if kind == "obj":
+        _require_obj_end(path.read_bytes())
+    elif kind == "ply" and re.search(rb"(?m)^format ascii", head):
+        _require_ply_end(path.read_bytes())
+
+
+def _require_obj_end(data: bytes) -> None:
+    last = data[data.rfind(b"\n") + 1 :]
+    if last.startswith(b"#") or not last.strip(b"\r\0 "):
+        return
+    # Some programs leave the end of the last line out; their triangles use all points.
+    rows = re.findall(rb"(?m)^f[ \t]+(.*)$", data)
+    used = {corner.split(b"/")[0] for row in rows for corner in row.split()}
+    points = len(re.findall(rb"(?m)^v[ \t]", data))
+    relative = any(corner.startswith(b"-") for corner in used)  # to the last point
+    if len(used) < points and not relative:
+        raise ValueError(
+            f"it ends early, in {last[:40].decode('latin-1')!r}: of {points:,} points "
+            f"{points - len(used):,} belong to no triangle"
+        )
+
+
+def _require_ply_end(data: bytes) -> None:
+    header, _, body = data.partition(b"end_header")
+    counts = re.findall(rb"(?m)^element (\w+) (\d+)", header)
+    whole = sum(int(count) for _, count in counts)
+    rows = [row.split() for row in body.splitlines() if row.strip()]
+    held = len(rows)
+    faces = header.rpartition(b"element ")[2]  # the last element, mostly these
+    last = re.match(rb"face \d+\s+property list", faces)
+    if rows and last and len(rows[-1]) <= int(rows[-1][0]):
+        held -= 1  # its last row lacks a corner
+    if held < whole:
+        raise ValueError(
+            f"it ends early, after {held:,} of {whole:,} points and triangles"
+        )
+
+
+def _require_stl_end(path: Path) -> None:
+    with path.open("rb") as stream:
+        stream.seek(max(path.stat().st_size - _COMMENTS, 0))
+        last = stream.read().strip(b"\0 \r\n\t").splitlines()[-1].strip()
+    if not last.lower().startswith(b"endsolid"):
+        raise ValueError(
+            f"it ends early, without 'endsolid', in {last[:40].decode('latin-1')!r}"
+        )
+
+
 def _announced(path: Path) -> int:
     """Triangles that a file announces, or the most its size leaves room for."""
     kind = path.suffix.lower().lstrip(".")
@@ -91,12 +182,20 @@ def _announced(path: Path) -> int:
     size = path.stat().st_size
     if kind != "stl":
         return size // FORMATS[kind]
-    if head.lstrip().startswith(b"solid") and b"\0" not in head:
-        return size // _STL_TEXT
     whole, held = int.from_bytes(head[80:84], "little"), max(size - 84, 0) // 50
+    if size == 84 + 50 * whole:
+        return whole
+    if re.match(rb"(?i)\W*solid", head) and b"\0" not in head:
+        _require_stl_end(path)
+        return size // _STL_TEXT
     if b"\0" in head and held < whole <= MOST:
         raise ValueError(f"it ends early, after {held:,} of {whole:,} triangles")
-    return held
+    if held > MOST:
+        return held
+    raise ValueError(
+        f"its content is no STL (it begins with {head[:20].decode('latin-1')!r}, and "
+        "is not as long as a binary one says); name it after its format"
+    )
 
 
 def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:

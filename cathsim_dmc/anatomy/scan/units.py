@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from cathsim_dmc import bounds
 
-UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6}  # metres per unit
+# Metres per unit.
+UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6, "inch": 25.4e-3}
 _SYSTEMS = {"LPS": 1.0, "RAS": -1.0}
 _AXES = dict(zip("LPSRAI", np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
 # Frame in which places are shown: matrix (3, 3) from there to m, LPS, its unit, and by

@@ -53,6 +53,12 @@ def triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return points, corners.astype(np.int64).reshape(-1, 3)
 
 
+def space(path: Path) -> str:
+    """What a file says of its frame, as 3D Slicer's do: "SPACE=RAS", or nothing."""
+    said = _poly_data(path).GetFieldData().GetAbstractArray("SPACE")
+    return f"SPACE={said.GetVariantValue(0).ToString()}" if said else ""
+
+
 def lines(path: Path) -> list[np.ndarray]:
     """Lines (n_i, 3), as of VMTK's centrelines: one for each way that it computed.
 
