@@ -140,7 +140,7 @@ def test_label_maps_of_itk_lie_where_they_were_saved(tmp_path, kind):
     else:
         pytest.importorskip("vtkmodules")
         path = meta(tmp_path / "map.mha", ball(), packed="packed" in kind)
-    vertices, faces, why = label_surface(path)
+    vertices, faces, (why,), _ = label_surface(path)
     middle = 1e-3 * (ORIGIN + (np.array((16, 11, 10)) * SPACING) @ TURN)
     np.testing.assert_allclose(vertices.mean(axis=0), middle, atol=0.1e-3)
     assert np.linalg.norm(vertices - middle, axis=1).max() < 7e-3
@@ -183,4 +183,4 @@ def test_images_are_told_from_label_maps(tmp_path, image, words):
     labels[:, :12] = np.where(labels[:, :12], 120, 0)
     labels[2:20:3] = 7
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), path)
-    assert "label 300" in label_surface(path, (300,))[2]
+    assert "label 300" in label_surface(path, (300,)).notes[0]

@@ -124,7 +124,7 @@ def test_two_likely_units_are_asked_for_with_their_sizes(y_mesh):
     said = str(error.value)
     assert re.search(r"mm makes the widest lumen 4\.\S* mm wide .* 4\d\.\S* mm", said)
     assert re.search(r"cm makes the widest lumen 4\d\.\S* mm wide .* 4\d\d", said)
-    assert said.endswith("pass units='mm' or 'cm'.")
+    assert said.endswith("pass units='mm' or 'cm' (--units).")
     assert guess_units("siphon", vertices * 0.4, faces, "cm")[0] == "cm"
 
 
@@ -167,7 +167,7 @@ def test_a_given_unit_is_taken_and_the_one_that_fits_is_named(y_mesh, tmp_path):
     with pytest.raises(ValueError, match="pass units='cm'"):
         read_lumen(path, units="m")
     with pytest.raises(ValueError, match="one of mm, cm, m"):
-        read_lumen(path, units="inch")
+        read_lumen(path, units="ft")
 
 
 def test_far_too_many_triangles_are_refused_unread(tmp_path, monkeypatch):
