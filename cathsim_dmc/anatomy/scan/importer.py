@@ -119,7 +119,8 @@ def import_scan(
     told = _Told([] if notes is None else notes, progress or (lambda text: None))
     given, changes = _checked(inlet, heart, rename, device)
     # Refused before the long steps; read again when the unit is known.
-    read_curves(centreline_paths, units or "mm", mesh_frame or "LPS", axes)
+    first = "LPS" if mesh_frame is None else mesh_frame
+    read_curves(centreline_paths, units or "mm", first, axes)
     lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, told.say)
     told.notes.extend(lumen.notes)
     frame = FileFrame(lumen.units, to_lps(lumen.units, lumen.frame, axes))

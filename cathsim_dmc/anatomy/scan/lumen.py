@@ -77,7 +77,8 @@ def read_lumen(
         FileNotFoundError: if there is no such file.
         ValueError: if it is no such surface; says how to mend it.
     """
-    to_lps(units or "mm", frame or "LPS", axes)  # before anything is read
+    # Before anything is read:
+    to_lps("mm" if units is None else units, "LPS" if frame is None else frame, axes)
     if str(path).lower().endswith(mesh.LABEL_MAPS):
         vertices, faces, notes, units = label_maps.label_surface(path, labels, units)
         frame, vertices = frame or "LPS", vertices @ upright(axes).T
