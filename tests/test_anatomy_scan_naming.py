@@ -245,6 +245,13 @@ def test_a_carotid_artery_with_a_bypass_to_the_arm_is_asked_for(bend, fork, stub
     assert fork == 55 or "bypass, that leaves the arch" in notes
 
 
+def test_a_wide_vertebral_artery_is_named_beside_a_left_carotid_of_its_own(bend):
+    """A bypass from the LCCA is thought of only where no LCCA leaves the arch."""
+    way = [(45, 0, 55), (95, 0, 60)]
+    wide = (5.0, (3.1, [*way, (170, 0, 62)]), (2.9, [*way, (96, 0, 140)]))
+    assert named(bend, BCA, LCCA, wide)[0] == ["bca", "lcca", "lsa", "lva"]
+
+
 def test_an_arm_that_parts_at_once_from_a_carotid_artery_is_no_vertebral(bend):
     arm = (4.2, [(0, 0, 50), (20, 0, 58), (75, 0, 70)])
     names, notes = named(bend, BCA, (5.0, (3.6, [(0, 0, 50), (5, 0, 150)]), arm), STUB)

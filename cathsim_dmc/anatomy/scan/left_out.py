@@ -12,7 +12,7 @@ from cathsim_dmc.anatomy.scan.ways import CELL, Ways, in_reach
 
 REACH = (1.2, 1e-3)  # radii and m from a centreline, up to which lumen is its vessel's
 THIN = 10e-3  # m, least length of a vessel too thin for the device that is told
-SHORT = 2.0  # of its width: a vessel or an aneurysm that is no longer has no length
+SHORT = 2.0  # of its width: what is no longer is a stub, or an aneurysm
 WIDE = 98.0  # percentile of the depths of a vessel that is its radius
 
 
@@ -84,14 +84,22 @@ def said(
     found = [one for one in found if one.width > 2.0 * radius or one.length > THIN]
     if not found:
         return None
-    texts = []
-    for one in found:
-        why = "too short" if one.length < BRANCH else "narrow on the way to it"
-        why = "short for its width" if one.length < SHORT * one.width else why
-        why = "too thin" if one.width <= 2.0 * (radius + CELL) else why
-        text = f"{shown(one.position)}, {mm(one.width):.1f} mm wide, "
-        text += f"{mm(one.length):.0f} mm long"
-        texts.append(text if drawn else f"{text} ({why})")
+    # Of those that are hardly longer than wide, as bulges are, the longest is told.
+    short = [one for one in found if one.length < SHORT * one.width]
+    long = [one for one in found if one.length >= SHORT * one.width]
+    texts = [_told(one, radius, drawn) for one in long]
+    if short:
+        count = "stub" if len(short) == 1 else f"{len(short)} stubs, the longest"
+        texts.append(f"{count} at {_told(short[0], radius, True)}")
     count = "a vessel is" if len(found) == 1 else f"{len(found)} vessels are"
     where = "of the drawn centrelines" if drawn else f"for the {device}"
     return f"{count} left out {where}: {'; '.join(texts)}"
+
+
+def _told(one: LeftOut, radius: float, plain: bool) -> str:
+    """Place and size of a vessel, and unless `plain`, why a device's tree lacks it."""
+    text = f"{shown(one.position)}, {mm(one.width):.1f} mm wide, "
+    text += f"{mm(one.length):.0f} mm long"
+    why = "too short" if one.length < BRANCH else "narrow on the way to it"
+    why = "too thin" if one.width <= 2.0 * (radius + CELL) else why
+    return text if plain else f"{text} ({why})"
