@@ -40,7 +40,8 @@ def left_out(ways: Ways, tree: VesselTree) -> list[LeftOut]:
         for one, way in more:
             found.append(one)
             reach = REACH[0] * (ways.depth[way] + CELL) + REACH[1]
-            taken |= in_reach(ways.points, ways.points[way], reach)
+            free = np.flatnonzero(~taken)
+            taken[free] = in_reach(ways.points[free], ways.points[way], reach)
     return sorted(found, key=lambda one: -one.length)
 
 
