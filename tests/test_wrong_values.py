@@ -39,7 +39,7 @@ def test_an_environment_may_have_no_time_limit():
     [
         {"reward": {"distance": 1e308}},
         {"reward": {"distance": -1e16}},
-        {"goal_radius": 1e308},
+        {"reward": {"success": 1e308}},
     ],
 )
 def test_numbers_beyond_all_quantities_are_refused(options):

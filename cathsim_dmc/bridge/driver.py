@@ -241,9 +241,16 @@ class Driver:
     ) -> Driven:
         if not told:
             self._stop(end)
-        figures = milliseconds(run.times), milliseconds(run.gaps)
-        counts = len(run.times), run.skipped, run.late, run.force
-        return Driven(end, reason, *counts, *figures)
+        return Driven(
+            end,
+            reason,
+            steps=len(run.times),
+            skipped=run.skipped,
+            late=run.late,
+            force=run.force,
+            compute=milliseconds(run.times),
+            period=milliseconds(run.gaps),
+        )
 
     def _observation(self, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
         if missing := sorted(self._table.keys() - given.keys()):

@@ -107,7 +107,7 @@ def _blind_end(
         path = ways.trace(back, tip)
         shared = [common(path[:, None], way[:, None]) for way in traces]
         at = max(shared, default=1) - 1
-        place, wide = ways.points[path[at]], ways.depth[path[at]]
+        place, wide = ways.points[path[at]], float(ways.depth[path[at]])
         away = np.linalg.norm(ways.points[path[at:]] - ways.points[tip], axis=1)
         if wide < widest or away[0] < BLIND * wide:
             continue
@@ -124,7 +124,7 @@ def _blind_end(
             continue
         before = ways.deepest_from(int(tip))
         if any(_joined(ways, before, end, wide) for end in ends):
-            return FreeEnd(ways.points[tip], float(wide), float(wide))
+            return FreeEnd(ways.points[tip], wide, wide)
     return None
 
 
