@@ -216,6 +216,8 @@ def test_every_setting_is_a_typed_option(cathsim, tmp_path):
     code, out, err = cathsim("train", "--out", tmp_path, "--resume", "--frames", 128)
     assert code == 0, err
     assert Checkpoint.open(tmp_path).config == config.replace(total_frames=128)
+    code, _, err = cathsim("train", "--out", tmp_path, "--resume", "--frames", 64)
+    assert code == 0 and "128 frames are done, and 64 are asked for" in err
     code, _, err = cathsim("train", "--out", tmp_path, "--resume", "--clip", 0.3)
     assert code == 2 and "clip: it has 0.1, given is 0.3" in err
 
