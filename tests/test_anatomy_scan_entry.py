@@ -8,7 +8,8 @@ from synthetic_scans import marched, write_markup, write_obj, y_tree
 
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.scan import importer
-from cathsim_dmc.anatomy.scan.extract import free_ends, plan_inlet, trunk
+from cathsim_dmc.anatomy.scan.ends import free_ends
+from cathsim_dmc.anatomy.scan.extract import plan_inlet, trunk
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.left_out import left_out
 from cathsim_dmc.anatomy.scan.places import opened_at_inlet, place_goals

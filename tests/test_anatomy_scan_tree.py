@@ -19,7 +19,7 @@ from cathsim_dmc.anatomy.parts import Goal, Surface
 from cathsim_dmc.anatomy.reach import unreachable
 from cathsim_dmc.anatomy.scan.aorta import unproven
 from cathsim_dmc.anatomy.scan.check import check_tree
-from cathsim_dmc.anatomy.scan.extract import free_ends
+from cathsim_dmc.anatomy.scan.ends import free_ends
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.places import place_goals
 from cathsim_dmc.anatomy.scan.tree import grow_tree

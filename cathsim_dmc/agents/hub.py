@@ -43,9 +43,9 @@ def parse(text: str, pinned: bool = True) -> Reference:
     """A reference; ValueError for another form, or where no commit is pinned."""
     found = _FORM.fullmatch(text)
     if found is None:
-        form = "hf:OWNER/NAME@COMMIT, with 40 hexadecimal digits," if pinned else (
-            "hf:OWNER/NAME, without a commit, which the upload makes,"
-        )  # fmt: skip
+        form = "hf:OWNER/NAME, without a commit, which the upload makes,"
+        if pinned:
+            form = "hf:OWNER/NAME@COMMIT, with 40 hexadecimal digits,"
         raise ValueError(
             f"{text} is no place on the hub; give {form} and #POLICY where the "
             "repository holds several"

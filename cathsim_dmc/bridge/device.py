@@ -146,6 +146,7 @@ class ServeOptions:
             bounds.number("force_limit", self.force_limit, unit="N", positive=True)
 
 
+@signals.raised()
 def serve(
     device: Device,
     listener: socket.socket,
@@ -170,19 +171,8 @@ def serve(
         "missed", "late", "force" (largest, N), and percentiles of "answer" (from a
         state to its action) and "tick" (by how much a period begins late), ms.
     """
-    with signals.raised():
-        return _serve(device, listener, options, episodes, log or Log(None), say)
-
-
-def _serve(
-    device: Device,
-    listener: socket.socket,
-    options: ServeOptions | None,
-    episodes: int | None,
-    log: Log,
-    say: Callable[[str], None],
-) -> list[dict[str, Any]]:
     done: list[dict[str, Any]] = []
+    log = log or Log(None)
     while episodes is None or len(done) < episodes:
         listener.settimeout(_SLICE)
         try:

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from cathsim_dmc.anatomy.centreline import VesselTree, arc_lengths
 from cathsim_dmc.anatomy.scan.centring import resample, tangents
-from cathsim_dmc.anatomy.scan.extract import FreeEnd
+from cathsim_dmc.anatomy.scan.ends import FreeEnd
 from cathsim_dmc.anatomy.scan.units import mm, shown
 from cathsim_dmc.anatomy.scan.ways import Ways
 

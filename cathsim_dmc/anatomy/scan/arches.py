@@ -9,7 +9,8 @@ from scipy.spatial.distance import cdist
 
 from cathsim_dmc.anatomy.scan import aorta, extract, naming
 from cathsim_dmc.anatomy.scan.aorta import Bend
-from cathsim_dmc.anatomy.scan.extract import FreeEnd, LumenEntry, listed
+from cathsim_dmc.anatomy.scan.ends import FreeEnd, stump
+from cathsim_dmc.anatomy.scan.extract import LumenEntry, listed
 from cathsim_dmc.anatomy.scan.naming import SURE, Naming
 from cathsim_dmc.anatomy.scan.offshoots import (
     Offshoot,
@@ -47,7 +48,7 @@ class Arch:
         if it is near no end of an aorta.
         """
         (pair, why), cut = aorta.find_aorta(ways, ends), None
-        if pair is None and (cut := extract.stump(ways, ends)) is not None:
+        if pair is None and (cut := stump(ways, ends)) is not None:
             ends = [*ends, cut]
             pair, why = aorta.find_aorta(ways, ends, aorta.TURN_OF_STUMP)
         if pair is None:

@@ -19,6 +19,7 @@ from cathsim_dmc.anatomy.scan.aorta import bend_of, unproven
 from cathsim_dmc.anatomy.scan.arches import Arch
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.curves import inside_part, read_curves
+from cathsim_dmc.anatomy.scan.ends import free_ends
 from cathsim_dmc.anatomy.scan.extract import listed
 from cathsim_dmc.anatomy.scan.left_out import left_out, said
 from cathsim_dmc.anatomy.scan.lumen import Lumen, read_lumen
@@ -264,7 +265,7 @@ class _Growth:
         self._certain = wishes.axes is not None and "heart" in places
         self.device, self._given = wishes.device or USUAL, wishes.device is not None
         self._ways = Ways(field, scale * self.device.outer_radius)
-        self._ends = extract.free_ends(self._ways)
+        self._ends = free_ends(self._ways)
 
     def tree(self, curves) -> tuple[VesselTree, bool, bool]:
         """The tree of drawn curves, or of computed ones if there are none.

@@ -12,7 +12,7 @@ from cathsim_dmc.anatomy.scan.ways import CELL, Ways, in_reach
 
 REACH = (1.2, 1e-3)  # radii and m from a centreline, up to which lumen is its vessel's
 THIN = 10e-3  # m, least length of a vessel too thin for the device that is told
-SHORT = 2.0  # of its width: what is no longer is a stub, or an aneurysm
+SHORT = 2.0  # of its width: least length of what is neither a stub nor an aneurysm
 WIDE = 98.0  # percentile of the depths of a vessel that is its radius
 
 

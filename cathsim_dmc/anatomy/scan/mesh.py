@@ -22,7 +22,7 @@ _OTHERS = {
 # Endings, and the least bytes that a triangle takes where no header counts them.
 FORMATS = {"obj": 35, "stl": 50, "ply": 12, "vtp": 12, "vtk": 12}
 _STL_TEXT = 100  # seven lines
-_COMMENTS = 4096  # bytes at the start of a file in which it may say its frame
+_COMMENTS = 4096  # bytes at the start of a file with its frame, or at its end
 MOST = 4_000_000  # triangles; reading more takes gigabytes
 
 
@@ -121,15 +121,23 @@ def _require_end(path: Path) -> None:
     with path.open("rb") as stream:
         head = stream.read(_COMMENTS)
     if kind == "obj":
-        _require_obj_end(path.read_bytes())
+        _require_obj_end(path)
     elif kind == "ply" and re.search(rb"(?m)^format ascii", head):
         _require_ply_end(path.read_bytes())
 
 
-def _require_obj_end(data: bytes) -> None:
-    last = data[data.rfind(b"\n") + 1 :]
+def _tail(path: Path) -> bytes:
+    """The last bytes of a file."""
+    with path.open("rb") as stream:
+        stream.seek(max(path.stat().st_size - _COMMENTS, 0))
+        return stream.read()
+
+
+def _require_obj_end(path: Path) -> None:
+    last = _tail(path).rpartition(b"\n")[2]
     if last.startswith(b"#") or not last.strip(b"\r\0 "):
         return
+    data = path.read_bytes()
     # Some programs leave the end of the last line out; their triangles use all points.
     rows = re.findall(rb"(?m)^f[ \t]+(.*)$", data)
     used = {corner.split(b"/")[0] for row in rows for corner in row.split()}
@@ -159,9 +167,7 @@ def _require_ply_end(data: bytes) -> None:
 
 
 def _require_stl_end(path: Path) -> None:
-    with path.open("rb") as stream:
-        stream.seek(max(path.stat().st_size - _COMMENTS, 0))
-        last = stream.read().strip(b"\0 \r\n\t").splitlines()[-1].strip()
+    last = _tail(path).strip(b"\0 \r\n\t").splitlines()[-1].strip()
     if not last.lower().startswith(b"endsolid"):
         raise ValueError(
             f"it ends early, without 'endsolid', in {last[:40].decode('latin-1')!r}"

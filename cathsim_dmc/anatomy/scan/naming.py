@@ -132,8 +132,7 @@ def name_branches(
     for label, one in forked:
         own = " and ".join(sorted(names[i] for i in one.curves))
         called = TRUNKS.get(label, label)
-        mixed = offshoots.MIXED.get(label)
-        if mixed and mixed not in others:
+        if mixed := offshoots.mixed(label, others):
             called = f"{label}, or trunk of {label} and {mixed}, or one with a bypass,"
         notes.append(
             f"question: the {called} that leaves the arch at {shown(one.place)} leads "

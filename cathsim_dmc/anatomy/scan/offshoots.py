@@ -217,6 +217,12 @@ def _stubs(ways, bend, depth, curves, aorta) -> Iterator[Offshoot]:
             yield Offshoot(points[low], 1e-3 * at[low], calibre, (), None, ())
 
 
+def mixed(label: str, others: Collection[str]) -> str | None:
+    """What a branch may also lead to, if none of the others of its arch is that."""
+    other = MIXED.get(label)
+    return None if other in others else other
+
+
 def leads(
     ways: Ways,
     bend: Bend,
@@ -233,8 +239,7 @@ def leads(
     `heart_last` whether its last point is at the heart.
     """
     label, sure = called
-    mixed = MIXED.get(label)
-    doubt = None if mixed in others else mixed
+    doubt = mixed(label, others)
     single = label == "rcca" or label == "lcca" and (one.fork or 0.0) >= AT_ONCE
     kept = without_twins(one.rows) if label in LEADS or single else [0]
     rows, numbers = [one.rows[k] for k in kept], [one.curves[k] for k in kept]

@@ -245,16 +245,8 @@ def overlap(
 
     Faces (F, 3) are labelled (F,) by their parts.
     """
-    import igl
-
-    middles = vertices[faces].mean(axis=1)
-    for part in chosen:
-        own = np.ascontiguousarray(faces[label == part])
-        within = np.abs(igl.fast_winding_number(vertices, own, middles)) > 0.5
-        shares = [within[label == other].mean() for other in chosen if other != part]
-        if any(0.0 < share < 1.0 for share in shares):
-            return True
-    return False
+    shares = (inside(vertices, faces, label, int(one))[chosen] for one in chosen)
+    return any(bool(((share > 0.0) & (share < 1.0)).any()) for share in shares)
 
 
 def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
