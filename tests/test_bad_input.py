@@ -216,7 +216,7 @@ SAC = CRITIC | {
 }
 SCAN = {
     "units": word(optional=True),
-    "mesh_frame": word(),
+    "mesh_frame": word(optional=True),
     "axes": word(optional=True),
     "inlet": st.one_of(word(optional=True), st.tuples(number(), st.just(0.0))),
     "rename": st.sampled_from([1, "x", ["a"], {"a": 1}, {1: "a"}]),
