@@ -34,6 +34,7 @@ TASK = {
     "sheath_clearance": number(0.1e-3, 2e-3, optional=True),
     "working_length": number(0.02, 3, optional=True),
     "physics_timestep": number(4e-5, 0.005),
+    "solver_tolerance": number(1e-12, 1e-4),
     "outside_range": flag(),
     "fluoroscopy": options() | NONE,
     "endoluminal_size": pixels(),

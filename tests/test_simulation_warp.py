@@ -116,6 +116,7 @@ def test_other_scenes_follow_the_batch(task, options):
     [
         ("type1_lcca_pair", {}, "coaxial devices"),
         ("type1_lcca", {"vessel": "living"}, "living vessel"),
+        ("type1_lcca", {"solver_tolerance": 1e-8}, "solver_tolerance"),
     ],
 )
 def test_what_is_not_simulated_is_refused_by_name(task, options, named):

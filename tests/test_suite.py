@@ -253,6 +253,14 @@ def test_a_step_keeps_the_axis_of_the_buffer(shared_environment):
             assert value.shape == spec[name].shape
 
 
+def test_the_solver_has_the_tolerance_of_the_task_in_both_paths():
+    task = suite.make_task("type1_bca", solver_tolerance=3e-8)
+    batch = BatchSimulation(task, 1)
+    environment = suite.environment(twin(task, 0))
+    assert batch.batch.model.opt.tolerance == 3e-8
+    assert environment.physics.model.opt.tolerance == 3e-8
+
+
 def test_environment_kwargs_reach_composer():
     environment = suite.load(
         "cathsim", "simple1_bca", environment_kwargs={"time_limit": 0.1}

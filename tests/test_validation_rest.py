@@ -53,6 +53,14 @@ def test_what_swung_at_rest_stands_still(device, anatomy, depth):
     assert all(check.passed for check in one.checks(device)), one
 
 
+@pytest.mark.slow
+def test_with_a_stricter_tolerance_of_the_solver_it_stands_still():
+    options = {**rest.DEVICES["wire_014_micro"], "solver_tolerance": rest.EXACT}
+    one = rest.compared(options, ("type1",), (0.11,))
+    assert all(check.passed for check in one.checks("wire_014_micro")), one
+    assert one.wobble < 1e-3
+
+
 def test_the_checks_of_rest_see_a_swing():
     swing = 1e-3 * np.sin(np.arange(200.0))[:, None, None] * np.eye(3)[:1]
     one = rest.Rest(swing, 1.0 + 50 * swing[..., 0])

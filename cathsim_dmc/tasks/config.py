@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc import bounds
+from cathsim_dmc.entities.arena import SOLVER_TOLERANCE
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.entities.device import Device
@@ -38,6 +39,7 @@ _NUMBERS = {
     "shaft_link": (2e-3, 0.1, "m"),
     "working_length": (*WORKING_LENGTHS, "m"),
     "sheath_clearance": (0.1e-3, 2e-3, "m"),
+    "solver_tolerance": (1e-12, 1e-4, ""),
 }
 # Range in which the physics holds (docs/physics.md); the library stays within it.
 _LONGEST_TIMESTEP = 5e-3  # s
@@ -71,6 +73,9 @@ class NavigationConfig:
         sheath_clearance: Play of the device in the bore of the sheath all round, m;
             None for a sheath that holds it on its axis (docs/physics.md).
         physics_timestep: Length of a physics step, s; it divides the control step.
+        solver_tolerance: Relative improvement at which the solver of contacts stops;
+            with 1e-8 devices at rest are steadier (docs/validation.md), for up to a
+            seventh more time.
         outside_range: Whether a physics step longer than 5 ms and a device stiffer than
             5000 N·mm², with which the physics does not hold, are warned of and not
             refused.
@@ -100,6 +105,7 @@ class NavigationConfig:
     working_length: float | None = None
     sheath_clearance: float | None = None
     physics_timestep: float = PHYSICS_TIMESTEP
+    solver_tolerance: float = SOLVER_TOLERANCE
     outside_range: bool = False
     # What makes an object is given; the object is here after validation.
     fluoroscopy: Any = FluoroscopyOptions()

@@ -91,7 +91,7 @@ class Scene:
             anatomy=anatomy,
             goal=goal,
             placement=place,
-            arena=AngiographyArena(device_density=catheter.density),
+            arena=AngiographyArena(catheter.density, config.solver_tolerance),
             phantom=Phantom(anatomy, friction, goal_radius, drawn),
             catheter=catheter,
             sheath=Sheath(bore, radius, clearance=config.sheath_clearance),

@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc import rows
+from cathsim_dmc.entities.arena import SOLVER_TOLERANCE
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.dispatcher import Places
 from cathsim_dmc.physics.stepper import Stepper
@@ -331,6 +332,7 @@ def refuse(task: Navigation) -> None:
     missing = {
         "coaxial devices": chain.coaxial,
         "a living vessel (vessel=)": config.vessel.living,
+        "a solver_tolerance below 1e-6": config.solver_tolerance < SOLVER_TOLERANCE,
     }
     named = [name for name, there in missing.items() if there]
     if named:
