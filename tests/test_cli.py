@@ -318,7 +318,10 @@ BAD = {
     "no such hyper-parameter": ([*TRAIN, "--gama", 0.9], ["--gama", "gamma"]),
     "text in a list": ([*TRAIN, "--hidden", 64, "x"], ["--hidden", "x"]),
     "a value out of range": ([*TRAIN, "--gamma", 2], ["gamma is 2.0", "at most 1"]),
-    "an option of another algorithm": ([*TRAIN, "--tau", 0.1], ["--tau"]),
+    "an option of another algorithm": (
+        [*TRAIN, "--tau", 0.1],
+        ["--tau is a setting of sac, not of ppo", "--algo sac"],
+    ),
     "nothing to resume": ([*TRAIN, "--resume"], ["no run in OUT to resume"]),
     "nothing to resume, no task": (
         ["train", "--out", "OUT", "--resume"],

@@ -18,7 +18,7 @@ from cathsim_dmc import agents  # isort: skip
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.checkpoint import checkpoints_in
-from cathsim_dmc.agents.learners import config_from_dict
+from cathsim_dmc.agents.learners import LEARNERS, config_from_dict
 from cathsim_dmc.agents.training import no_run
 from cathsim_dmc.cli.options import INTERRUPTED, Modules
 from cathsim_dmc.cli.task_options import field_helps, task_kind
@@ -61,6 +61,7 @@ def command(arguments: list[str]) -> Any:
             algorithm or preset.
     """
     settings, resumed = _settings(arguments)
+    _refuse_others(arguments, settings)
     own, others = _setting_kind(settings), task_kind(vars(settings))
     name = conf.arg(help="Task of `cathsim list`.", metavar="TASK")
     task = dataclasses.field(default=settings.task if resumed else dataclasses.MISSING)
@@ -147,6 +148,27 @@ def _settings(arguments: list[str]) -> tuple[agents.TrainingConfig, bool]:
     given = {"algorithm": found.algo, "preset": found.preset}.items()
     chosen = {name: value for name, value in given if value is not None}
     return agents.make_config(**chosen), False
+
+
+def _refuse_others(arguments: list[str], settings: agents.TrainingConfig) -> None:
+    """ValueError for a setting that only other algorithms have."""
+    known = {item.name for item in dataclasses.fields(settings)}
+    for word in arguments:
+        name = word.partition("=")[0].removeprefix("--").removeprefix("no-")
+        name = name.replace("-", "_")
+        if not word.startswith("--") or name in known:
+            continue
+        have = [
+            algorithm
+            for algorithm, learner in LEARNERS.items()
+            if name in {item.name for item in dataclasses.fields(learner.config)}
+        ]
+        if have:
+            raise ValueError(
+                f"{word.partition('=')[0]} is a setting of {' and '.join(have)}, not "
+                f"of {settings.algorithm}; leave it out, or train with --algo "
+                f"{' or '.join(have)}"
+            )
 
 
 def _setting_kind(settings: agents.TrainingConfig) -> type:
