@@ -176,7 +176,7 @@ def validate_rest() -> Report:
     found = {name: compared(options) for name, options in DEVICES.items()}
     for name, options in DEVICES.items():
         exact = compared({**options, "solver_tolerance": EXACT})
-        found[f"{name}, solver tolerance {EXACT:g},"] = exact
+        found[f"{name}, strict solver,"] = exact
     checks = [check for name, one in found.items() for check in one.checks(name)]
     findings = {name: one._asdict() for name, one in found.items()}
     return Report("rest", checks, findings)

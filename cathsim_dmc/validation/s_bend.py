@@ -193,7 +193,7 @@ def checks() -> Iterator[Check]:
     """Push forces after a stop, and what is left of the last one."""
     for friction, speed in itertools.product(FRICTIONS, SPEEDS):
         exact = stopped(speed, friction, tolerance=EXACT)
-        yield _push(exact, friction, speed, f", solver tolerance {EXACT:g}")
+        yield _push(exact, friction, speed, ", strict solver")
     for friction in FRICTIONS:
         for speed in SPEEDS:
             creeps = friction == FRICTIONS[-1] and speed == SPEEDS[-1]
