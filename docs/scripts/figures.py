@@ -17,6 +17,7 @@ import datetime
 import json
 import os
 import re
+import statistics
 import subprocess
 import sys
 from pathlib import Path
@@ -26,6 +27,12 @@ DATA = ROOT / "docs" / "data"
 ORIGIN = ("command", "date", "machine", "commit")
 QUOTED = re.compile(r"<!-- = (.+?)(?: \{(\S+)\})? -->(.*?)<!-- -->", re.DOTALL)
 REPORT = re.compile(r"<!-- report (\w+) -->")
+# Rows of the table of training.md on force in the reward, and their trainings.
+_LARGEST_SUM = {
+    "imitation": "dagger-internal-published",
+    "gentle": "ppo-internal-tuned-gentle",
+    "control": "ppo-internal-tuned-control",
+}
 _VARIED = re.compile(r"\b(?:\w+_\w+|type\d|patient)\b(?: in \w+_\w+)?|\d+(?:\.\d+)?")
 
 
@@ -125,6 +132,31 @@ def figures() -> dict[str, dict]:
             found[name] = {"value": check["value"], "unit": check["unit"], **source}
         for name, value in _leaves(path.stem, report.get("findings", {})):
             found[name] = {"value": value, "unit": "", **source}
+    return found | _largest_sums()
+
+
+def _largest_sums() -> dict[str, dict]:
+    """Largest sum of all wall forces, mean over episodes, of the trained policies."""
+    found = {}
+    for row, training in _LARGEST_SUM.items():
+        for path in sorted((ROOT / "results").glob(f"*-{training}-seed0.json")):
+            result = json.loads(path.read_text())
+            task, machine = result["cell"]["task"], result["machine"]
+            model, finished = machine["processor"] or "?", result["finished"]
+            commit, mark = result["commit"][:7], result["commit"][40:]
+            source = {
+                "command": f"python benchmarks/trainings.py --only {task}-{training}",
+                "date": finished.partition("T")[0],
+                "machine": f"{machine['cores']} × {model}",
+                "commit": commit + mark,
+            }
+            sums = result["evaluation"]["episodes"]["largest_sum"]
+            value = 1e3 * statistics.fmean(sums)
+            found[f"largest sum: {task}: {row}"] = {
+                "value": value,
+                "unit": "mN",
+                **source,
+            }
     return found
 
 
