@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import bridge
-from cathsim_dmc.bridge import device as device_module
-from cathsim_dmc.bridge import fit, messages
+from cathsim_dmc.bridge import fit, messages, serving
 from cathsim_dmc.bridge.driver import Driver, connect
 
 PERIOD = 0.02
@@ -65,7 +64,7 @@ class Served:
         self.robot, self.done, self.said = robot, None, []
         # The clock of a busy machine has hiccups.
         options = bridge.ServeOptions(**{"watchdog": 5.0, **options})
-        self._listener = device_module.listen("127.0.0.1", 0)
+        self._listener = serving.listen("127.0.0.1", 0)
         self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
 
         def run():
@@ -129,7 +128,7 @@ def test_an_episode_is_driven_and_every_action_applied(lockstep, tmp_path):
 
 def test_an_empty_host_does_not_let_all_machines_in():
     with pytest.raises(ValueError, match="host is ''; it must be"):
-        device_module.listen("", 0)
+        serving.listen("", 0)
 
 
 def test_a_log_is_never_overwritten(tmp_path):
@@ -200,7 +199,7 @@ def test_a_device_goes_on_with_the_next_driver_when_one_is_killed():
 
 
 def test_a_driver_stops_when_its_device_falls_silent_or_is_lost():
-    listener = device_module.listen("127.0.0.1", 0)
+    listener = serving.listen("127.0.0.1", 0)
     address = f"127.0.0.1:{listener.getsockname()[1]}"
     heard = []
 
@@ -234,7 +233,7 @@ def test_a_driver_stops_when_its_device_falls_silent_or_is_lost():
 
 
 def test_the_end_counts_of_a_device_that_closes_while_the_policy_computes():
-    listener = device_module.listen("127.0.0.1", 0)
+    listener = serving.listen("127.0.0.1", 0)
     computing, closed = threading.Event(), threading.Event()
 
     def run():
@@ -341,7 +340,7 @@ def test_a_signal_that_ends_the_program_stops_the_device(name, error, interrupts
     robot.stop = lambda: (os.kill(os.getpid(), signal.SIGTERM), stop())
     if name == "SIGINT":
         robot.stop = stop
-    with device_module.listen("127.0.0.1", 0) as listener:
+    with serving.listen("127.0.0.1", 0) as listener:
         address = f"127.0.0.1:{listener.getsockname()[1]}"
 
         def driven():
@@ -378,7 +377,7 @@ def test_an_action_before_the_start_is_out_of_order_at_once(monkeypatch):
         link.receive(time.monotonic() + WAIT)
     bridge.drive(push, served.address, options=SLOW)
     assert [one["end"] for one in served.joined()] == ["success"] * 3
-    monkeypatch.setattr(device_module, "IDLE", 0.2)
+    monkeypatch.setattr(serving, "IDLE", 0.2)
     served = Served(Robot(steps=2))
     link = served.raw()
     with pytest.raises(bridge.BridgeError, match=r"idle: no start came within 0.2 s"):
@@ -390,7 +389,7 @@ def test_an_action_before_the_start_is_out_of_order_at_once(monkeypatch):
 def test_an_end_that_is_none_is_refused_on_both_sides():
     robot = Robot()
     robot._state = lambda: bridge.State({}, {}, 0.0, "finished")
-    session = device_module._Session(robot, None, None, bridge.ServeOptions(), None)
+    session = serving._Session(robot, None, None, bridge.ServeOptions(), None)
     session._seed = None
     with pytest.raises(ValueError, match="end of a State is 'finished'.*success, trun"):
         session.episode()
@@ -555,7 +554,7 @@ def test_what_is_no_action_is_refused_by_name_and_stops_the_device(patient, name
 
 
 def test_another_version_another_program_and_a_stranger_are_refused(monkeypatch):
-    monkeypatch.setattr(device_module, "HANDSHAKE", 0.3)
+    monkeypatch.setattr(serving, "HANDSHAKE", 0.3)
     robot = Robot(steps=2)
     served = Served(robot, lockstep=True)
     stranger = socket.create_connection(served.address.split(":"), WAIT)

@@ -1,17 +1,13 @@
 """A device and what drives it, in two programs: messages over TCP, both sides."""
 
-from cathsim_dmc.bridge.device import (
-    Device,
-    ServeOptions,
-    SimulatedDevice,
-    State,
-    serve,
-)
+from cathsim_dmc.bridge.device import Device, SimulatedDevice, State
 from cathsim_dmc.bridge.driver import Driven, DriveOptions, drive
 from cathsim_dmc.bridge.messages import PROTOCOL, BridgeError, Connection
 from cathsim_dmc.bridge.records import Log
+from cathsim_dmc.bridge.serving import ServeOptions, listen, serve
 
 __all__ = [
     "PROTOCOL", "BridgeError", "Connection", "Device", "DriveOptions", "Driven", "Log",
-    "ServeOptions", "SimulatedDevice", "State", "drive", "serve",
+    "ServeOptions", "SimulatedDevice", "State", "drive", "listen",
+    "serve",
 ]  # fmt: skip

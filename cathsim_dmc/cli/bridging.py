@@ -17,8 +17,8 @@ from cathsim_dmc import agents  # isort: skip
 from cathsim_dmc import bounds, bridge, suite
 from cathsim_dmc.agents.policies import FunctionPolicy, task_and_options
 from cathsim_dmc.bridge import fit
-from cathsim_dmc.bridge.device import listen
 from cathsim_dmc.bridge.driver import Driver, connect
+from cathsim_dmc.bridge.serving import listen
 from cathsim_dmc.cli.options import CHECK_FAILED, Json, Modules, Task, print_json, say
 from cathsim_dmc.cli.task_options import TaskOptions, task_kind
 from cathsim_dmc.policies import Policy

@@ -1,0 +1,321 @@
+"""The side of the device: it keeps the clock, and stops when its driver does not."""
+
+import contextlib
+import dataclasses
+import itertools
+import socket
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc import bounds
+from cathsim_dmc.bridge import messages, signals
+from cathsim_dmc.bridge.device import (
+    FORCE_LIMIT,
+    HANDSHAKE,
+    IDLE,
+    LIMITED,
+    MOST_FRAMES,
+    Device,
+    State,
+)
+from cathsim_dmc.bridge.messages import BridgeError, Connection
+from cathsim_dmc.bridge.records import Log, milliseconds
+
+_SLICE = 0.2  # s, after which a wait looks around
+
+
+@dataclasses.dataclass(frozen=True)
+class ServeOptions:
+    """How a device is served.
+
+    Attributes:
+        lockstep: Whether each period waits for its action, at any speed; otherwise the
+            clock does not wait.
+        missed: What the device does in a period whose action has not come in time:
+            "still", no translation and no rotation, or "hold", the last action.
+        watchdog: Silence of the driver after which the device stops, s.
+        force_limit: Largest contact or push above which the device stops, N; None for
+            none.
+    """
+
+    lockstep: bool = False
+    missed: str = "still"
+    watchdog: float = 0.2
+    force_limit: float | None = FORCE_LIMIT
+
+    def __post_init__(self) -> None:
+        bounds.choice("missed", self.missed, ("still", "hold"))
+        bounds.number("watchdog", self.watchdog, 0.0, 3600.0, "s", positive=True)
+        if self.force_limit is not None:
+            bounds.number("force_limit", self.force_limit, unit="N", positive=True)
+
+
+@signals.raised()
+def serve(
+    device: Device,
+    listener: socket.socket,
+    options: ServeOptions | None = None,
+    *,
+    episodes: int | None = None,
+    log: Log | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> list[dict[str, Any]]:
+    """Serve one driver after the other.
+
+    What ends it from outside, SIGTERM as well as Ctrl-C, stops the device before.
+
+    Args:
+        listener: A socket that listens, see `listen`.
+        episodes: Number of episodes after which it returns; None for ever.
+        log: What was received and applied.
+        say: Function that is called with a line of progress.
+
+    Returns:
+        For each episode "end", "reason" (why it was stopped, else None), "steps",
+        "missed", "late", "force" (largest, N), and percentiles of "answer" (from a
+        state to its action) and "tick" (by how much a period begins late), ms.
+    """
+    done: list[dict[str, Any]] = []
+    log = log or Log(None)
+    while episodes is None or len(done) < episodes:
+        listener.settimeout(_SLICE)
+        try:
+            sock, (peer, port, *_) = listener.accept()
+        except TimeoutError:
+            continue
+        link, wrong = Connection(sock), None
+        log.write("connected", peer=f"{peer}:{port}")
+        session = _Session(device, link, listener, options or ServeOptions(), log)
+        try:
+            session.greet()
+            while (episodes is None or len(done) < episodes) and session.begins():
+                done.append(session.episode())
+                say(f"{peer}:{port}: {_told(done[-1])}")
+        except BridgeError as error:
+            wrong = error
+            say(f"{peer}:{port}: {error}")
+            log.write("refused", fault=error.fault, reason=error.text)
+            if session.running is not None:
+                done.append(session.summary(error.fault, error.text))
+        except BaseException as error:  # of the device, or a signal
+            text = f"the device's program ends: {type(error).__name__}: {error}"
+            wrong = BridgeError("peer_lost", text.removesuffix(": "))
+            raise
+        finally:
+            device.stop()
+            link.close(wrong)
+    return done
+
+
+def _told(episode: Mapping[str, Any]) -> str:
+    """How an episode went, in words."""
+    reason = "" if episode["reason"] is None else f": {episode['reason']}"
+    return f"{episode['end']} after {episode['steps']} steps{reason}"
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that listens; OSError if the port is taken, 0 takes a free one.
+
+    Raises:
+        ValueError: the port is none, or the host is empty, which would let all in.
+    """
+    bounds.text("host", host)
+    bounds.whole("port", port, 0, 65535)
+    try:
+        return socket.create_server((host, port), backlog=8)
+    except OSError as error:
+        text = f"cannot listen on {host}:{port}; choose another --port or --host"
+        raise OSError(f"{text}: {error}") from error
+
+
+@dataclasses.dataclass
+class _Running:
+    """Counts of an episode."""
+
+    step: int = 0
+    missed: int = 0
+    late: int = 0
+    force: float = 0.0
+    answers: list[float] = dataclasses.field(default_factory=list)
+    ticks: list[float] = dataclasses.field(default_factory=list)
+
+
+class _Session:
+    """One driver."""
+
+    running: _Running | None = None
+    played: int | None = None  # steps of the last episode
+
+    def __init__(
+        self,
+        device: Device,
+        link: Connection,
+        listener: socket.socket,
+        options: ServeOptions,
+        log: Log,
+    ):
+        self._device, self._link, self._listener = device, link, listener
+        self._options, self._log = options, log
+        speeds = ["/s" in str(one["unit"]) for one in device.action]
+        self._speeds = np.array(speeds, dtype=bool)
+
+    def greet(self) -> None:
+        hello = self._wait(HANDSHAKE, "hello")
+        messages.require_version(hello)
+        device = self._device
+        self._link.send(
+            HANDSHAKE, "welcome", protocol=messages.PROTOCOL, name=device.name,
+            period=device.period, action=list(device.action),
+            observation=list(device.observation), watchdog=self._options.watchdog,
+            force_limit=self._options.force_limit, lockstep=self._options.lockstep,
+        )  # fmt: skip
+
+    def begins(self) -> bool:
+        """Wait for the start of an episode; False if the driver has left."""
+        try:
+            message = self._wait(IDLE, "start", "action", "stop")
+            while message["kind"] != "start":
+                # Those on their way when the last episode ended have no effect.
+                if message["kind"] == "action":
+                    self._require_past(message["step"])
+                message = self._wait(IDLE, "start", "action", "stop")
+        except BridgeError as error:
+            if error.fault == "peer_lost":
+                return False
+            raise
+        if message["seed"] is not None:
+            try:
+                bounds.seed("seed", message["seed"])
+            except ValueError as error:
+                raise BridgeError("bad_message", str(error)) from error
+        self._seed = message["seed"]
+        return True
+
+    def _require_past(self, step: int) -> None:
+        """BridgeError for an action between episodes that answers none of the last."""
+        if self.played is None:
+            raise BridgeError("out_of_order", "action came, expected start")
+        if step > self.played:
+            text = f"action of step {step}, but the episode ended at step {self.played}"
+            raise BridgeError("out_of_order", text)
+
+    def episode(self) -> dict[str, Any]:
+        """Play one; whatever happens, the device stands still afterwards."""
+        device, options = self._device, self._options
+        self.running = run = _Running()
+        self._heard = due = time.monotonic()
+        last, reason = np.zeros(len(self._speeds)), None
+        try:
+            state = device.start(self._seed)
+            self._heard = due = time.monotonic()
+            while True:
+                if state.end is not None:
+                    bounds.choice("end of a State", state.end, messages.ENDS)
+                end = state.end or self._too_much(state.force)
+                self._send(run.step, state, end)
+                if end is not None:
+                    break
+                due = max(due, time.monotonic() - device.period) + device.period
+                action, reason = self._action(due)
+                if reason is not None:
+                    end = "stopped"
+                    self._log.write("stop", step=run.step, reason=reason)
+                    with contextlib.suppress(BridgeError):  # it may have left
+                        self._link.send(device.period, "stop", reason=reason)
+                    break
+                if action is None:
+                    run.missed += 1
+                    hold = options.missed == "hold"
+                    action = last if hold else np.where(self._speeds, 0.0, last)
+                    device.command(action)
+                if not options.lockstep:
+                    time.sleep(max(0.0, due - time.monotonic()))
+                    run.ticks.append(time.monotonic() - due)
+                last = action
+                self._log.write(
+                    "applied", step=run.step, action=action.tolist(),
+                    force=dict(state.force),
+                )  # fmt: skip
+                run.step += 1
+                state = device.read()
+        finally:
+            device.stop()
+        self._log.write("end", step=run.step, reason=end)
+        found = self.summary(end, reason)
+        self.running, self.played = None, run.step
+        return found
+
+    def summary(self, end: str, reason: str | None) -> dict[str, Any]:
+        run = self.running or _Running()
+        return {
+            "end": end, "reason": reason, "steps": run.step, "missed": run.missed,
+            "late": run.late, "force": run.force, "answer": milliseconds(run.answers),
+            "tick": milliseconds(run.ticks),
+        }  # fmt: skip
+
+    def _too_much(self, force: Mapping[str, float]) -> str | None:
+        run, limit = self.running or _Running(), self._options.force_limit
+        largest = max((abs(force[k]) for k in LIMITED if k in force), default=0.0)
+        run.force = max(run.force, largest)
+        return "force_limit" if limit is not None and largest > limit else None
+
+    def _send(self, step: int, state: State, end: str | None) -> None:
+        observation = {k: messages.to_json(v) for k, v in state.observation.items()}
+        self._sent = time.monotonic()
+        self._link.send(
+            self._options.watchdog, "state", step=step, time=state.time,
+            observation=observation, force=dict(state.force), end=end,
+        )  # fmt: skip
+
+    def _action(self, due: float) -> tuple[np.ndarray | None, str | None]:
+        """The action of the present period, if it comes, and why to stop, or None."""
+        run, options = self.running or _Running(), self._options
+        for frames in itertools.count():
+            now = time.monotonic()
+            until = self._heard + options.watchdog
+            if now > until:
+                return None, f"watchdog: no action for {now - self._heard:.3f} s"
+            message = self._link.receive(until if options.lockstep else min(due, until))
+            self._turn_away()
+            if message is None:
+                if options.lockstep or time.monotonic() < due:
+                    continue
+                return None, None
+            if frames > MOST_FRAMES:
+                raise BridgeError("flood", f"over {MOST_FRAMES} frames in a period")
+            message = messages.require_kind(message, "action", "stop")
+            if message["kind"] == "stop":
+                return None, f"driver: {message['reason'][:200]}"
+            self._heard = time.monotonic()
+            size = (len(self._speeds),)
+            given = messages.to_array("action", message["action"], size, "float64")
+            if message["step"] > run.step:
+                text = f"action of step {message['step']}, but step {run.step} runs"
+                raise BridgeError("out_of_order", text)
+            if message["step"] < run.step:
+                run.late += 1  # of a state that is over
+                continue
+            run.answers.append(self._heard - self._sent)
+            action = np.clip(given, -1.0, 1.0)
+            self._device.command(action)
+            return action, None
+        raise AssertionError("unreachable")
+
+    def _wait(self, seconds: float, *kinds: str) -> dict[str, Any]:
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            message = self._link.receive(time.monotonic() + min(left, _SLICE))
+            self._turn_away()
+            if message is not None:
+                return messages.require_kind(message, *kinds)
+        raise BridgeError("idle", f"no {kinds[0]} came within {seconds:g} s")
+
+    def _turn_away(self) -> None:
+        """Tell another driver that there is one already."""
+        self._listener.settimeout(0.0)
+        with contextlib.suppress(OSError):
+            sock, _ = self._listener.accept()
+            Connection(sock).close(BridgeError("busy", "another program drives it"))
