@@ -32,6 +32,7 @@ SCANS = {
     "arch or pulmonary arteries": ((12e-3, 200e-3), (0.25, 0.35), 1.0),
     "abdominal aorta and iliacs": ((9.5e-3, 260e-3), (0.3, 0.35), 1.0),
     "whole aorta": ((12e-3, 550e-3), (0.2, 0.25), 1.0),
+    "arteries of the whole body": ((12e-3, 1.4), (0.15, 0.12), 0.1),
     "aneurysm of the aorta": ((22e-3, 260e-3), (0.35, 0.4), 0.4),
     "a mouse's aorta": ((0.8e-3, 25e-3), (0.25, 0.35), 0.015),
 }
