@@ -422,6 +422,9 @@ def test_the_proof_finds_each_fault(computed):
     goal = replace(goal, arc_length=good.goals["lcca"].arc_length)
     goals = found("goals in their vessels", {"lcca": goal})
     assert "lies in lsa, not in lcca" in goals
+    # A vessel that is too thin for the unit.
+    thin = replace(lcca, centreline=Centreline(line.points, 0.05 * line.radii))
+    assert "another one (--units)" in found("sizes of vessels", lcca=thin)
     # Neighbours that leave together, as in a bovine arch, have no order.
     sides = "branches of the arch on their sides"
     trunk = bca.centreline

@@ -257,6 +257,7 @@ def _sizes(anatomy: Anatomy) -> Iterator[str]:
             f"the lumen holds {volume * 1e6:.2g} ml (allowed {VOLUME[0] * 1e6:g} to "
             f"{VOLUME[1] * 1e6:g}): the unit is wrong"
         )
+    unlikely = False
     for key, vessel in anatomy.tree.vessels.items():
         own = vessel.centreline.radii[vessel.centreline.arc_length >= vessel.ostium]
         middle = float(np.median(own))
@@ -265,6 +266,9 @@ def _sizes(anatomy: Anatomy) -> Iterator[str]:
                 f"{key} has a radius of {mm(middle):.3g} mm (median; allowed "
                 f"{mm(RADII[0]):g} to {mm(RADII[1]):g})"
             )
+            unlikely = True
+    if unlikely:
+        yield "the unit may be another one (--units)"
 
 
 def _inlet(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
