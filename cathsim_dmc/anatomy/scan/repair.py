@@ -26,6 +26,10 @@ RAGGED = 0.1  # of an end's width: rims that are less flat are cut back to a pla
 DENSE = 30_000  # triangles; more are decimated
 FEW = 12_000  # triangles that are left then
 ROUNDS = 6
+_OF_WALL = (
+    "The surface was taken for that of a thick wall, and cut at its rims: export the "
+    "lumen alone, without wall, flanges and connectors. If it has none: "
+)
 _AGAIN = "Smooth or remesh that place, or export the segmentation again."
 
 
@@ -56,6 +60,7 @@ class _Work:
         self.name, self.vertices, self.faces = name, vertices, faces
         self.notes: list[str] = []
         self._ends, self._ragged = 0, 0.0
+        self._walled = False
         self._cut: set[tuple[float, ...]] = set()  # corners of what was cut out
 
     def merge(self) -> None:
@@ -162,6 +167,7 @@ class _Work:
         inner = topology.lumen_of_wall(self.vertices, self.faces)
         if inner is not None:
             self.notes.append("thick wall: its inner surface taken as the lumen")
+            self._walled = True
             self._keep(inner)
             self.faces = self.faces[:, ::-1]
             self._drop_small_parts()
@@ -189,7 +195,8 @@ class _Work:
                 raise ValueError(
                     f"{self.name} is not closed: a hole {mm(wide):.1f} mm wide in "
                     f"the side of a vessel at {shown(middle)} (at most "
-                    f"{mm(widest):.2g} mm are filled). Fill holes (3D Slicer: Surface "
+                    f"{mm(widest):.2g} mm are filled). "
+                    f"{_OF_WALL if self._walled else ''}Fill holes (3D Slicer: Surface "
                     "Toolbox, Fill holes), then export again."
                 )
             else:
