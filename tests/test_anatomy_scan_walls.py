@@ -104,6 +104,15 @@ def test_a_wall_whose_inner_side_is_not_found_whole_is_told(monkeypatch):
         mended(vertices, faces)
 
 
+@pytest.mark.parametrize("factor", [1.0, 0.1])
+def test_the_lumen_of_a_wall_is_measured_without_the_wall(tmp_path, factor):
+    """Its thickness, and what is between two walls, are no width of a lumen."""
+    vertices, faces = wall()
+    path = write_obj(tmp_path / "wall.obj", factor * vertices, faces)
+    lumen = read_lumen(path, "mm" if factor == 1.0 else "cm")
+    assert lumen.scale == pytest.approx(12.0 / 5.0, rel=0.1)
+
+
 def test_places_of_mending_are_those_of_the_file(tmp_path):
     """A hole is told in the unit and frame in which the file has it."""
     vertices, faces = revolved(*CLOSED)

@@ -26,6 +26,7 @@ RAGGED = 0.1  # of an end's width: rims that are less flat are cut back to a pla
 DENSE = 30_000  # triangles; more are decimated
 FEW = 12_000  # triangles that are left then
 ROUNDS = 6
+WALL = "thick wall"  # how notes on it begin
 _OF_WALL = (
     "The surface was taken for that of a thick wall, and cut at its rims: export the "
     "lumen alone, without wall, flanges and connectors. If it has none: "
@@ -90,7 +91,7 @@ class _Work:
             shells = [self.faces[label == k] for k in large]
             inner = topology.inner_shell(self.vertices, shells)
         if inner is not None:
-            self.notes.append("thick wall: the inner of two surfaces taken")
+            self.notes.append(f"{WALL}: the inner of two surfaces taken")
             large = large[[inner]]
         elif len(large) > 1:
             remedy = (
@@ -166,7 +167,7 @@ class _Work:
         """Keeps the inner surface of a wall that is open at its ends."""
         inner = topology.lumen_of_wall(self.vertices, self.faces)
         if inner is not None:
-            self.notes.append("thick wall: its inner surface taken as the lumen")
+            self.notes.append(f"{WALL}: its inner surface taken as the lumen")
             self._walled = True
             self._keep(inner)
             self.faces = self.faces[:, ::-1]
