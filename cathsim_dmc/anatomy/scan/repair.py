@@ -11,6 +11,7 @@ from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 PART_AREA = 0.03  # of the surface's area: smaller separate parts are dropped
 PART_WIDTH = 12e-3  # m, and if they are not wider, or lie in the largest part:
 PART_INSIDE = 0.25  # of such a part
+MOST_SHOWN = 4  # separate parts whose places are told
 NON_MANIFOLD = 0.01  # of the triangles: more at non-manifold edges are not mended
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
@@ -103,9 +104,14 @@ class _Work:
                     "Some of them overlap: unite these (Blender: modifier Boolean, "
                     "Union; 3D Slicer: import them as one segment)"
                 )
+            around = [
+                shown(self.vertices[self.faces[label == k]].mean(axis=(0, 1)))
+                for k in large[np.argsort(-share[large])][:MOST_SHOWN]
+            ]
             raise ValueError(
-                f"{self.name} has {len(large)} separate parts; one connected lumen is "
-                f"needed. {remedy}, and export again."
+                f"{self.name} has {len(large)} separate parts, the largest around "
+                f"{', '.join(around)}; one connected lumen is needed. {remedy}, and "
+                "export again."
             )
         elif len(share) > 1 and not quiet:
             self.notes.append(
