@@ -140,9 +140,16 @@ def test_less_is_cut_off_where_a_branch_begins():
         "trunk": Vessel("trunk", tube([(0, 0, 9), (0, 0, 100)], [8, 8])),
     }
     with pytest.raises(
-        ValueError, match=r"cut off for the inlet.*--inlet X Y Z\), such"
+        ValueError, match=r"cut off at .*for the inlet.*--inlet X Y Z\), such"
     ):
         opened_at_inlet(VesselTree(behind), False, lumen_surface(tree, 1.5e-3))
+    # So where a branch beside the inlet turns back, past its plane.
+    back = tube([(0, 0, 16), (10, 0, 12), (60, 0, -12)], [4, 4, 3])
+    beside = {**behind, "near": Vessel("near", back, "trunk", 8e-3)}
+    whole = VesselTree({**beside, "trunk": vessels["trunk"]})
+    cut = lumen_surface(whole, 1.5e-3)
+    with pytest.raises(ValueError, match=r"cut off at \(60, 0, -12\) mm with the end"):
+        opened_at_inlet(VesselTree(beside), False, cut)
 
 
 def test_every_vessel_left_out_has_its_own_entry():

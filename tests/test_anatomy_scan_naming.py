@@ -1,5 +1,7 @@
 """Names of an arch's branches: hypotheses, confidence and questions, without a mesh."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -284,6 +286,15 @@ def test_a_kinked_aorta_with_visceral_branches_is_no_arch(bend):
     arch = bent(bend, 0.7, *usual)
     turned = Arch(arch.ways, (), None, [], down, arch.width, arch.branches, 0.7)
     assert "towards the feet" in turned._unlike() and "--heart" in turned._unlike()
+
+
+def test_an_arch_as_narrow_as_a_childs_is_asked_for(bend):
+    """A subclavian artery bends, too, and its branches may be as wide by it."""
+    arch = bent(bend, 1.0, BCA, LCCA, LSA)
+    for width, given, asks in ((13, False, False), (5, False, True), (5, True, False)):
+        one = replace(arch, width=0 * arch.width + 1e-3 * width, given=given)
+        asked = "".join(one._young())
+        assert ("is it an aortic arch? It is 10.0 mm wide" in asked) is asks
 
 
 def test_a_right_sided_arch_is_taken_where_heart_and_axes_are_given():

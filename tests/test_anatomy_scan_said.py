@@ -171,6 +171,12 @@ def test_units_are_not_sure_because_others_are_unusual():
     vertices, faces = tube(1.7e-3, 25e-3)
     unit, why, _ = guess_units("mouse", 1e3 * vertices, faces, None)
     assert unit == "cm" and "pass units='mm'" in why
+    # Arteries of a whole body in cm are those of a heart in mm.
+    vertices, faces = tube(26e-3, 1.4)
+    with pytest.raises(ValueError, match=r"mm makes .*cm makes .*\(--units\)"):
+        guess_units("body", 1e2 * vertices, faces, None)
+    vertices, faces = tube(3.6e-3, 90e-3)
+    assert guess_units("heart", 1e3 * vertices, faces, None)[0] == "mm"
     # A wide aneurysm is one in mm only.
     vertices, faces = tube(83e-3, 320e-3)
     assert guess_units("aneurysm", 1e3 * vertices, faces, None)[0] == "mm"

@@ -136,14 +136,20 @@ def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
     assert free.goals["lcca"].position[0] < -0.15
 
 
-def test_a_scan_that_does_not_stand_upright_is_told():
-    """Its arch may be a mirrored one, and sides in the picture would be false."""
-    tree, turn = arch_tree(), np.roll(np.eye(3), 1, axis=0)
-    lying = {}
+def moved(tree, turn):
+    """A tree whose points are turned or mirrored by a matrix."""
+    vessels = {}
     for name, vessel in tree.vessels.items():
         line = vessel.centreline
         line = Centreline(line.points @ turn, line.radii)
-        lying[name] = replace(vessel, centreline=line)
+        vessels[name] = replace(vessel, centreline=line)
+    return VesselTree(vessels)
+
+
+def test_a_scan_that_does_not_stand_upright_is_told():
+    """Its arch may be a mirrored one, and sides in the picture would be false."""
+    tree, turn = arch_tree(), np.roll(np.eye(3), 1, axis=0)
+    lying = moved(tree, turn).vessels
     assert unproven(tree, None) is unproven(tree, np.eye(3)) is None
     said = unproven(VesselTree(lying), None)
     assert "arch points towards +y, 88 degrees off the head, so whether it is" in said
@@ -416,6 +422,9 @@ def test_the_proof_finds_each_fault(computed):
     goal = replace(goal, arc_length=good.goals["lcca"].arc_length)
     goals = found("goals in their vessels", {"lcca": goal})
     assert "lies in lsa, not in lcca" in goals
+    # A vessel that is too thin for the unit.
+    thin = replace(lcca, centreline=Centreline(line.points, 0.05 * line.radii))
+    assert "another one (--units)" in found("sizes of vessels", lcca=thin)
     # Neighbours that leave together, as in a bovine arch, have no order.
     sides = "branches of the arch on their sides"
     trunk = bca.centreline
@@ -423,6 +432,11 @@ def test_the_proof_finds_each_fault(computed):
     points = trunk.points + 1e-3 * back / np.linalg.norm(back)
     together = replace(bca, name="lcca", centreline=replace(trunk, points=points))
     assert not found(sides, lcca=together)
+    # Two axes exchanged: the arch leads to the back and left as before, not the arms.
+    exchanged = replace(good, tree=moved(good.tree, np.eye(3)[[1, 0, 2]]))
+    assert re.search("rsa .* leads 9[0-9] degrees off the p", failed(exchanged)[sides])
+    slanted = np.array([(0.77, 0.64, 0.0), (-0.64, 0.77, 0.0), (0.0, 0.0, 1.0)])
+    assert sides not in failed(replace(good, tree=moved(good.tree, slanted)))
     # A branch that does not start on its parent.
     vessels.pop("lcca")
     adrift = Vessel("lcca", line.slice(0.04, 0.09), "lsa", 1e-3)

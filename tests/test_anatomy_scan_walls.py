@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from synthetic_scans import write_obj
 
+from cathsim_dmc.anatomy.scan import topology
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
 from cathsim_dmc.anatomy.scan.repair import mend
 from cathsim_dmc.anatomy.scan.topology import edge_counts
@@ -91,6 +92,25 @@ def test_the_lumen_of_a_wall_is_its_inner_side(options):
     assert "thick wall: its inner surface taken" in notes
     assert "holes" not in notes
     assert volume == pytest.approx(np.pi * 5.0**2 * 40 * np.pi, rel=0.04)
+
+
+def test_a_wall_whose_inner_side_is_not_found_whole_is_told(monkeypatch):
+    """A closed surface has no holes to fill; flanges may hide where its lumen ends."""
+    vertices, faces = revolved(*CLOSED)
+    middles = vertices[faces].mean(axis=1)
+    inner = np.linalg.norm(middles - (RADIUS, 0.0, 70.0), axis=1) > 6.0
+    monkeypatch.setattr(topology, "lumen_of_wall", lambda *surface: inner)
+    with pytest.raises(ValueError, match="taken for that of a thick wall.*lumen alone"):
+        mended(vertices, faces)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.1])
+def test_the_lumen_of_a_wall_is_measured_without_the_wall(tmp_path, factor):
+    """Its thickness, and what is between two walls, are no width of a lumen."""
+    vertices, faces = wall()
+    path = write_obj(tmp_path / "wall.obj", factor * vertices, faces)
+    lumen = read_lumen(path, "mm" if factor == 1.0 else "cm")
+    assert lumen.scale == pytest.approx(12.0 / 5.0, rel=0.1)
 
 
 def test_places_of_mending_are_those_of_the_file(tmp_path):

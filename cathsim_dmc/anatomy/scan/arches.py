@@ -37,6 +37,7 @@ class Arch:
     branches: list[Offshoot]  # of the arch
     heart: float  # probability that the heart is at the last end
     right: bool = False  # whether it is known to be a right-sided arch
+    given: bool = False  # whether the user says that it is an arch, by its heart
 
     @classmethod
     def of(
@@ -70,7 +71,7 @@ class Arch:
                     f"heart is {off:.0f} mm away from both ends of the aorta; give a "
                     f"point near one of them: {listed([first, last])}."
                 )
-            arch = cls._seen(ways, ends, first, last, 1.0)
+            arch = replace(cls._seen(ways, ends, first, last, 1.0), given=True)
         else:
             arch = cls._seen(ways, ends, first, last)
             if arch.heart < 0.5:
@@ -167,6 +168,21 @@ class Arch:
 
         A root that leads to no end of the aorta is seen towards the farther end.
         """
+        names, notes, right = self._named(curves, root)
+        return Naming(names, [*notes, *self._young()], right)
+
+    def _young(self) -> list[str]:
+        """What to ask of an arch that is as narrow as a child's."""
+        wide = mm(2.0 * float(np.median(self.width)))
+        if self.given or wide >= 2.0 * aorta.ADULT:
+            return []
+        return [
+            f"question: is it an aortic arch? It is {wide:.1f} mm wide, as a child's. "
+            "If it is another artery that bends, name it and its branches (--rename); "
+            "if it is an adult's, give its unit (--units)"
+        ]
+
+    def _named(self, curves: Sequence[np.ndarray], root: np.ndarray | None) -> Naming:
         start, ends = curves[0][0], [end.position for end in self.ends]
         gaps = [np.linalg.norm(end - start) for end in ends]
         if root is not None and min(np.linalg.norm(ends - root, axis=1)) < 1e-6:

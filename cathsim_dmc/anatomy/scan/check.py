@@ -34,6 +34,8 @@ WIDE = 90.0  # percentile of the radii of a tree that is the width of its wide p
 RADII = (0.3e-3, 30e-3)  # m, allowed median of a vessel: arteriole, aneurysm
 WIDEST = 45e-3  # m
 RIM_SLACK = 0.05e-3  # m, by which the first cross-section of a branch may lie outside
+ARMS = 60e-3  # m across between the ends of the subclavian arteries that say sides
+LEFT = 0.5  # least cosine between the way from the right to the left of them and +x
 ONE_OSTIUM = 3e-3  # m of the aorta between ostia that are one
 
 
@@ -143,6 +145,28 @@ def _sides(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
         return
     if bend.turn > TURN and (text := mirrored(bend.azimuth(bool(along.sum() < 0)))):
         yield text
+    elif bend.turn > TURN and bend.upright:
+        yield from _arms(anatomy)
+
+
+def _arms(anatomy: Anatomy) -> Iterator[str]:
+    """Whether the subclavian arteries of an upright scan lead to their sides.
+
+    Where two axes are exchanged the arch still leads to the back and left.
+    """
+    arms = [anatomy.tree.vessels.get(key) for key in ("rsa", "lsa")]
+    ends = [arm.centreline.points[-1] for arm in arms if arm is not None]
+    if len(ends) < len(arms):
+        return
+    across = (ends[1] - ends[0])[:2]
+    wide = float(np.linalg.norm(across))
+    if wide > ARMS and across[0] < LEFT * wide:
+        off = np.degrees(np.arccos(across[0] / wide))
+        yield (
+            f"the way from the end of the rsa at {shown(ends[0])} to that of the lsa "
+            f"at {shown(ends[1])} leads {off:.0f} degrees off the patient's left: the "
+            "scan is mirrored, turned, or in another frame (--frame, --axes)"
+        )
 
 
 def _right_sided(anatomy: Anatomy) -> bool:
@@ -233,6 +257,7 @@ def _sizes(anatomy: Anatomy) -> Iterator[str]:
             f"the lumen holds {volume * 1e6:.2g} ml (allowed {VOLUME[0] * 1e6:g} to "
             f"{VOLUME[1] * 1e6:g}): the unit is wrong"
         )
+    unlikely = False
     for key, vessel in anatomy.tree.vessels.items():
         own = vessel.centreline.radii[vessel.centreline.arc_length >= vessel.ostium]
         middle = float(np.median(own))
@@ -241,6 +266,9 @@ def _sizes(anatomy: Anatomy) -> Iterator[str]:
                 f"{key} has a radius of {mm(middle):.3g} mm (median; allowed "
                 f"{mm(RADII[0]):g} to {mm(RADII[1]):g})"
             )
+            unlikely = True
+    if unlikely:
+        yield "the unit may be another one (--units)"
 
 
 def _inlet(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan import labels as label_maps
 from cathsim_dmc.anatomy.scan import mesh
-from cathsim_dmc.anatomy.scan.repair import mend
+from cathsim_dmc.anatomy.scan.repair import WALL, mend
 from cathsim_dmc.anatomy.scan.topology import areas, merged
 from cathsim_dmc.anatomy.scan.units import UNITS, file_frame, to_lps, upright
 from cathsim_dmc.anatomy.surface import sampled
@@ -32,6 +32,7 @@ SCANS = {
     "arch or pulmonary arteries": ((12e-3, 200e-3), (0.25, 0.35), 1.0),
     "abdominal aorta and iliacs": ((9.5e-3, 260e-3), (0.3, 0.35), 1.0),
     "whole aorta": ((12e-3, 550e-3), (0.2, 0.25), 1.0),
+    "arteries of the whole body": ((12e-3, 1.4), (0.15, 0.12), 0.1),
     "aneurysm of the aorta": ((22e-3, 260e-3), (0.35, 0.4), 0.4),
     "a mouse's aorta": ((0.8e-3, 25e-3), (0.25, 0.35), 0.015),
 }
@@ -79,7 +80,8 @@ def read_lumen(
     """
     # Before anything is read:
     to_lps("mm" if units is None else units, "LPS" if frame is None else frame, axes)
-    if str(path).lower().endswith(mesh.LABEL_MAPS):
+    given, labelled = units, str(path).lower().endswith(mesh.LABEL_MAPS)
+    if labelled:
         vertices, faces, notes, units = label_maps.label_surface(path, labels, units)
         frame, vertices = frame or "LPS", vertices @ upright(axes).T
         radius = typical_radius(vertices, faces)
@@ -114,6 +116,12 @@ def read_lumen(
         surface, changed = mend(str(path), scale * vertices, faces)
     if scale != 1.0:
         surface = Surface(surface.vertices / scale, surface.faces)
+    if any(note.startswith(WALL) for note in changed) and not labelled:
+        # Until now what lies between two walls was measured, too.
+        why, radius = _in_wall(str(path), surface, units, given)
+        say(f"note: {why}")
+        notes = (why, *notes[1:])
+        scale = enlargement(radius, surface.volume)
     if surface.volume > VOLUME:
         raise ValueError(
             f"{path} holds {surface.volume * 1e3:.3g} litres when its unit is "
@@ -121,6 +129,23 @@ def read_lumen(
             f"unit in which the mesh was exported ({notes[0]})."
         )
     return Lumen(surface, units, (*notes, *changed), scale, frame)
+
+
+def _in_wall(
+    name: str, surface: Surface, units: str, given: str | None
+) -> tuple[str, float]:
+    """A line on the unit and the radius (m) of the inner surface (m) of a wall.
+
+    ValueError if the unit that is likely for the wall is not that for its lumen.
+    """
+    vertices = surface.vertices / UNITS[units]
+    likely, why, radius = guess_units(name, vertices, surface.faces, given)
+    if likely != units:
+        raise ValueError(
+            f"{name} may be in several units: {units!r} by its thick wall, {likely!r} "
+            f"by its lumen ({why}); pass units={units!r} or {likely!r} (--units)."
+        )
+    return f"{why}, measured inside its thick wall", radius
 
 
 def _else(size: float, units: str) -> str:

@@ -244,15 +244,17 @@ def opened_at_inlet(
         cut = Surface(points[used], numbers.reshape(-1, 3))
         tips = [vessel.centreline.points[-1] for vessel in opened.vessels.values()]
         begun = [v.centreline.points[0] for v in opened.vessels.values() if v.parent]
-        inside = SurfaceDepth(cut)(np.array([*tips, *begun])) > 0.0
-        if inside.all():
+        depths = SurfaceDepth(cut)(np.array([*tips, *begun]))
+        if (depths > 0.0).all():
             break
-        if last and not inside[len(tips) :].all():
-            row = int(inside[len(tips) :].argmin())
+        floors = np.append(np.full(len(tips), -inlet.radius), np.zeros(len(begun)))
+        gone = np.flatnonzero(depths <= floors)
+        if last and len(gone):
+            where = shown([*tips, *begun][gone[-1]])
             raise ValueError(
-                f"a branch leaves the lumen at {shown(begun[row])}, where its end is "
-                f"cut off for the inlet at {shown(inlet.position)}. Choose an inlet "
-                f"farther from it (inlet; --inlet X Y Z), such as {_listed(tips)}."
+                f"a branch is cut off at {where} with the end of the lumen, for the "
+                f"inlet at {shown(inlet.position)}. Choose an inlet farther from it "
+                f"(inlet; --inlet X Y Z), such as {_listed(tips)}."
             )
     return opened, inlet, cut
 

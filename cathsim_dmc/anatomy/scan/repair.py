@@ -11,6 +11,7 @@ from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 PART_AREA = 0.03  # of the surface's area: smaller separate parts are dropped
 PART_WIDTH = 12e-3  # m, and if they are not wider, or lie in the largest part:
 PART_INSIDE = 0.25  # of such a part
+MOST_SHOWN = 4  # separate parts whose places are told
 NON_MANIFOLD = 0.01  # of the triangles: more at non-manifold edges are not mended
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
@@ -26,6 +27,11 @@ RAGGED = 0.1  # of an end's width: rims that are less flat are cut back to a pla
 DENSE = 30_000  # triangles; more are decimated
 FEW = 12_000  # triangles that are left then
 ROUNDS = 6
+WALL = "thick wall"  # how notes on it begin
+_OF_WALL = (
+    "The surface was taken for that of a thick wall, and cut at its rims: export the "
+    "lumen alone, without wall, flanges and connectors. If it has none: "
+)
 _AGAIN = "Smooth or remesh that place, or export the segmentation again."
 
 
@@ -56,6 +62,7 @@ class _Work:
         self.name, self.vertices, self.faces = name, vertices, faces
         self.notes: list[str] = []
         self._ends, self._ragged = 0, 0.0
+        self._walled = False
         self._cut: set[tuple[float, ...]] = set()  # corners of what was cut out
 
     def merge(self) -> None:
@@ -85,7 +92,7 @@ class _Work:
             shells = [self.faces[label == k] for k in large]
             inner = topology.inner_shell(self.vertices, shells)
         if inner is not None:
-            self.notes.append("thick wall: the inner of two surfaces taken")
+            self.notes.append(f"{WALL}: the inner of two surfaces taken")
             large = large[[inner]]
         elif len(large) > 1:
             remedy = (
@@ -97,9 +104,14 @@ class _Work:
                     "Some of them overlap: unite these (Blender: modifier Boolean, "
                     "Union; 3D Slicer: import them as one segment)"
                 )
+            around = [
+                shown(self.vertices[self.faces[label == k]].mean(axis=(0, 1)))
+                for k in large[np.argsort(-share[large])][:MOST_SHOWN]
+            ]
             raise ValueError(
-                f"{self.name} has {len(large)} separate parts; one connected lumen is "
-                f"needed. {remedy}, and export again."
+                f"{self.name} has {len(large)} separate parts, the largest around "
+                f"{', '.join(around)}; one connected lumen is needed. {remedy}, and "
+                "export again."
             )
         elif len(share) > 1 and not quiet:
             self.notes.append(
@@ -161,7 +173,8 @@ class _Work:
         """Keeps the inner surface of a wall that is open at its ends."""
         inner = topology.lumen_of_wall(self.vertices, self.faces)
         if inner is not None:
-            self.notes.append("thick wall: its inner surface taken as the lumen")
+            self.notes.append(f"{WALL}: its inner surface taken as the lumen")
+            self._walled = True
             self._keep(inner)
             self.faces = self.faces[:, ::-1]
             self._drop_small_parts()
@@ -189,7 +202,8 @@ class _Work:
                 raise ValueError(
                     f"{self.name} is not closed: a hole {mm(wide):.1f} mm wide in "
                     f"the side of a vessel at {shown(middle)} (at most "
-                    f"{mm(widest):.2g} mm are filled). Fill holes (3D Slicer: Surface "
+                    f"{mm(widest):.2g} mm are filled). "
+                    f"{_OF_WALL if self._walled else ''}Fill holes (3D Slicer: Surface "
                     "Toolbox, Fill holes), then export again."
                 )
             else:
