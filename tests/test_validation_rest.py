@@ -55,7 +55,7 @@ def test_what_swung_at_rest_stands_still(device, anatomy, depth):
 
 @pytest.mark.slow
 def test_with_a_stricter_tolerance_of_the_solver_it_stands_still():
-    options = {**rest.DEVICES["wire_014_micro"], "solver_tolerance": rest.EXACT}
+    options = {**rest.DEVICES["wire_014_micro"], "solver_tolerance": rest.STRICT}
     one = rest.compared(options, ("type1",), (0.11,))
     assert all(check.passed for check in one.checks("wire_014_micro")), one
     assert one.wobble < 1e-3

@@ -8,6 +8,5 @@ from cathsim_dmc.bridge.serving import ServeOptions, listen, serve
 
 __all__ = [
     "PROTOCOL", "BridgeError", "Connection", "Device", "DriveOptions", "Driven", "Log",
-    "ServeOptions", "SimulatedDevice", "State", "drive", "listen",
-    "serve",
+    "ServeOptions", "SimulatedDevice", "State", "drive", "listen", "serve",
 ]  # fmt: skip

@@ -9,7 +9,6 @@ from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.interface import action_table, observation_table
 
 HANDSHAKE = 5.0  # s, in which a driver says hello
-IDLE = 60.0  # s, for which a driver may wait between episodes
 MOST_FRAMES = 50  # in one period; more are a flood
 # Proposed threshold of rupture, docs/limits.md.
 FORCE_LIMIT = 1.5  # N

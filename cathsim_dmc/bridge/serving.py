@@ -15,7 +15,6 @@ from cathsim_dmc.bridge import messages, signals
 from cathsim_dmc.bridge.device import (
     FORCE_LIMIT,
     HANDSHAKE,
-    IDLE,
     LIMITED,
     MOST_FRAMES,
     Device,
@@ -24,6 +23,7 @@ from cathsim_dmc.bridge.device import (
 from cathsim_dmc.bridge.messages import BridgeError, Connection
 from cathsim_dmc.bridge.records import Log, milliseconds
 
+IDLE = 60.0  # s, for which a driver may wait between episodes
 _SLICE = 0.2  # s, after which a wait looks around
 
 

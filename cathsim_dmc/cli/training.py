@@ -153,10 +153,9 @@ def _settings(arguments: list[str]) -> tuple[agents.TrainingConfig, bool]:
 def _refuse_others(arguments: list[str], settings: agents.TrainingConfig) -> None:
     """ValueError for a setting that only other algorithms have."""
     known = {item.name for item in dataclasses.fields(settings)}
-    for word in arguments:
-        name = word.partition("=")[0].removeprefix("--").removeprefix("no-")
-        name = name.replace("-", "_")
-        if not word.startswith("--") or name in known:
+    for option in (word.partition("=")[0] for word in arguments):
+        name = option.removeprefix("--").removeprefix("no-").replace("-", "_")
+        if not option.startswith("--") or name in known:
             continue
         have = [
             algorithm
@@ -165,8 +164,8 @@ def _refuse_others(arguments: list[str], settings: agents.TrainingConfig) -> Non
         ]
         if have:
             raise ValueError(
-                f"{word.partition('=')[0]} is a setting of {' and '.join(have)}, not "
-                f"of {settings.algorithm}; leave it out, or train with --algo "
+                f"{option} is a setting of {' and '.join(have)}, not of "
+                f"{settings.algorithm}; leave it out, or train with --algo "
                 f"{' or '.join(have)}"
             )
 

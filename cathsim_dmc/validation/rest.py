@@ -19,6 +19,7 @@ from cathsim_dmc.physics.stepper import PHYSICS_TIMESTEP
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.rig import STRICT
 
 DEVICES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
@@ -35,7 +36,6 @@ DEPTHS = (0.05, 0.07, 0.09, 0.11, 0.13)  # m, of the push
 # Physics steps, that many times shorter, that the mean force is compared with.
 FINER = 4
 SETTLING, WATCHED = 8.0, 4.0  # s; a thin wire swings for some seconds
-EXACT = 1e-8  # tolerance of the solver with which all devices stand still
 STILL = 0.01  # mm, RMS of the head about its mean place
 STEADY = 2.0  # %, standard deviation of the force over its mean
 CONVERGED = 3.0  # %, of the mean force in shorter steps
@@ -175,8 +175,8 @@ def validate_rest() -> Report:
     """Runs every check of devices at rest; takes some minutes."""
     found = {name: compared(options) for name, options in DEVICES.items()}
     for name, options in DEVICES.items():
-        exact = compared({**options, "solver_tolerance": EXACT})
-        found[f"{name}, strict solver,"] = exact
+        strict = compared({**options, "solver_tolerance": STRICT})
+        found[f"{name}, strict solver,"] = strict
     checks = [check for name, one in found.items() for check in one.checks(name)]
     findings = {name: one._asdict() for name, one in found.items()}
     return Report("rest", checks, findings)

@@ -29,6 +29,7 @@ from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import theory
 
 RESTING_TIME = 0.4  # s
+STRICT = 1e-8  # tolerance of the solver with which devices at rest stand still
 
 
 def half_circle(radius: float, start: float, pieces: int) -> np.ndarray:

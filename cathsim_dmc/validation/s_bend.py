@@ -18,10 +18,9 @@ from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.forces import Contacts
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check
-from cathsim_dmc.validation.rig import Rig
+from cathsim_dmc.validation.rig import STRICT, Rig
 
 SPEEDS, FRICTIONS = (0.01, 0.04), (0.037, 0.1)  # m/s; Coulomb
-EXACT = 1e-8  # tolerance of the solver with which all of them stand still
 STOPPED_BOUND = 5.0  # % of the push force
 WALL_BOUND = 5.0  # % of the sum of the forces on the wall
 CREEP_BOUND = 5.0  # % of the push force, in `_HELD`
@@ -192,19 +191,15 @@ def _push(one: Stopped, friction: float, speed: float, solved: str = "") -> Chec
 def checks() -> Iterator[Check]:
     """Push forces after a stop, and what is left of the last one."""
     for friction, speed in itertools.product(FRICTIONS, SPEEDS):
-        exact = stopped(speed, friction, tolerance=EXACT)
-        yield _push(exact, friction, speed, ", strict solver")
-    for friction in FRICTIONS:
-        for speed in SPEEDS:
-            creeps = friction == FRICTIONS[-1] and speed == SPEEDS[-1]
-            one = stopped(speed, friction, _HELD if creeps else 0.0)
-            yield _push(one, friction, speed)
-            name = f"S-bend, friction {friction:g}, links of {1e3 * LINK:g} mm, "
-            name += f"stopped from {1e3 * speed:g} mm/s: force on the wall"
-            yield Check.deviation(name, one.wall, one.expected_wall, WALL_BOUND, "N")
-            if creeps:
-                name = f"S-bend: change of the push by creep in {_HELD:g} s"
-                note = f"{1e3 * one.stopped:.2f} mN, then {1e3 * one.held:.2f} mN"
-                yield Check.deviation(
-                    name, one.held, one.stopped, CREEP_BOUND, "N", note
-                )
+        strict = stopped(speed, friction, tolerance=STRICT)
+        yield _push(strict, friction, speed, ", strict solver")
+        creeps = friction == FRICTIONS[-1] and speed == SPEEDS[-1]
+        one = stopped(speed, friction, _HELD if creeps else 0.0)
+        yield _push(one, friction, speed)
+        name = f"S-bend, friction {friction:g}, links of {1e3 * LINK:g} mm, "
+        name += f"stopped from {1e3 * speed:g} mm/s: force on the wall"
+        yield Check.deviation(name, one.wall, one.expected_wall, WALL_BOUND, "N")
+        if creeps:
+            name = f"S-bend: change of the push by creep in {_HELD:g} s"
+            note = f"{1e3 * one.stopped:.2f} mN, then {1e3 * one.held:.2f} mN"
+            yield Check.deviation(name, one.held, one.stopped, CREEP_BOUND, "N", note)

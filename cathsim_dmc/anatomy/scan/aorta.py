@@ -42,6 +42,8 @@ BEFORE, BEFORE_SPREAD = 10e-3, 11e-3
 # what was cut; the range that is accepted; and how often a scan is not as it seems.
 FACING, FACING_SPREAD, TURNED = np.radians(50.0), np.radians(25.0), 0.02
 AZIMUTH = (np.radians(-5.0), np.radians(97.0))
+# What is wrong with a scan whose sides are not the patient's.
+MISPLACED = "the scan is mirrored, turned, or in another frame (--frame, --axes)"
 
 
 def find_aorta(
@@ -195,9 +197,8 @@ def mirrored(azimuth: float | None) -> str | None:
     certain = f"{certain} and --axes, LPS where it stands upright)"
     return (
         f"the arch leads from the heart to the {side} and {face} "
-        f"({np.degrees(azimuth):.0f} degrees from back to left; 50 are usual): the "
-        "scan is mirrored, turned, or in another frame (--frame, --axes), or its heart "
-        "is at the other end (--heart)"
+        f"({np.degrees(azimuth):.0f} degrees from back to left; 50 are usual): "
+        f"{MISPLACED}, or its heart is at the other end (--heart)"
         f"{certain if right_sided(azimuth) else ''}"
     )
 

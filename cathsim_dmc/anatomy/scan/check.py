@@ -11,7 +11,7 @@ from cathsim_dmc.anatomy.centreline import CentrelinePoint
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.anatomy.reach import unreachable
 from cathsim_dmc.anatomy.scan import units
-from cathsim_dmc.anatomy.scan.aorta import TURN, Bend, mirrored
+from cathsim_dmc.anatomy.scan.aorta import MISPLACED, TURN, Bend, mirrored
 from cathsim_dmc.anatomy.scan.lumen import enlargement
 from cathsim_dmc.anatomy.scan.naming import ARCH_BRANCHES
 from cathsim_dmc.anatomy.scan.places import resized
@@ -164,8 +164,8 @@ def _arms(anatomy: Anatomy) -> Iterator[str]:
         off = np.degrees(np.arccos(across[0] / wide))
         yield (
             f"the way from the end of the rsa at {shown(ends[0])} to that of the lsa "
-            f"at {shown(ends[1])} leads {off:.0f} degrees off the patient's left: the "
-            "scan is mirrored, turned, or in another frame (--frame, --axes)"
+            f"at {shown(ends[1])} leads {off:.0f} degrees off the patient's left: "
+            f"{MISPLACED}"
         )
 
 

@@ -20,7 +20,6 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc import rows
-from cathsim_dmc.entities.arena import SOLVER_TOLERANCE
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.dispatcher import Places
 from cathsim_dmc.physics.stepper import Stepper
@@ -34,6 +33,7 @@ from cathsim_dmc.tasks.rollout import Rollout
 
 # State of a simulation, in the order in which it is written.
 _STATE = ("qpos", "qvel", "act", "qacc_warmstart")
+_LEAST_TOLERANCE = 1e-6  # of the solver, which has single precision
 
 
 class WarpStepper(Stepper):
@@ -332,7 +332,9 @@ def refuse(task: Navigation) -> None:
     missing = {
         "coaxial devices": chain.coaxial,
         "a living vessel (vessel=)": config.vessel.living,
-        "a solver_tolerance below 1e-6": config.solver_tolerance < SOLVER_TOLERANCE,
+        f"a solver_tolerance below {_LEAST_TOLERANCE:g}": (
+            config.solver_tolerance < _LEAST_TOLERANCE
+        ),
     }
     named = [name for name, there in missing.items() if there]
     if named:
