@@ -238,7 +238,7 @@ def test_a_ragged_rim_is_cut_back_to_a_plane(y_mesh, outward):
     open_faces = faces[(vertices[:, 2] > tooth)[faces].all(axis=1)]
     rim = vertices[np.unique(open_faces)][:, 2]
     faces = open_faces if outward else open_faces[:, ::-1]
-    surface, notes = mend("ragged", vertices * 1e-3, faces)
+    surface, notes, _ = mend("ragged", vertices * 1e-3, faces)
     assert any("1 open vessel ends capped, ragged rims cut" in note for note in notes)
     low = surface.vertices[:, 2].min()
     assert rim.min() * 1e-3 + 5e-3 < low < 16e-3
@@ -279,7 +279,7 @@ def test_a_hole_that_mending_makes_between_large_triangles_is_filled():
     one, other, _ = ball.faces[0]
     vertices = np.vstack([ball.vertices, 1.3 * ball.vertices[one]])
     faces = np.vstack([ball.faces, [[one, other, len(ball.vertices)]]])
-    surface, notes = mend("ball", vertices, faces)
+    surface, notes, _ = mend("ball", vertices, faces)
     assert surface.volume == pytest.approx(ball.volume, rel=0.1)
     (filled,) = (note for note in notes if "holes filled" in note)
     assert float(re.search(r"widest (\S+) mm", filled)[1]) > 8.0
@@ -379,7 +379,7 @@ def test_a_small_tangle_between_large_triangles_is_mended():
     patch += [(q, r, s), (r, p, s), (p, q, t), (q, s, t), (s, p, t)]
     faces = np.vstack([np.delete(tube.faces, face, axis=0), patch])
 
-    surface, notes = mend("tube", vertices, faces)
+    surface, notes, _ = mend("tube", vertices, faces)
 
     assert len(surface.faces) == len(tube.faces)
     assert surface.volume == pytest.approx(tube.volume)
@@ -391,7 +391,7 @@ def test_folds_that_noise_makes_in_a_coarse_surface_are_smoothed():
     vertices, faces = decimated(vertices * 1e-3, faces, 3000)
     clean = Surface(vertices, faces)
     noise = np.random.default_rng(2).normal(0.0, 0.3e-3, (len(vertices), 1))
-    surface, notes = mend("y", vertices + noise * clean.normals, faces)
+    surface, notes, _ = mend("y", vertices + noise * clean.normals, faces)
     assert len(surface.faces) == len(faces)
     assert surface.volume == pytest.approx(clean.volume, rel=0.01)
     (smoothed,) = (note for note in notes if "smoothed" in note)

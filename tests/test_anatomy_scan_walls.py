@@ -30,7 +30,7 @@ def revolved(*corners, closed=False):
 
 
 def mended(vertices, faces):
-    surface, notes = mend("tube", 1e-3 * np.asarray(vertices), np.asarray(faces))
+    surface, notes, _ = mend("tube", 1e-3 * np.asarray(vertices), np.asarray(faces))
     assert set(edge_counts(surface.faces)[1]) == {2} and surface.volume > 0.0
     return surface.volume * 1e9, " | ".join(notes)
 

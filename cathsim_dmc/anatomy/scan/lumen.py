@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan import labels as label_maps
 from cathsim_dmc.anatomy.scan import mesh
-from cathsim_dmc.anatomy.scan.repair import WALL, mend
+from cathsim_dmc.anatomy.scan.repair import mend
 from cathsim_dmc.anatomy.scan.topology import areas, merged
 from cathsim_dmc.anatomy.scan.units import UNITS, file_frame, to_lps, upright
 from cathsim_dmc.anatomy.surface import sampled
@@ -113,10 +113,10 @@ def read_lumen(
         )
     scale = enlargement(radius, Surface(vertices - vertices.mean(axis=0), faces).volume)
     with file_frame(to_lps(units, frame, axes), units, scale):
-        surface, changed = mend(str(path), scale * vertices, faces)
+        surface, changed, walled = mend(str(path), scale * vertices, faces)
     if scale != 1.0:
         surface = Surface(surface.vertices / scale, surface.faces)
-    if any(note.startswith(WALL) for note in changed) and not labelled:
+    if walled and not labelled:
         # Until now what lies between two walls was measured, too.
         why, radius = _in_wall(str(path), surface, units, given)
         say(f"note: {why}")

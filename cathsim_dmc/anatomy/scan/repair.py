@@ -1,5 +1,7 @@
 """Mending a lumen's surface: what is wrong is put right, counted and said."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from cathsim_dmc.anatomy.parts import Inlet, Surface
@@ -27,7 +29,6 @@ RAGGED = 0.1  # of an end's width: rims that are less flat are cut back to a pla
 DENSE = 30_000  # triangles; more are decimated
 FEW = 12_000  # triangles that are left then
 ROUNDS = 6
-WALL = "thick wall"  # how notes on it begin
 _OF_WALL = (
     "The surface was taken for that of a thick wall, and cut at its rims: export the "
     "lumen alone, without wall, flanges and connectors. If it has none: "
@@ -35,13 +36,19 @@ _OF_WALL = (
 _AGAIN = "Smooth or remesh that place, or export the segmentation again."
 
 
-def mend(
-    name: str, vertices: np.ndarray, faces: np.ndarray
-) -> tuple[Surface, list[str]]:
+class Mended(NamedTuple):
+    """A closed surface (m), a line for each change, and if it was that of a wall."""
+
+    surface: Surface
+    notes: list[str]
+    walled: bool
+
+
+def mend(name: str, vertices: np.ndarray, faces: np.ndarray) -> Mended:
     """Close a surface (V, 3) m, (F, 3), turn it outwards, and leave one part of it.
 
-    Also returns what was changed, a line for each. ValueError if it cannot be mended;
-    says what is wrong in the file called `name`, and where.
+    ValueError if it cannot be mended; says what is wrong in the file called `name`, and
+    where.
     """
     work = _Work(name, vertices, faces)
     work.merge()
@@ -54,7 +61,8 @@ def mend(
     work.keep_one_part(quiet=True)
     work.turn_outwards()
     work.untangle()
-    return Surface(work.vertices, work.faces), work.notes
+    surface = Surface(work.vertices, work.faces)
+    return Mended(surface, work.notes, work.walled)
 
 
 class _Work:
@@ -62,7 +70,7 @@ class _Work:
         self.name, self.vertices, self.faces = name, vertices, faces
         self.notes: list[str] = []
         self._ends, self._ragged = 0, 0.0
-        self._walled = False
+        self.walled = self._rims = False
         self._cut: set[tuple[float, ...]] = set()  # corners of what was cut out
 
     def merge(self) -> None:
@@ -92,7 +100,8 @@ class _Work:
             shells = [self.faces[label == k] for k in large]
             inner = topology.inner_shell(self.vertices, shells)
         if inner is not None:
-            self.notes.append(f"{WALL}: the inner of two surfaces taken")
+            self.notes.append("thick wall: the inner of two surfaces taken")
+            self.walled = True
             large = large[[inner]]
         elif len(large) > 1:
             remedy = (
@@ -173,8 +182,8 @@ class _Work:
         """Keeps the inner surface of a wall that is open at its ends."""
         inner = topology.lumen_of_wall(self.vertices, self.faces)
         if inner is not None:
-            self.notes.append(f"{WALL}: its inner surface taken as the lumen")
-            self._walled = True
+            self.notes.append("thick wall: its inner surface taken as the lumen")
+            self.walled = self._rims = True
             self._keep(inner)
             self.faces = self.faces[:, ::-1]
             self._drop_small_parts()
@@ -203,7 +212,7 @@ class _Work:
                     f"{self.name} is not closed: a hole {mm(wide):.1f} mm wide in "
                     f"the side of a vessel at {shown(middle)} (at most "
                     f"{mm(widest):.2g} mm are filled). "
-                    f"{_OF_WALL if self._walled else ''}Fill holes (3D Slicer: Surface "
+                    f"{_OF_WALL if self._rims else ''}Fill holes (3D Slicer: Surface "
                     "Toolbox, Fill holes), then export again."
                 )
             else:
