@@ -24,7 +24,7 @@ def each(count: int, act: Callable[[slice], Any], least: int = _LEAST) -> None:
         act: Gets the rows of a part, and writes no others.
         least: Number of rows of a part.
     """
-    cores = os.cpu_count() or 1
+    cores = 1 if count < 2 * least else os.cpu_count() or 1
     parts = min(cores, count // least)
     if parts < 2:
         act(slice(0, count))
@@ -46,8 +46,8 @@ def copy(target: np.ndarray, source: np.ndarray) -> np.ndarray:
 
 def copied(source: np.ndarray, kind: Any = None) -> np.ndarray:
     """A copy of an array with one axis or more, of a kind of numbers."""
-    if kind is None and len(source) < MANY:
-        return source.copy()
+    if len(source) < MANY:
+        return source.astype(kind or source.dtype, "C", casting="same_kind")
     return copy(np.empty(source.shape, kind or source.dtype), source)
 
 

@@ -144,10 +144,19 @@ class BatchedEnv(EnvBase):
     def _tensors(self, step: Step) -> TensorDict:
         own = self._tensor
         entries = {key: own(value) for key, value in step.observation.items()}
-        info = {key: own(value)[:, None] for key, value in step.info().items()}
         here = {"batch_size": self.batch_size, "device": self.device}
-        entries["info"] = TensorDict(info, **here)
+        entries["info"] = TensorDict(self._columns(step.info()), **here)
         return TensorDict(entries, **here)
+
+    def _columns(self, info: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+        """Figures as (N, 1); the numbers go to the device together."""
+        numbers = [key for key, value in info.items() if value.dtype != np.bool_]
+        together = self._tensor(np.stack([info[key] for key in numbers]))
+        found = dict(zip(numbers, together.unbind(), strict=True))
+        return {
+            key: (found[key] if key in found else self._tensor(value))[:, None]
+            for key, value in info.items()
+        }
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
         """On the device; numbers as float32."""
