@@ -27,9 +27,10 @@ def script(monkeypatch):
 def page(script, tmp_path):
     """Writes pages of `tmp_path`/results; returns (exit code, text, that in detail)."""
 
-    def write():
+    def write(*more):
         out = tmp_path / "docs/results.md"
-        code = script.main(["--results", str(tmp_path / "results"), "--out", str(out)])
+        results = str(tmp_path / "results")
+        code = script.main(["--results", results, "--out", str(out), *more])
         return code, out.read_text(), out.with_name("results_detail.md").read_text()
 
     return write
@@ -131,11 +132,17 @@ def test_means_stand_beside_agents_with_several_seeds_only(page, tmp_path):
     assert line_of(main, "PPO-Sequential")[-1] == "–"
 
 
-def test_published_agents_are_missing_only_where_the_grid_has_them(page, tmp_path):
+def test_published_agents_are_missing_only_where_the_grid_has_them(
+    page, script, tmp_path
+):
+    grid = (script.HERE / "grid.toml").read_text()
+    row = re.search(r'(?s)label = "SAC-Image".*?\n\n', grid)[0]
+    less = re.sub("tasks = .*", 'tasks = ["type1_bca", "type2_lcca"]', row)
+    (tmp_path / "grid.toml").write_text(grid.replace(row, less))
     fabricated_results.write(
         tmp_path / "results", "type1_lcca", "PPO-Internal", "ppo", "internal", 0, 1.0
     )
-    _, _, text = page()
+    _, _, text = page("--grid", str(tmp_path / "grid.toml"))
     assert line_of(text, "PPO-Sequential (missing)", "97 %")
     for success in ("-196 ± 5", "-68 ± 91"):  # type1_lcca, type2_bca
         assert line_of(text, "SAC-Image (not trained)", success)
