@@ -84,7 +84,7 @@ def with_demonstrations(agents, looks, path):
         looks: Looks of the agents.
         path: Path of the PNG.
     """
-    figure, (axes,) = _panels(1, height=3.4, width=6.0)
+    figure, (axes,) = _panels(1, height=3.6, width=8.4)
     for label, results in agents.items():
         line = looks[label]
         frames, success = _common(results)
@@ -98,9 +98,9 @@ def with_demonstrations(agents, looks, path):
             [np.mean([result.training["frames"] for result in results])],
             [100 * rate],
             yerr=100 * np.abs(np.array(interval)[:, None] - rate),
-            fmt="o",
-            color=line["color"],
+            marker="o",
             capsize=3,
+            **line,
             label=f"{label} ({_seeds(len(results))})",
         )
     axes.set_xscale("log")
@@ -109,7 +109,7 @@ def with_demonstrations(agents, looks, path):
     axes.set_xlabel("frames")
     axes.set_ylabel("success, %")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=7, loc="best", framealpha=0.7)
+    figure.legend(fontsize=8, loc="outside right center", handlelength=4)
     return _save(figure, path)
 
 
