@@ -17,7 +17,7 @@ from dm_control import mjcf
 from mujoco import batch as mujoco_batch
 
 from cathsim_dmc import bounds, rows
-from cathsim_dmc.physics import forces
+from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks import rehearsal
 from cathsim_dmc.tasks.cases import Case
@@ -361,9 +361,13 @@ class _PoolStepper(_BatchStepper):
 
 
 def _own(step: Step) -> Step:
-    """Observations as the caller's own, as composer's buffers make them."""
+    """Observations as the caller's own, as composer's buffers make them.
+
+    So are the readings and forces, which the next control step goes on from.
+    """
     copies = {key: rows.copied(value) for key, value in step.observation.items()}
-    return step._replace(observation=copies)
+    state = readings.copied(step.readings), readings.copied(step.wall_force)
+    return step._replace(observation=copies, readings=state[0], wall_force=state[1])
 
 
 def _refuse_overrides(kind: type) -> None:
