@@ -343,6 +343,34 @@ def test_a_snapshot_that_does_not_fit_is_refused_in_a_line(task):
         snapshot[[]]
 
 
+@pytest.mark.parametrize(
+    "change",
+    [{"numbers": [11, 10], "goal": ["bca", "bca"]}, {"goal": ["bca", "lsa"]}],
+)
+def test_anatomies_in_another_order_or_with_other_goals_are_another_task(change):
+    chosen = {"numbers": [10, 11], "goal": ["bca", *change["goal"][:1]]}
+    first, second = (
+        BatchSimulation(suite.make_task("arch_any", **options), 1, num_threads=1)
+        for options in (chosen, {**chosen, **change})
+    )
+    first.reset()
+    second.reset()
+    with pytest.raises(ValueError, match="another task: its cases is"):
+        second.restore(first.snapshot())
+
+
+def test_simulations_are_kept_and_restored_in_ascending_order(task):
+    batch = BatchSimulation(task(), 3, num_threads=1)
+    batch.reset()
+    snapshot = batch.snapshot(np.array([0, 2]))
+    for wrong in ([2, 0], [0, 0]):
+        with pytest.raises(ValueError, match=r"indices is \[\d, 0\].*ascending"):
+            batch.restore(snapshot, wrong)
+        with pytest.raises(ValueError, match="ascending"):
+            batch.snapshot(wrong)
+    batch.restore(snapshot, [0, 2])
+
+
 def test_a_refused_snapshot_leaves_the_episode_as_it_is(task):
     one, other = (suite.environment(task(3)) for _ in range(2))
     for environment in (one, other):

@@ -35,6 +35,8 @@ def describe(
     Friction, time limit, reward and what an agent sees may differ.
     """
     anatomies = {case.scene.anatomy.name: case.scene.placement.start for case in cases}
+    # By the number that a state holds.
+    numbered = [[case.scene.anatomy.name, case.scene.goal.name] for case in cases]
     return {
         "goal": scene.goal.name,
         "anatomies": {n: np.round(1e3 * p, 2).tolist() for n, p in anatomies.items()},
@@ -45,6 +47,7 @@ def describe(
             for effect in effects
         ],
         "timestep": model.opt.timestep,
+        **({"cases": numbered} if len(cases) > 1 else {}),
     }
 
 
