@@ -289,7 +289,8 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
     """Checks arguments of `composer.Environment`, which checks none of them."""
     endless = {"time_limit": math.inf, "n_sub_steps": None}
     for name, value in settings.items():
-        if name in endless and value == endless[name]:
+        plain = isinstance(value, float | None)  # an array has no single truth
+        if plain and name in endless and value == endless[name]:
             continue
         if name == "time_limit":
             bounds.number(name, value, unit="s", positive=True)
