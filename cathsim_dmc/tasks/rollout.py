@@ -112,7 +112,7 @@ class Rollout(Restorable):
             parameters=state.userdata,
         )
         self._layout = Layout(self.effects, world)
-        self._description = describe(scene, cases, self.effects, model)
+        self._description = describe(scene, cases, self.effects, model, config)
         for index in range(count):
             self._enter(index)
         self.progress = Progress(self._names, cases, count, config.give_up)
