@@ -386,6 +386,17 @@ def test_another_device_or_sheath_is_another_task(options, key):
             mine.restore(other.snapshot())
 
 
+def test_coaxial_devices_with_another_lead_are_another_task():
+    mine, others = (
+        suite.load("cathsim", "simple1_bca_pair", {"lead": lead})
+        for lead in (0.02, 0.05)
+    )
+    mine.reset()
+    others.reset()
+    with pytest.raises(ValueError, match="another task: its lead is 0.02"):
+        others.restore(mine.snapshot())
+
+
 def test_simulations_are_kept_and_restored_in_ascending_order(task):
     batch = BatchSimulation(task(), 3, num_threads=1)
     batch.reset()

@@ -38,7 +38,8 @@ def describe(
     """What tasks have in common that can go on from each other's snapshots.
 
     Friction, time limit, reward and what an agent sees may differ. Devices and sheath
-    may not: a snapshot holds the stiffness of the hinges, those held by the sheath too.
+    may not: a snapshot holds the stiffness of the hinges, those held by the sheath too,
+    and the masses of links, some of which stay as they are at the start.
     """
     anatomies = {case.scene.anatomy.name: case.scene.placement.start for case in cases}
     # By the number that a state holds.
@@ -49,6 +50,7 @@ def describe(
         "devices": list(map(_named, scene.catheter.devices)),
         "links": np.round(1e3 * scene.catheter.link_lengths, 3).tolist(),
         "sheath_clearance": config.sheath_clearance,
+        "lead": config.lead,
         "actions": list(scene.catheter.action_names),
         "effects": [
             [type(effect).__name__, *getattr(effect.parameters, "_fields", ())]
