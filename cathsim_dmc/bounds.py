@@ -31,6 +31,8 @@ FAR = 10.0
 LARGEST = 1e15
 
 _SHOWN = 80  # characters of a value in an error
+# Python and numpy count truths and durations among the integers.
+_NO_NUMBERS = bool, np.bool_, np.timedelta64
 
 
 def refuse(name: str, value: Any, allowed: str) -> NoReturn:
@@ -127,11 +129,14 @@ def seeds(name: str, value: Any, count: int) -> list[int]:
     return [seed(f"an entry of {name}", one) for one in each]
 
 
-def indices(name: str, value: Any, count: int) -> np.ndarray:
+def indices(
+    name: str, value: Any, count: int, *, ascending: bool = False
+) -> np.ndarray:
     """Numbers (K,) of some of `count` simulations, sorted, each once.
 
     Args:
         value: Integers in one row, at least one; None chooses all.
+        ascending: Refuses another order, and numbers that are there twice.
     """
     if value is None:
         return np.arange(count)
@@ -139,7 +144,10 @@ def indices(name: str, value: Any, count: int) -> np.ndarray:
     if not row or not all(_is_whole(one) and 0 <= one < count for one in row):
         allowed = f"None for all, or integers from 0 to {count - 1} in a row"
         refuse(name, value, f"{allowed}; np.flatnonzero(mask) makes them of a mask")
-    return np.unique(np.array(row, dtype=int))
+    found = np.array(row, dtype=int)
+    if ascending and (np.diff(found) <= 0).any():
+        refuse(name, value, "in ascending order, each once")
+    return np.unique(found)
 
 
 def random_state(name: str, value: Any) -> np.random.RandomState:
@@ -317,7 +325,7 @@ def _row(value: Any) -> list[Any] | None:
 
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number; a bool is not."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+    if not isinstance(value, numbers.Real) or isinstance(value, _NO_NUMBERS):
         return False
     try:
         return math.isfinite(value)
@@ -326,9 +334,7 @@ def is_number(value: Any) -> bool:
 
 
 def _is_whole(value: Any) -> bool:
-    # numpy counts durations among the integers.
-    other = isinstance(value, bool | np.timedelta64)
-    return isinstance(value, numbers.Integral) and not other
+    return isinstance(value, numbers.Integral) and not isinstance(value, _NO_NUMBERS)
 
 
 def _allowed(

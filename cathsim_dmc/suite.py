@@ -34,6 +34,9 @@ SUITE = containers.TaggedTasks()
 # Rewards are distances, not in [0, 1], and nothing is coloured by them.
 _TAG = "no_reward_visualization"
 _CONFIG_FIELDS = tuple(field.name for field in dataclasses.fields(NavigationConfig))
+# Other names of options that an objective cannot have.
+_TAKEN = "random", "environment_kwargs", "anatomy", "goal", "access"
+_TAKEN += "arches", "pool", "first", "numbers"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,10 +93,16 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
         *tags: Tags of dm_control's suite, such as "easy".
 
     Raises:
-        ValueError: if the name is taken.
+        ValueError: if the name is taken, or an option of the objective has the name of
+            one that tasks have.
     """
     bounds.text("name", name)
     bounds.instance("definition", definition, TaskDefinition)
+    if taken := sorted({*_TAKEN, *_CONFIG_FIELDS} & {*definition.objective_options}):
+        raise ValueError(
+            f"the objective of {name!r} has the options {', '.join(taken)}, which are "
+            "options of tasks and would not reach it; give them other names"
+        )
     if name in TASKS:
         raise ValueError(f"there is a task {name!r} already; choose another name")
     TASKS[name] = definition
@@ -289,7 +298,8 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
     """Checks arguments of `composer.Environment`, which checks none of them."""
     endless = {"time_limit": math.inf, "n_sub_steps": None}
     for name, value in settings.items():
-        if name in endless and value == endless[name]:
+        plain = isinstance(value, float | None)  # an array has no single truth
+        if plain and name in endless and value == endless[name]:
             continue
         if name == "time_limit":
             bounds.number(name, value, unit="s", positive=True)

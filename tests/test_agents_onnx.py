@@ -97,6 +97,15 @@ def test_what_cannot_be_exported_is_said(exported, tmp_path, cathsim):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_policy_of_random_arches_plays_the_arch_of_a_number(tmp_path):
+    folder = onnx_export.write_onnx(
+        "pretrained:navigator", tmp_path / "a", task_kwargs={"numbers": [3], **SHORT}
+    )
+    card = require_the_same(folder, 25)
+    assert card["task"]["options"]["numbers"] == [3]
+    assert "pool" not in card["task"]["options"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", pretrained.pretrained_names())
 def test_every_policy_that_ships_is_the_same_as_onnx(name, tmp_path):

@@ -390,3 +390,48 @@ def test_a_saved_model_finds_its_field_again(tube, tmp_path):
 def test_a_bore_without_width_is_refused():
     with pytest.raises(ValueError, match="radii 0 m"):
         fields.Bore(np.array([(0, 0, 0), (0, 0, 1)]), 0.0)
+
+
+_TOGETHER = """
+import threading
+import numpy as np
+from cathsim_dmc.collision import fields
+
+barrier, keys = threading.Barrier(8), []
+
+def register(number):
+    bore = fields.Bore(np.array([[0, 0, 0], [0, 0, 0.1 + 0.01 * number]]), 2e-3)
+    barrier.wait()
+    keys.append(fields.register(bore))
+
+threads = [threading.Thread(target=register, args=(n,)) for n in range(8)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+assert len(set(keys)) == 8
+for key in keys:  # whose arrays somebody owns
+    assert fields.registered(key)[0]
+"""
+
+
+def test_threads_that_register_first_at_once_share_one_table():
+    done = subprocess.run(
+        [sys.executable, "-c", _TOGETHER], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_equal_walls_that_move_otherwise_have_entries_of_their_own(tube):
+    lattices = [np.r_[np.zeros(3), 0.1, 2, 2, 2, np.full(64, v)] for v in (0.0, 1e-3)]
+    users = [fields.carrier(tube, lattice)["user"] for lattice in lattices]
+    again = fields.carrier(tube, lattices[0].copy())["user"]
+    assert len({fields.register(tube), *users}) == 3
+    assert again == users[0]
+    table = fields._get_table()
+    for user, lattice in zip(users, lattices, strict=True):
+        key = fields._key([int(part) for part in user[1:]])
+        row = table._rows[np.flatnonzero(table._rows[:, 0] == key)[0]]
+        held = table._lattices[key]
+        assert row[table._motion] == held.ctypes.data
+        np.testing.assert_array_equal(held, lattice)

@@ -153,6 +153,27 @@ def test_shaped_devices_are_equal(name, options):
             pair.reset_some([1])
 
 
+def test_what_a_caller_writes_into_a_step_changes_no_episode(anatomy):
+    pair = Pair(anatomy, observation="force")
+    pair.reset()
+    for action in actions(12):
+        step = pair.step(action)
+        for array in (*step.readings, *step.wall_force, *step.observation.values()):
+            array *= 1e3
+        for environment in pair.environments:
+            task = environment.task
+            for array in (task.goal_position, task.readings.head):
+                array += 1.0
+    alone = BatchSimulation(twin(pair.batch.task), SIMULATIONS, seeds=SEED)
+    alone.reset()
+    for action in actions(12):
+        kept = alone.step(action)
+    for name, mine in zip(kept.readings._fields, kept.readings, strict=True):
+        theirs = getattr(pair.batch.rollout.readings, name)
+        np.testing.assert_array_equal(mine, theirs, err_msg=name)
+    np.testing.assert_array_equal(kept.distance, step.distance)
+
+
 @pytest.mark.parametrize("name", ["diagnostic_5f_simmons", "berenstein_5f"])
 def test_a_shaped_device_that_is_left_alone_comes_to_rest(name):
     batch = BatchSimulation(suite.make_task("type2_lcca", device=name), 1)

@@ -231,6 +231,30 @@ def test_callbacks_that_were_removed_are_put_back_or_missed():
     ended(_LOST)
 
 
+def test_an_error_of_a_law_in_a_reset_is_that_of_the_reset(windy):
+    class Astray(SideWind):
+        acts_in = "passive"
+
+        @staticmethod
+        def law(wind, time, device):
+            wind.lengths[int(wind.force_per_length[0])] += 1.0
+
+    wrong, right = (
+        suite.environment(twin(windy("simple1_bca"), effects=[Astray((place, 0, 0))]))
+        for place in (1e6, 0)
+    )
+    right.reset()
+    with pytest.raises(RuntimeError, match="an index beyond"):
+        wrong.reset()
+    right.step(np.zeros(21))
+    batch = BatchSimulation(
+        twin(windy("simple1_bca"), effects=[Astray((1e6, 0, 0))]), 1
+    )
+    with pytest.raises(RuntimeError, match="an index beyond"):
+        batch.reset()
+    right.step(np.zeros(21))
+
+
 @pytest.mark.parametrize("place", [100, 10**8, -(10**8)])
 def test_an_index_beyond_the_bodies_is_an_error_and_writes_nothing(windy, place):
     class Astray(SideWind):

@@ -1,8 +1,12 @@
 """The domain is known to dm_control and to TorchRL, and registering it is safe."""
 
+import dataclasses
+
+import pytest
 from dm_control import suite as dm_suite
 
 from cathsim_dmc import suite
+from cathsim_dmc.tasks.objectives import Cannulation
 
 
 def test_dm_control_knows_the_tasks():
@@ -33,3 +37,13 @@ def test_torchrl_lists_the_domain():
 
     available = dict(DMControlEnv.available_envs)
     assert set(available["cathsim"]) == set(suite.SUITE)
+
+
+def test_an_objective_whose_options_would_not_reach_it_is_refused():
+    def slippery(anatomy, goal, *, friction=0.1, first=0):
+        return Cannulation.to(anatomy, goal)
+
+    known = suite.TASKS["type1_lcca"]
+    with pytest.raises(ValueError, match="'slippery' has the options first, friction"):
+        suite.register("slippery", dataclasses.replace(known, objective=slippery))
+    assert "slippery" not in suite.TASKS

@@ -241,6 +241,17 @@ def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
     many.close()
 
 
+def test_a_vector_takes_the_seed_of_its_task():
+    def start(**options):
+        return CathSimVectorEnv(2, "simple1_bca", num_threads=1, **options).reset
+
+    seen = start()(seed=5)[0]["position"]
+    for random in (5, np.int64(5), [5, 6]):
+        np.testing.assert_array_equal(start(random=random)()[0]["position"], seen)
+    with pytest.raises(ValueError, match="random is 1.5"):
+        start(random=1.5)
+
+
 def test_gymnasiums_vector_wrappers_take_the_batch():
     wrappers = gymnasium.wrappers.vector
     env = gymnasium.make_vec(TASK, 2, max_steps=3)

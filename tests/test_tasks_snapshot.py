@@ -13,6 +13,7 @@ from conftest import twin
 from dm_control import mjcf
 
 from cathsim_dmc import suite
+from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.physics.effects import Effect, Layout, World
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -36,6 +37,11 @@ MANY = 40
 # living vessel, images of two planes with delays.
 FEW = (0, 1, 2, 3)
 AHEAD = 10
+# Of the name of a device of the library, and another one.
+SOFT = dataclasses.replace(
+    DEVICES["steerable_5f"],
+    shaft=dataclasses.replace(DEVICES["steerable_5f"].shaft, bending_stiffness=1e-5),
+)
 
 
 def configuration(number):
@@ -341,6 +347,66 @@ def test_a_snapshot_that_does_not_fit_is_refused_in_a_line(task):
         environment.restore(dataclasses.replace(snapshot, arrays=far))
     with pytest.raises(ValueError, match="no simulation of 1 is chosen"):
         snapshot[[]]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"numbers": [11, 10], "goal": ["bca", "bca"]}, {"goal": ["bca", "lsa"]}],
+)
+def test_anatomies_in_another_order_or_with_other_goals_are_another_task(change):
+    chosen = {"numbers": [10, 11], "goal": ["bca", *change["goal"][:1]]}
+    first, second = (
+        BatchSimulation(suite.make_task("arch_any", **options), 1, num_threads=1)
+        for options in (chosen, {**chosen, **change})
+    )
+    first.reset()
+    second.reset()
+    with pytest.raises(ValueError, match="another task: its cases is"):
+        second.restore(first.snapshot())
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        ({"device": SOFT}, "devices"),
+        ({"working_length": 0.205}, "links"),
+        ({"sheath_clearance": 3.5e-4}, "sheath_clearance"),
+    ],
+)
+def test_another_device_or_sheath_is_another_task(options, key):
+    chosen = {"working_length": 0.2}
+    batches = [
+        BatchSimulation(suite.make_task("simple1_bca", **each), 1, num_threads=1)
+        for each in (chosen, {**chosen, **options})
+    ]
+    for batch in batches:
+        batch.reset()
+    for mine, other in (batches, batches[::-1]):
+        with pytest.raises(ValueError, match=f"another task: its {key} is"):
+            mine.restore(other.snapshot())
+
+
+def test_coaxial_devices_with_another_lead_are_another_task():
+    mine, others = (
+        suite.load("cathsim", "simple1_bca_pair", {"lead": lead})
+        for lead in (0.02, 0.05)
+    )
+    mine.reset()
+    others.reset()
+    with pytest.raises(ValueError, match="another task: its lead is 0.02"):
+        others.restore(mine.snapshot())
+
+
+def test_simulations_are_kept_and_restored_in_ascending_order(task):
+    batch = BatchSimulation(task(), 3, num_threads=1)
+    batch.reset()
+    snapshot = batch.snapshot(np.array([0, 2]))
+    for wrong in ([2, 0], [0, 0]):
+        with pytest.raises(ValueError, match=r"indices is \[\d, 0\].*ascending"):
+            batch.restore(snapshot, wrong)
+        with pytest.raises(ValueError, match="ascending"):
+            batch.snapshot(wrong)
+    batch.restore(snapshot, [0, 2])
 
 
 def test_a_refused_snapshot_leaves_the_episode_as_it_is(task):

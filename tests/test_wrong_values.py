@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 
 import cathsim_dmc
@@ -18,6 +19,8 @@ TASK = "simple1_bca"
         *(("time_limit", value) for value in (-1, 0, math.nan, "a", True, None, [])),
         *(("max_reset_attempts", value) for value in (0, -1, 1.5, "a", None)),
         *(("n_sub_steps", value) for value in (0, "a")),
+        *((name, np.ones(2)) for name in ("time_limit", "n_sub_steps")),
+        ("time_limit", np.timedelta64(1)),
         ("legacy_step", "no"),
         ("fixed_initial_state", 1),
         ("raise_exception_on_physics_error", None),
@@ -45,6 +48,13 @@ def test_an_environment_may_have_no_time_limit():
 def test_numbers_beyond_all_quantities_are_refused(options):
     with pytest.raises(ValueError, match=r"it must be at most 1e\+15 in magnitude"):
         suite.make_task(TASK, **options)
+
+
+@pytest.mark.parametrize("value", [np.array([0.01, 0.02]), np.timedelta64(1)])
+@pytest.mark.parametrize("name", ["lead", "lumen_friction", "friction"])
+def test_arrays_and_durations_are_no_numbers(name, value):
+    with pytest.raises(ValueError, match=f"{name} is .*; it must be a finite number"):
+        suite.make_task(TASK, **{name: value})
 
 
 def test_so_are_numbers_in_a_row():

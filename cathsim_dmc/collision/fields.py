@@ -17,6 +17,7 @@ import ctypes
 import functools
 import hashlib
 import re
+import threading
 import types
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,6 +38,7 @@ _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 _TYPES = int(mujoco.mjtGeom.mjNGEOMTYPES)
 
 _EXCURSION = 40e-3  # m, largest displacement of a wall beyond the box of its field
+_LOCK = threading.Lock()  # held while the table is made or written
 
 
 class Bore:
@@ -73,7 +75,7 @@ class _Table:
 
         # Owners of the arrays in the table; never freed.
         self._kept: dict[int, list[np.ndarray]] = {}
-        self._lattices: dict[int, list[np.ndarray]] = {}
+        self._lattices: dict[int, np.ndarray] = {}
         self._words, self._message = table.TABLE, ctypes.create_string_buffer(_MESSAGE)
         self._library = _mujoco_library()
         self._functions = (ctypes.c_void_p * (_TYPES * _TYPES)).in_dll(
@@ -114,7 +116,9 @@ class _Table:
 
     def move(self, key: int, lattice: np.ndarray) -> None:
         """Adds a motion lattice to an entry, for simulations of a moving vessel."""
-        self._lattices.setdefault(key, []).append(lattice)
+        if key in self._lattices:
+            return
+        self._lattices[key] = lattice
         row = self._rows[np.flatnonzero(self._rows[:, 0] == key)[0]]
         row[self._motion] = lattice.ctypes.data
         from cathsim_dmc.collision import moving
@@ -127,14 +131,23 @@ class _Table:
             self._functions[kind * _TYPES + _BOX] = module.of_link.address
 
 
-_get_table = functools.cache(_Table)
+_made_table = functools.cache(_Table)
 
 
-def register(field: Field | Bore) -> tuple[float, ...]:
+def _get_table() -> _Table:
+    """The one table, also of threads that ask for it first at the same time."""
+    with _LOCK:
+        return _made_table()
+
+
+def register(
+    field: Field | Bore, motion: np.ndarray | None = None
+) -> tuple[float, ...]:
     """Registers a field for collisions in this process; it is never removed.
 
     Args:
         field: Wall whose inner side is in contact.
+        motion: See `carrier`.
 
     Returns:
         Values of `geom_user` of its carrier.
@@ -145,10 +158,17 @@ def register(field: Field | Bore) -> tuple[float, ...]:
     digest = (
         field.digest if whole else hashlib.sha256(bytes(field.arrays[0].data)).digest()
     )
+    if motion is not None:  # another motion of an equal wall has an entry of its own
+        motion = np.ascontiguousarray(motion)
+        digest = hashlib.sha256(digest + motion.tobytes()).digest()
     parts = [int.from_bytes(digest[3 * k : 3 * k + 3], "big") % PART for k in range(3)]
     parts[0] = parts[0] or 1  # a key of 0 is none
     (low, high), kind = field.box, LUMEN if whole else BORE
-    _get_table().put(_key(parts), kind, (low + high) / 2, field.arrays)
+    known, key = _get_table(), _key(parts)
+    with _LOCK:
+        known.put(key, kind, (low + high) / 2, field.arrays)
+        if motion is not None:
+            known.move(key, motion)
     return (MARK, *map(float, parts))
 
 
@@ -183,15 +203,12 @@ def carrier(field: Field | Bore, motion: np.ndarray | None = None) -> dict[str, 
             simulations with `physics.motion.Moving`; None for a wall at rest.
     """
     low, high = field.box
-    user, around = register(field), 0.0
-    if motion is not None:
-        around = _EXCURSION
-        _get_table().move(_key([int(part) for part in user[1:]]), motion)
+    around = 0.0 if motion is None else _EXCURSION
     return {
         "type": "box",
         "pos": (low + high) / 2,
         "size": (high - low) / 2 + around,
-        "user": user,
+        "user": register(field, motion),
         "mass": 0,
         "group": 5,
         "rgba": (0, 0, 0, 0),

@@ -9,6 +9,7 @@ where somebody has removed them; what replaces them without calling them is foll
 import ctypes
 import functools
 import hashlib
+import threading
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -209,6 +210,7 @@ def laws(effect: Any, kind: Any, start: int) -> list[Law]:
 
 
 _layouts: dict[Any, Layout] = {}
+_LOCK = threading.RLock()  # held while layouts or callbacks change
 
 
 def layout(model: mujoco.MjModel, places: Places, laws: Sequence[Law]) -> Layout:
@@ -220,10 +222,11 @@ def layout(model: mujoco.MjModel, places: Places, laws: Sequence[Law]) -> Layout
     sizes = tuple(int(getattr(model, name)) for name in own.SIZES)
     arrays = [np.asarray(each, np.int64).tobytes() for each in places[1:3]]
     key = (sizes, places.first_link, *arrays, *places[3:], tuple(laws))
-    if key not in _layouts:
-        _layouts[key] = Layout(sizes, places, tuple(laws))
-    stand()
-    return _layouts[key]
+    with _LOCK:
+        if key not in _layouts:
+            _layouts[key] = Layout(sizes, places, tuple(laws))
+        stand()
+        return _layouts[key]
 
 
 def _standing(name: str) -> int:
@@ -250,12 +253,13 @@ def stand() -> None:
     Raises:
         RuntimeError: if a Python function stands in a callback.
     """
-    for name, function in (("mjcb_passive", _passive), ("mjcb_control", _control)):
-        stood = _standing(name)
-        if stood == function.address or (stood and _reaches(name)):
-            continue
-        _BEFORE[name][0] = stood
-        getattr(mujoco, f"set_{name}")(function.ctypes)
+    with _LOCK:
+        for name, function in (("mjcb_passive", _passive), ("mjcb_control", _control)):
+            stood = _standing(name)
+            if stood == function.address or (stood and _reaches(name)):
+                continue
+            _BEFORE[name][0] = stood
+            getattr(mujoco, f"set_{name}")(function.ctypes)
 
 
 @functools.cache

@@ -210,6 +210,13 @@ def part(measured: Any, rows: np.ndarray | slice | int) -> Any:
     return type(measured)._make(part(value, rows) for value in measured)
 
 
+def copied(measured: Any) -> Any:
+    """A named tuple of copies of all arrays, and of those in tuples in it."""
+    if hasattr(measured, "_fields"):
+        return type(measured)._make(map(copied, measured))
+    return array_rows.copied(measured) if np.ndim(measured) else measured
+
+
 def merged(old: Any, new: Any, rows: np.ndarray) -> Any:
     """A named tuple with `new` in some rows of its arrays (N, ...); `old` stays."""
     if old is None or isinstance(old, np.ndarray):

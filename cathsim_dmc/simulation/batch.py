@@ -17,7 +17,7 @@ from dm_control import mjcf
 from mujoco import batch as mujoco_batch
 
 from cathsim_dmc import bounds, rows
-from cathsim_dmc.physics import forces
+from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks import rehearsal
 from cathsim_dmc.tasks.cases import Case
@@ -184,7 +184,8 @@ class BatchSimulation:
         """The state between two steps, from which episodes go on bit for bit.
 
         Args:
-            indices: (K,) numbers of the simulations, K > 0; None for all.
+            indices: (K,) numbers of the simulations, K > 0, in ascending order; None
+                for all.
 
         Raises:
             ValueError: if the indices are no such numbers.
@@ -192,7 +193,7 @@ class BatchSimulation:
                 its last step.
             NotImplementedError: if these simulations have no snapshots.
         """
-        indices = bounds.indices("indices", indices, self.num_simulations)
+        indices = self._in_order(indices)
         self._refuse_waiting(indices)
         return self.rollout.snapshot(indices)
 
@@ -209,16 +210,20 @@ class BatchSimulation:
 
         Raises:
             ValueError: if the snapshot is of another task, or of another number of
-                simulations.
+                simulations, or the indices are no such numbers.
             RuntimeError: if the process has forked.
             NotImplementedError: if these simulations have no snapshots.
         """
         self._refuse_fork()
-        indices = bounds.indices("indices", indices, self.num_simulations)
+        indices = self._in_order(indices)
         waiting = indices[~self._begun[indices] | self.rollout.half_done[indices]]
         if len(waiting):
             self.reset(waiting)
         return _own(self.rollout.restore(indices, snapshot, self._random_states))
+
+    def _in_order(self, indices: np.ndarray | None) -> np.ndarray:
+        count = self.num_simulations
+        return bounds.indices("indices", indices, count, ascending=True)
 
     def _refuse_waiting(self, indices: np.ndarray) -> None:
         waiting = indices[~self._begun[indices]].tolist()
@@ -361,9 +366,13 @@ class _PoolStepper(_BatchStepper):
 
 
 def _own(step: Step) -> Step:
-    """Observations as the caller's own, as composer's buffers make them."""
+    """Observations as the caller's own, as composer's buffers make them.
+
+    So are the readings and forces, which the next control step goes on from.
+    """
     copies = {key: rows.copied(value) for key, value in step.observation.items()}
-    return step._replace(observation=copies)
+    state = readings.copied(step.readings), readings.copied(step.wall_force)
+    return step._replace(observation=copies, readings=state[0], wall_force=state[1])
 
 
 def _refuse_overrides(kind: type) -> None:

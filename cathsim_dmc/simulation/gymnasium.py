@@ -198,10 +198,13 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
             autoreset_mode: "NextStep" as Gymnasium's wrappers of observations expect,
                 "SameStep", or "Disabled", where `reset(options={"reset_mask": mask})`
                 begins some episodes.
-            **task_kwargs: Options of the task, such as `observation`.
+            **task_kwargs: Options of the task, such as `observation`, and `random`, a
+                seed of the first simulation, from which the others count up, or one
+                seed for each; without it they are seeded from the system.
         """
         self.render_mode = _render_mode(render_mode)
         self._dtype = _float_type(dtype)
+        seed = task_kwargs.pop("random", None)
         modes = [mode.value for mode in AutoresetMode]
         mode = getattr(autoreset_mode, "value", autoreset_mode)
         self._mode = AutoresetMode(bounds.choice("autoreset_mode", mode, modes))
@@ -210,8 +213,11 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
             suite.make_task(task, **task_kwargs), num_envs, num_threads=num_threads
         )
         self.num_envs = self.simulation.num_simulations
-        for state in self.simulation.random_states:
-            state.seed(None)
+        if seed is not None:
+            self.simulation.seed(bounds.seeds("random", seed, self.num_envs))
+        else:
+            for state in self.simulation.random_states:
+                state.seed(None)
         entries = self.simulation.task.observation_specs
         self.single_observation_space = space_of(entries, self._dtype)
         size = self.simulation.num_actions

@@ -116,8 +116,8 @@ class NavigationConfig:
     vessel: Any = VesselOptions()
 
     def __post_init__(self):
-        self._check_devices()
         self._check_numbers()
+        self._check_devices()
         self._check_range()
         vars(self).update(
             fluoroscopy=bounds.made(

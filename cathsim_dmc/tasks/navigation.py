@@ -16,7 +16,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.effects import Effect
-from cathsim_dmc.physics.readings import CoaxialReadings, part
+from cathsim_dmc.physics.readings import CoaxialReadings, copied, part
 from cathsim_dmc.physics.stepper import SingleStepper, Stepper
 from cathsim_dmc.tasks import cases, observations, rehearsal
 from cathsim_dmc.tasks.common_chain import CommonChain
@@ -308,17 +308,18 @@ class Navigation(composer.Task):
     @property
     def goal_position(self) -> np.ndarray:
         """Position (3,) of the goal now, m, world frame; it moves with its vessel."""
-        return self.rollout.goal[0] if self._compiled else self._objective.goal
+        goal = self.rollout.goal[0] if self._compiled else self._objective.goal
+        return goal.copy()
 
     @property
     def readings(self) -> readings.Readings:
         """State of the device after the last control step, without a leading axis."""
-        return part(self._current().readings, 0)
+        return copied(part(self._current().readings, 0))
 
     @property
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last control step, N, without a leading axis."""
-        return part(self._current().wall_force, 0)
+        return copied(part(self._current().wall_force, 0))
 
     @property
     def devices(self) -> CoaxialReadings | None:

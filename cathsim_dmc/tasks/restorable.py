@@ -5,6 +5,7 @@ The state is what holders name in their attribute `state`, and what the stepper 
 episode and is neither named nor derived from what is.
 """
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,10 +13,13 @@ import mujoco
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc.entities.device import Device
+from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.imaging.angiograph import Deviation
 from cathsim_dmc.physics.effects import Effect, Layout
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors
 from cathsim_dmc.tasks.progress import Progress
 from cathsim_dmc.tasks.scene import Scene
@@ -29,23 +33,39 @@ def describe(
     cases: Sequence[Case],
     effects: Sequence[Effect],
     model: mujoco.MjModel,
+    config: NavigationConfig,
 ) -> dict[str, Any]:
     """What tasks have in common that can go on from each other's snapshots.
 
-    Friction, time limit, reward and what an agent sees may differ.
+    Friction, time limit, reward and what an agent sees may differ. Devices and sheath
+    may not: a snapshot holds the stiffness of the hinges, those held by the sheath too,
+    and the masses of links, some of which stay as they are at the start.
     """
     anatomies = {case.scene.anatomy.name: case.scene.placement.start for case in cases}
+    # By the number that a state holds.
+    numbered = [[case.scene.anatomy.name, case.scene.goal.name] for case in cases]
     return {
         "goal": scene.goal.name,
         "anatomies": {n: np.round(1e3 * p, 2).tolist() for n, p in anatomies.items()},
-        "devices": [device.name for device in scene.catheter.devices],
+        "devices": list(map(_named, scene.catheter.devices)),
+        "links": np.round(1e3 * scene.catheter.link_lengths, 3).tolist(),
+        "sheath_clearance": config.sheath_clearance,
+        "lead": config.lead,
         "actions": list(scene.catheter.action_names),
         "effects": [
             [type(effect).__name__, *getattr(effect.parameters, "_fields", ())]
             for effect in effects
         ],
         "timestep": model.opt.timestep,
+        **({"cases": numbered} if len(cases) > 1 else {}),
     }
+
+
+def _named(device: Device) -> str:
+    """Name of a device; of one that is not of the library with a digest of it."""
+    if DEVICES.get(device.name) == device:
+        return device.name
+    return f"{device.name} {hashlib.sha256(repr(device).encode()).hexdigest()[:8]}"
 
 
 class Restorable:

@@ -112,7 +112,7 @@ class Rollout(Restorable):
             parameters=state.userdata,
         )
         self._layout = Layout(self.effects, world)
-        self._description = describe(scene, cases, self.effects, model)
+        self._description = describe(scene, cases, self.effects, model, config)
         for index in range(count):
             self._enter(index)
         self.progress = Progress(self._names, cases, count, config.give_up)
@@ -245,7 +245,9 @@ class Rollout(Restorable):
 
         Raises:
             ValueError: if an observation is not as its row declares.
+            RuntimeError: if a law has raised an error in the forward pass.
         """
+        self._layout.raise_fault()
         # The others have not moved: what is measured of them stays.
         self._measure(self._stepper.still(indices), indices)
         self._way[indices] = 0.0

@@ -28,7 +28,8 @@ class Step(NamedTuple):
     """State of N simulations after a control step, or at the start of an episode.
 
     Attributes:
-        observation: arrays (N, ...), which may share memory with the readings.
+        observation: arrays (N, ...), which may share memory with the readings; a batch
+            returns copies of both.
         outcome: reward, success and reward terms, arrays (N,); the reward is 0 and
             there is no success where the physics failed.
         terminated: (N,) bool, success, a physics error, or given up (option `give_up`).
