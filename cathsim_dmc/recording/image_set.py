@@ -134,9 +134,11 @@ def _begin(out: Path, options: ImageSetOptions) -> None:
             f"{described} says that {out} was begun with other options or another "
             f"version{_others(begun, text)}; give those, or another folder"
         )
+    files.require_folder(out, make=True)
+    # First: an interrupted run could not go on in a folder without it.
+    files.write_text(described, text)
     for name in ("annotations", *SPLITS):
         files.require_folder(out / name, make=True)
-    files.write_text(described, text)
 
 
 def _shards(out: Path, options: ImageSetOptions) -> list[_Shard]:
