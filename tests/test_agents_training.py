@@ -40,7 +40,8 @@ def small_sac(**changes):
 
 def run(config, out, **kwargs):
     kwargs.setdefault("make_env", synthetic_env.make_env)
-    return train(config, out, progress=False, **kwargs)
+    kwargs.setdefault("progress", False)
+    return train(config, out, **kwargs)
 
 
 def without_clocks(rows):
@@ -223,14 +224,15 @@ def file_header(path):
     return (path / "metrics.csv").read_text().splitlines()[0].split(",")
 
 
-def test_an_interrupt_saves_and_can_be_resumed(tmp_path):
+def test_an_interrupt_saves_and_can_be_resumed(tmp_path, capsys):
     interrupting = synthetic_env.calling(
         lambda: os.kill(os.getpid(), signal.SIGINT), at=70
     )
     config = small_ppo(total_frames=10_240, checkpoint_frames=10_240)
     handler = signal.getsignal(signal.SIGINT)
-    result = run(config, tmp_path, make_env=interrupting)
+    result = run(config, tmp_path, make_env=interrupting, progress=True)
     assert result.interrupted
+    assert "ends after this batch, with a checkpoint" in capsys.readouterr().err
     assert 0 < result.frames < 10_240
     assert Checkpoint.open(tmp_path).frames == result.frames
     assert signal.getsignal(signal.SIGINT) is handler
@@ -244,7 +246,10 @@ def test_a_run_is_neither_overwritten_nor_resumed_with_other_settings(tmp_path):
         run(small_ppo(total_frames=512), tmp_path)
     with pytest.raises(ConfigError, match="clip: it has 0.1, given is 0.3"):
         run(small_ppo(clip=0.3), tmp_path, resume=True)
-    with pytest.raises(ConfigError, match="algorithm"):
+    # The others come with the algorithm.
+    with pytest.raises(
+        ConfigError, match=r"\(algorithm: it has 'ppo', given is 'sac'\)"
+    ):
         run(small_sac(), tmp_path, resume=True)
 
 

@@ -2,6 +2,8 @@
 
 import copy
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -237,3 +239,11 @@ def test_command_builds_and_refuses(tmp_path, cathsim):
     assert not other.exists()
     with pytest.raises(FileNotFoundError):
         read_tree(tmp_path / "none.json")
+
+
+def test_the_file_of_the_docs_builds():
+    page = Path(__file__).parents[1] / "docs/anatomy_files.md"
+    (text,) = re.findall(r"```json\n(.*?)```", page.read_text(), re.DOTALL)
+    tree = parse_tree(json.loads(text))
+    for access in tree.inlets:
+        assert [*tree.build(access).goals] == ["bca", "other"]

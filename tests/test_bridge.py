@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from cathsim_dmc import bridge
+from cathsim_dmc import bridge, suite
 from cathsim_dmc.bridge import fit, messages, serving
 from cathsim_dmc.bridge.driver import Driver, connect
 
@@ -660,3 +660,11 @@ def test_a_shipped_policy_drives_its_task_as_it_plays_it(cathsim, shared_environ
     assert code == 2 and "looks at the simulation" in told
     code, _, told = cathsim("serve", "type1_lca")
     assert code == 2 and "type1_lcca" in told
+
+
+def test_a_port_that_is_taken_is_refused_before_anything_compiles(cathsim, monkeypatch):
+    monkeypatch.setattr(suite, "load", lambda *task: pytest.fail("it compiles"))
+    with bridge.listen("127.0.0.1", 0) as taken:
+        port = taken.getsockname()[1]
+        code, _, told = cathsim("serve", "type1_lcca", "--port", port)
+    assert code == 2 and f"cannot listen on 127.0.0.1:{port}" in told

@@ -21,6 +21,7 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.cli import agents as commands
 from cathsim_dmc.cli import checks, task_options, training
+from cathsim_dmc.cli import phantoms as cli_phantoms
 from cathsim_dmc.recording.episode import Episode
 
 # What works.
@@ -45,6 +46,28 @@ def test_signs_that_an_encoding_lacks_are_spelt(monkeypatch):
         cli.main()
     assert ended.value.code == 0
     assert rb"EI tip N\xb7mm\xb2" in out.buffer.getvalue()
+
+
+def test_a_reader_that_has_seen_enough_is_no_failure():
+    process = started("list")
+    process.stdout.close()
+    assert process.wait(60) == 0, process.stderr.read()
+
+
+def test_a_closed_output_is_no_error(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "argv", ["cathsim", "--version"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 0
+
+
+def test_an_import_says_that_it_replaces_an_anatomy(cathsim, tmp_path, monkeypatch):
+    anatomy = phantoms.load("simple1")
+    monkeypatch.setattr(cli_phantoms, "import_scan", lambda *where, **how: anatomy)
+    for words in ("", f"the anatomy that was in {tmp_path / 'one'} is replaced"):
+        code, _, err = cathsim("phantom", "import", "x.stl", "--out", tmp_path / "one")
+        assert code == 0 and ("is replaced" in err) == bool(words) and words in err
 
 
 @pytest.mark.parametrize("kind", [("type1",), ("test", "--index", 3)])
@@ -278,6 +301,17 @@ def test_an_interrupted_training_says_how_to_go_on(cathsim, tmp_path):
     assert f"{saved + 64} frames in" in printed
 
 
+def test_a_run_that_is_refused_is_not_called_done(cathsim, tmp_path, monkeypatch):
+    def refuse(*where, **how):
+        raise ValueError("other settings")
+
+    monkeypatch.setattr(training.agents, "train", refuse)
+    monkeypatch.setattr(training, "checkpoints_in", lambda run: [run / "0000000320"])
+    where = "--out", tmp_path / "run", "--resume"
+    code, _, err = cathsim("train", "type1_bca", *where, "--frames", 300)
+    assert (code, err) == (2, "cathsim: ValueError: other settings\n")
+
+
 @pytest.mark.parametrize(
     "arguments",
     [("eval", "random", "--task", "type1_bca", "--episodes", 30), ("validate", "rod")],
@@ -340,7 +374,27 @@ BAD = {
         ["phantom", "import", "OUT.obj", "--out", __file__],
         ["test_cli.py is a file", "directory", "--out"],
     ),
-    "no such checkpoint": (["eval", "OUT"], ["no checkpoint", "OUT"]),
+    "no such checkpoint": (["eval", "OUT"], ["no policy OUT", "expert"]),
+    "a picture that would be no PNG": (
+        ["phantom", "check", "type1", "--figure", "OUT.jpg"],
+        ["OUT.jpg does not end in .png"],
+    ),
+    "a seed of an arch": (
+        ["phantom", "generate", "II", "--seed", -5, "--out", "OUT"],
+        ["seed is -5", "from 0 to"],
+    ),
+    "a seed of demonstrations": (
+        ["demos", "type1_bca", "--out", "OUT", "--seed", -5],
+        ["seed is -5", "from 0 to"],
+    ),
+    "no threads": (
+        ["demos", "type1_bca", "--out", "OUT", "--threads", 0],
+        ["--threads", "is 0", "from 1 to"],
+    ),
+    "a seed of a drive": (
+        ["drive", "pretrained:type1_lcca", "--connect", "127.0.0.1:1", "--seed", -5],
+        ["seed is -5", "from 0 to"],
+    ),
     "no task to evaluate on": (["eval", "random"], ["needs a task"]),
     "arches where there are none": (
         ["eval", "push", "--task", "type1_bca", "--pool", 2],
@@ -376,5 +430,8 @@ def test_record_writes_the_formats_that_python_writes(tmp_path, capsys):
     assert str(arrays) in capsys.readouterr().out
     assert Episode.load(arrays).steps == 3 and film.stat().st_size > 1000
     assert sorted(tmp_path.iterdir()) == [arrays, film]
+    recording = tmp_path / "push.rrd"  # its arrays replace those of before
+    assert commands.record("push", recording, task="simple1_bca", options=options) == 0
+    assert f"{recording} {arrays}" in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"x.csv does not end in .rrd or .npz or .gif"):
         commands.record("push", tmp_path / "x.csv", task="simple1_bca", options=options)

@@ -157,6 +157,17 @@ def test_a_film_as_mp4_plays_the_episode(pushed, tmp_path):
     assert moved > 1 > 3 * still
 
 
+def test_the_x_ray_of_a_scan_that_lies_is_not_too_small_to_see(pushed, tmp_path):
+    env, episode = pushed
+    surface = env.task.scene.anatomy.surface
+    lying = dataclasses.replace(surface, vertices=surface.vertices * [6.0, 1.0, 1.0])
+    path = animate(episode, lying, tmp_path / "film.webp", frames=1, width=320)
+    with Image.open(path) as film:
+        width, height = film.size
+    # As wide as 0.66 of the height of the film.
+    assert height > width / 2.5
+
+
 def test_without_an_encoder_no_work_is_lost(pushed, tmp_path, monkeypatch):
     env, _ = pushed
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)

@@ -166,6 +166,10 @@ def test_a_set_is_resumed_and_refused_where_it_must_be(tmp_path, monkeypatch, pa
     monkeypatch.setattr(image_set, "_simulate_shard", simulate_shard)
     out = tmp_path / "set"
     options = dataclasses.replace(OPTIONS, anatomies=(2, 1, 1))
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr(image_set, "SPLITS", ("train", 0))
+        with pytest.raises(TypeError):
+            image_set.write(out, options, processes=1)
     done = image_set.write(out, options, processes=1)
     assert done["frames"] == {"train": 16, "val": 8, "test": 8} and done["new"] == 32
     assert "| train | 2 | 16 |" in (out / "README.md").read_text()
@@ -173,7 +177,7 @@ def test_a_set_is_resumed_and_refused_where_it_must_be(tmp_path, monkeypatch, pa
     assert image_set.write(out, options, processes=1)["new"] == 8
     found = json.loads((out / "annotations/train.json").read_text())["images"]
     assert len({image["id"] for image in found}) == 16
-    with pytest.raises(ValueError, match="other options"):
+    with pytest.raises(ValueError, match=r"other options.*\(anatomies \[2, 1, 1\]\)"):
         image_set.write(out, OPTIONS, processes=1)
     with pytest.raises(ValueError, match="not empty"):
         image_set.write(path.parent, OPTIONS, processes=1)

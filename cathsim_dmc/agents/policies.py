@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc import files, suite
 from cathsim_dmc.agents import pretrained
-from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError
 from cathsim_dmc.policies import POLICIES, Policy, View, make_policy
 from cathsim_dmc.simulation import environments
 
@@ -159,6 +159,11 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     if policy in POLICIES:
         return make_policy(str(policy), seed)
     path = pretrained.pretrained_path(policy)
+    if path is None and not Path(policy).exists():
+        raise CheckpointError(
+            f"no policy {policy}: it is no file or directory, and none of "
+            f"{', '.join(POLICIES)}, pretrained:NAME"
+        )
     return TrainedPolicy(Checkpoint.open(policy) if path is None else path)
 
 

@@ -4,6 +4,7 @@ import contextlib
 import math
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -17,6 +18,7 @@ from filelock import FileLock, Timeout
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
+from tqdm import tqdm
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.checkpoint import (
@@ -41,6 +43,7 @@ CONFIG_FILE = "config.json"
 # What must agree for the weights of another policy to mean the same.
 _ALIKE = ("hidden", "activation", "subtract_background",
           "convolutions", "cnn_features", "observation_clip")  # fmt: skip
+_ENDING = "ends after this batch, with a checkpoint; once more ends it at once"
 _COIN = 0.5  # deviation of an entry that is 0 or 1 equally often
 
 
@@ -131,7 +134,7 @@ def train(
             torch.manual_seed(config.seed + 1)
         log = TrainingLog(run, learner, state, progress)
         stack.callback(log.close)
-        interruption = stack.enter_context(_interruption())
+        interruption = stack.enter_context(_interruption(progress))
         call = on_checkpoint or (lambda checkpoint: None)
         return _loop(run, iter(collector), learner, log, interruption, call)
 
@@ -197,6 +200,9 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
         return None
     checkpoint = Checkpoint.open(existing[-1])
     if changed := checkpoint.config.changed_for_resume(config):
+        # With another algorithm nearly all settings differ.
+        other = {name: changed[name] for name in ("algorithm",) if name in changed}
+        changed = other or changed
         raise ConfigError(
             f"{run} cannot be resumed with other settings ({_differing(changed)}). "
             "Resume with the run's own, or start a new run in another directory. These "
@@ -384,14 +390,20 @@ def _truncate_diverged(batch: TensorDictBase) -> None:
 
 
 @contextlib.contextmanager
-def _interruption() -> Iterator[threading.Event]:
-    """Yield an event that the first SIGINT or SIGTERM of the main thread sets."""
+def _interruption(say: bool) -> Iterator[threading.Event]:
+    """Yield an event that the first SIGINT or SIGTERM of the main thread sets.
+
+    Args:
+        say: Whether standard error then tells what happens next.
+    """
     requested = threading.Event()
     with contextlib.ExitStack() as handlers:
 
         def note(number: int, frame: object) -> None:
             requested.set()
             handlers.close()
+            if say:
+                tqdm.write(_ENDING, file=sys.stderr)
 
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):

@@ -55,7 +55,8 @@ def main() -> None:
     try:
         _require_here()
         code = _run(sys.argv[1:])
-        sys.stdout.flush()
+        if out := sys.stdout:  # None where it is closed
+            out.flush()
     except BrokenPipeError:
         # The reader, such as `head`, has seen enough; nor may the exit flush again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -207,6 +207,8 @@ def record(
     for path, endings in (out, recorded.FORMATS), (gif, SUFFIXES):
         if path is not None and path.suffix not in endings:
             raise ValueError(f"{path} does not end in {' or '.join(endings)}")
+    beside = () if out is None or out.suffix != ".rrd" else (out.with_suffix(".npz"),)
+    targets += beside
     for path in targets:
         if path.suffix in SUFFIXES:
             check_film(path)
@@ -222,8 +224,8 @@ def record(
         files.require_file(path, make=True)
     if out is not None:
         recorded.write(episode, env, out, fluoroscopy)
-        if out.suffix == ".rrd":
-            episode.save(out.with_suffix(".npz"))
+    for path in beside:
+        episode.save(path)
     if gif is not None:
         recorded.write(episode, env, gif)
     print(f"{episode.steps} steps, {episode.termination}:", *targets)

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich.console import Console
 from rich.table import Table
 from tyro import conf
 
@@ -19,7 +18,15 @@ from cathsim_dmc.agents.policies import FunctionPolicy, task_and_options
 from cathsim_dmc.bridge import fit
 from cathsim_dmc.bridge.driver import Driver, connect
 from cathsim_dmc.bridge.serving import listen
-from cathsim_dmc.cli.options import CHECK_FAILED, Json, Modules, Task, print_json, say
+from cathsim_dmc.cli.options import (
+    CHECK_FAILED,
+    Json,
+    Modules,
+    Task,
+    console,
+    print_json,
+    say,
+)
 from cathsim_dmc.cli.task_options import TaskOptions, task_kind
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
@@ -58,7 +65,9 @@ def serve(
     if episodes is not None:
         bounds.whole("episodes", episodes, 1)
     bridge.Log.require(log)
-    env = suite.load(suite.DOMAIN, suite.known(task), options.given)
+    suite.known(task)
+    listen(host, port).close()  # now: what is compiled below may take a minute
+    env = suite.load(suite.DOMAIN, task, options.given)
     env.reset()  # compiles what a first reset compiles
     device = bridge.SimulatedDevice(env, task)
     with listen(host, port) as listener, bridge.Log(log) as kept:
@@ -98,6 +107,8 @@ def drive(
         how: How the device is driven.
     """
     bounds.whole("episodes", episodes, 1)
+    if seed is not None:
+        bounds.seeds("seed", seed, episodes)
     bridge.Log.require(log)
     player = agents.load_policy(policy)
     if not isinstance(player, FunctionPolicy):
@@ -132,7 +143,7 @@ def drive(
     if json:
         print_json({"checks": [], "warm_up": warm, "episodes": done})
     else:
-        Console().print(_table(done))
+        console().print(_table(done))
     return 0 if all(one["end"] in _GOOD for one in done) else CHECK_FAILED
 
 

@@ -13,8 +13,14 @@ from typing import Annotated, Literal, NamedTuple
 from packaging.requirements import Requirement
 from tyro import conf
 
-from cathsim_dmc import files
-from cathsim_dmc.cli.options import CHECK_FAILED, Json, print_json, say, show
+from cathsim_dmc.cli.options import (
+    CHECK_FAILED,
+    Json,
+    print_json,
+    require_png,
+    say,
+    show,
+)
 from cathsim_dmc.laws.capsule import nearest_places
 
 _OPENGL = "import mujoco; mujoco.GLContext(8, 8).make_current()"
@@ -151,7 +157,7 @@ def _forces(options: Protocol, json: bool) -> int:
     from cathsim_dmc.validation import force_sensors, protocol
 
     if options.figure is not None:
-        files.require_file(options.figure)
+        require_png(options.figure)
     episode = None if options.episode is None else Episode.load(options.episode)
     report = force_sensors.validate_forces(
         episode=episode, mean=options.mean, sd=options.sd, margin=options.margin

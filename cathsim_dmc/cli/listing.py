@@ -5,11 +5,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from cathsim_dmc import suite
-from cathsim_dmc.cli.options import Json, Modules, print_json
+from cathsim_dmc.cli.options import Json, Modules, console, print_json
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.devices import DEVICES
 
@@ -33,7 +32,7 @@ def show(devices: bool = False, json: Json = False, modules: Modules = ()) -> in
     if devices:
         # Unlimited width where the output is no terminal.
         width = None if sys.stdout.isatty() else 240
-        Console(width=width).print(_device_table(rows))
+        console(width).print(_device_table(rows))
         return 0
     table = Table("task", "what to do", box=None)
     for name, line in lines.items():
@@ -41,8 +40,8 @@ def show(devices: bool = False, json: Json = False, modules: Modules = ()) -> in
             table.add_row(name, line)
     for suffix, (_, words) in suite.COAXIAL.items():
         table.add_row(f"…_{suffix}", f"Each task but navigate, {words}.")
-    Console().print(table)
-    Console().print("\nPolicies that ship: " + ", ".join(policies), highlight=False)
+    console().print(table)
+    console().print("\nPolicies that ship: " + ", ".join(policies), highlight=False)
     return 0
 
 

@@ -3,9 +3,12 @@
 import contextlib
 import json
 import sys
+from pathlib import Path
 from typing import Annotated, Any
 
 from tyro import conf
+
+from cathsim_dmc import files
 
 # Exit codes beside 0: a check has failed; the input cannot be used; Ctrl-C.
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
@@ -40,6 +43,25 @@ def told_of_losses() -> contextlib.redirect_stdout:
     return contextlib.redirect_stdout(sys.stderr)
 
 
+def require_png(path: Path, later: bool = False) -> None:
+    """Require that a picture can be written; see `files.require_file`."""
+    if path.suffix != ".png":
+        raise ValueError(f"{path} does not end in .png")
+    files.require_file(path, later=later)
+
+
+def console(width: int | None = None) -> Any:
+    """A console on standard output, which raises BrokenPipeError as `print` does."""
+    from rich.console import Console
+
+    class Ours(Console):
+        def on_broken_pipe(self) -> None:
+            # Rich's own ends with exit code 1, which is that of a failed check.
+            raise BrokenPipeError
+
+    return Ours(width=width)
+
+
 def print_json(values: Any) -> None:
     """Print one JSON object."""
     print(json.dumps(values, indent=2))
@@ -50,7 +72,5 @@ def show(report: Any, as_json: bool) -> int:
     if as_json:
         print_json(report.as_dict())
     else:
-        from rich.console import Console
-
-        Console().print(report.table())
+        console().print(report.table())
     return 0 if report.passed else CHECK_FAILED

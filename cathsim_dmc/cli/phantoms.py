@@ -15,7 +15,7 @@ from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.places import describe
 from cathsim_dmc.anatomy.tree_file import read_tree
-from cathsim_dmc.cli.options import Json, print_json, say, show
+from cathsim_dmc.cli.options import Json, print_json, require_png, say, show
 from cathsim_dmc.entities import devices
 from cathsim_dmc.pictures.anatomies import anatomy_figure
 
@@ -79,6 +79,7 @@ def import_phantom(
                 f"rename is {rename}; give computed=wanted, e.g. branch_1=lra"
             )
     files.require_place(out)  # now: the import would be lost
+    replaced = (out / "anatomy.npz").is_file()
     notes: list[str] = []
     anatomy = import_scan(
         mesh, centreline, units=units, mesh_frame=frame, axes=axes, labels=label,
@@ -87,6 +88,8 @@ def import_phantom(
     )  # fmt: skip
     anatomy.save(out)
     style.save(anatomy_figure(anatomy), out / _PICTURE)
+    if replaced:
+        say(f"the anatomy that was in {out} is replaced")
     commands = _next_commands(anatomy, out, device)
     where = {"directory": str(out), "picture": str(out / _PICTURE), "notes": notes}
     radius = () if bore is None else (bore.outer_radius,)
@@ -176,6 +179,7 @@ def generate(
         raise ValueError(f"{wrong}, which I, II and III take alone")
     files.require_place(out)
     if seed is not None:
+        bounds.seed("seed", seed)
         anatomy = arch.build_seed(
             arch.ArchSeed(seed, kind, variant, neck), access=access
         )
@@ -214,7 +218,7 @@ def check(
     if figure is None and Path(phantom).is_dir():
         figure = Path(phantom) / _PICTURE
     if figure is not None:
-        files.require_place(figure.parent)
+        require_png(figure, later=True)
     anatomy = load_anatomy(phantom)
     report = validate_anatomy(anatomy)
     code = show(report, json)

@@ -4,13 +4,13 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from cathsim_dmc import __version__
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons
+from cathsim_dmc.cli.options import console
 from cathsim_dmc.physics.forces import PEAK_NOTE
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
@@ -38,7 +38,7 @@ def print_results(results: Sequence[EvaluationResult]) -> None:
     table = Table(*heads, title=title, caption=caption, caption_justify="left")
     for name in columns[0]:
         table.add_row(name, *(column[name] for column in columns))
-    Console().print(table)
+    console().print(table)
 
 
 def _figures(result: EvaluationResult) -> dict[str, str]:
@@ -77,7 +77,7 @@ def print_episodes(result: EvaluationResult) -> None:
         table.add_row(*row.values())
     table.caption = f"Peak force: of any physics step. {PEAK_NOTE}"
     # A pipe has no width that the columns would have to fit.
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    console(None if sys.stdout.isatty() else 160).print(table)
 
 
 def _outcome(

@@ -88,12 +88,6 @@ def command(arguments: list[str]) -> Any:
             task_kwargs={**settings.task_kwargs, **options.options.given},
         )
         done = [int(each.name) for each in checkpoints_in(run.out)][-1:]
-        if run.resume and done and done[0] >= config.total_frames:
-            print(
-                f"{done[0]} frames are done, and {config.total_frames} are asked for: "
-                "nothing is left to train (--frames)",
-                file=sys.stderr,
-            )
         how: Any = {"resume": run.resume, "without_replay": run.without_replay}
         if run.films:
             how["on_checkpoint"] = _filming(run.out / "films", f".{run.films}")
@@ -106,6 +100,12 @@ def command(arguments: list[str]) -> Any:
                 file=sys.stderr,
             )
             return INTERRUPTED
+        if done and done[0] >= config.total_frames:
+            print(
+                f"{done[0]} frames are done, and {config.total_frames} are asked for: "
+                "nothing is left to train (--frames)",
+                file=sys.stderr,
+            )
         print(f"{result.frames} frames in {result.seconds:.0f} s: {result.checkpoint}")
         return 0
 

@@ -25,6 +25,9 @@ _SHORTEST, _LONGEST = 2.0, 12.0  # s of a film, without its last pause
 _HOLD_MS = 1500
 _TICK_MS = 20  # browsers do not show frames that are shorter
 _DPI, _NARROWEST = 100, 64  # px
+# Width of the scene per height; beside a wider one, as of a scan that lies, the X-ray
+# image would be too small to see.
+_WIDEST = 1.6
 _MARGIN = 8e-3  # around the vessel, m
 _FORCE_COLOUR = "#b3202c"
 # A film shows the noise of fluoroscopy, at a multiple of the usual dose.
@@ -100,7 +103,7 @@ def _frames(
     episode: Episode, surface: Any, width: int, steps: np.ndarray
 ) -> Iterator[np.ndarray]:
     """RGB pictures (rows, columns, 3) uint8 of some states of an episode."""
-    rough = ParallelProjection.of(surface.vertices, margin=_MARGIN)
+    rough = ParallelProjection.of(surface.vertices, margin=_MARGIN).no_wider(_WIDEST)
     left = rough.shape[1] / rough.shape[0]  # width of the scene per height
     height = width / (left + 0.66)
     # One pixel of the glass for each of the film.

@@ -55,6 +55,12 @@ class ParallelProjection:
         low, high = flat.min(0) - margin, flat.max(0) + margin
         return cls(axes[0], axes[1], low, high, size / (high - low).max())
 
+    def no_wider(self, ratio: float) -> "ParallelProjection":
+        """The view with room above and below if it is wider than `ratio` heights."""
+        width, height = self.high - self.low
+        room = np.array([0.0, max(width / ratio - height, 0.0) / 2])
+        return replace(self, low=self.low - room, high=self.high + room)
+
     @property
     def towards(self) -> np.ndarray:
         """Unit vector (3,) from the scene towards the viewer."""

@@ -12,6 +12,7 @@ that are missing. The same options give the same files, byte by byte.
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import json
 import multiprocessing
@@ -111,6 +112,15 @@ def write(
     }  # fmt: skip
 
 
+def _others(begun: str, asked: str) -> str:
+    """Values of a dataset.json that another one has otherwise, in brackets."""
+    with contextlib.suppress(ValueError, TypeError, LookupError):  # damaged by hand
+        there, here = ({**v, **v["options"]} for v in map(json.loads, (begun, asked)))
+        names = [n for n in here if n != "options" and there[n] != here[n]]
+        return f" ({', '.join(f'{name} {there[name]}' for name in names)})"
+    return ""
+
+
 def _begin(out: Path, options: ImageSetOptions) -> None:
     """Makes the folders; refuses one with anything else in it."""
     about = {"format": _FORMAT, "version": __version__, "options": vars(options)}
@@ -119,14 +129,16 @@ def _begin(out: Path, options: ImageSetOptions) -> None:
     described = out / "dataset.json"
     if out.exists() and not described.is_file() and any(out.iterdir()):
         raise ValueError(f"{out} is not empty and no data set; choose another folder")
-    if described.is_file() and described.read_text() != text:
+    if described.is_file() and (begun := described.read_text()) != text:
         raise ValueError(
             f"{described} says that {out} was begun with other options or another "
-            "version; give those, or another folder"
+            f"version{_others(begun, text)}; give those, or another folder"
         )
+    files.require_folder(out, make=True)
+    # First: an interrupted run could not go on in a folder without it.
+    files.write_text(described, text)
     for name in ("annotations", *SPLITS):
         files.require_folder(out / name, make=True)
-    files.write_text(described, text)
 
 
 def _shards(out: Path, options: ImageSetOptions) -> list[_Shard]:
