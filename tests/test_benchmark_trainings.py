@@ -9,7 +9,7 @@ import pytest
 import synthetic_env
 import trainings
 
-from cathsim_dmc.agents import evaluation, training
+from cathsim_dmc.agents import evaluation, load_policy, training
 from cathsim_dmc.tasks.config import MAX_STEPS
 
 CELL = trainings.Cell(
@@ -207,3 +207,13 @@ def test_episodes_that_an_expert_drives_do_not_count_as_solved(shares, frames):
         row["expert_share"] = share
 
     assert trainings.solved(rows) == {"frames": frames, "seconds": frames / 100}
+
+
+def test_policies_that_ship_fit_the_cells_that_start_from_them():
+    starts = [(c, str(c.settings.get("initial_policy"))) for c in trainings.read_grid()]
+    starts = [(c, one) for c, one in starts if one.startswith("pretrained:")]
+    assert starts
+    for cell, name in starts:
+        source, own = load_policy(name).config, cell.config()
+        assert tuple(own.observation) == tuple(source.observation)
+        assert (own.hidden, own.activation) == (source.hidden, source.activation)
