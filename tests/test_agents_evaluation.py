@@ -220,6 +220,15 @@ def test_a_policy_of_any_arch_goes_to_a_named_anatomy():
     assert there == ("type1_lcca", {"delay": 2})
 
 
+def test_settings_of_the_machine_go_over_those_of_the_policy():
+    policy = policies.load_policy("pretrained:navigator_image")
+    own = policy.task_kwargs["fluoroscopy"]
+    larger = {"fluoroscopy": {"detector_size": 0.9, "third": None}}
+    _, options = policies.task_and_options(policy, "type1_lcca", larger)
+    assert options["fluoroscopy"] == {**own, **larger["fluoroscopy"]}
+    assert larger == {"fluoroscopy": {"detector_size": 0.9, "third": None}}
+
+
 def test_a_policy_takes_its_devices_to_a_named_anatomy():
     policy = policies.load_policy("pretrained:navigator_pair")
     task, options = policies.task_and_options(policy, None, {"anatomy": "type2"})

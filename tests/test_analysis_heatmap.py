@@ -1,7 +1,10 @@
+import contextlib
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 from recording_samples import make_tube
 
 from cathsim_dmc.analysis.heatmap import force_map, heatmap
@@ -52,3 +55,15 @@ def test_the_picture_shows_contacts_where_they_are(tmp_path):
     assert one[:, 1].mean() > other[:, 1].mean()  # to the right
     with pytest.raises(ValueError, match=r"\.png"):
         heatmap(np.zeros((1, 3)), np.ones(1), tube, tmp_path / "map.pdf")
+
+
+def test_sides_of_a_patient_that_are_not_known_are_not_named(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: drawn.append(self))
+    for upright in (True, False):
+        place, force = np.zeros((1, 3)), np.ones(1)
+        with contextlib.suppress(RuntimeError):  # nothing is written
+            heatmap(place, force, make_tube(), tmp_path / "map.png", upright=upright)
+        axes = drawn[-1].axes[0]
+        assert ("left" in axes.get_xlabel()) == upright
+        assert ("head" in axes.get_ylabel()) == upright

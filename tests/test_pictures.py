@@ -168,6 +168,18 @@ def test_the_x_ray_of_a_scan_that_lies_is_not_too_small_to_see(pushed, tmp_path)
     assert height > width / 2.5
 
 
+@pytest.mark.parametrize("upright", [True, False])
+def test_the_sides_of_a_patient_are_named_where_they_are_known(pushed, upright):
+    env, episode = pushed
+    assert episode.meta["upright"]
+    meta = {**episode.meta, "upright": upright}
+    kept = dataclasses.replace(episode, meta=meta)
+    moment = Moment.of_episode(kept, env.task.scene.anatomy.surface)
+    front = scene_figure(moment, fluoroscopy=False, pixels=100).axes[0]
+    assert ("front" in front.get_title()) == upright
+    assert ("head" in front.get_ylabel()) == ("left" in front.get_xlabel()) == upright
+
+
 def test_without_an_encoder_no_work_is_lost(pushed, tmp_path, monkeypatch):
     env, _ = pushed
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)

@@ -15,7 +15,8 @@ ENVS = 3
 
 @pytest.fixture(scope="module")
 def batched():
-    return BatchedEnv("type1_lcca", ENVS, num_threads=1, seed=5, observation="internal")
+    place = torch.device("cpu")  # as good as its name
+    return BatchedEnv("type1_lcca", ENVS, num_threads=1, seed=5, device=place)
 
 
 def test_dm_control_env():

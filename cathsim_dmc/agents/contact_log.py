@@ -9,6 +9,7 @@ from torchrl.envs import EnvBase
 
 from cathsim_dmc import suite
 from cathsim_dmc.analysis import heatmap
+from cathsim_dmc.anatomy.scan.aorta import is_upright
 
 # Positions (K, 3), m, and magnitudes (K,), N, of the contacts of a control step.
 _Step = tuple[np.ndarray, np.ndarray]
@@ -47,6 +48,6 @@ class ContactLog:
         if task.num_anatomies > 1:  # whose contacts lie in different places
             return
         title = f"{result.task}, {result.policy}: {len(result.episodes)} episodes"
-        surface = task.scene.anatomy.surface
-        positions, magnitudes = self.contacts()
-        heatmap.heatmap(positions, magnitudes, surface, path, title)
+        anatomy = task.scene.anatomy
+        contacts, upright = self.contacts(), is_upright(anatomy)
+        heatmap.heatmap(*contacts, anatomy.surface, path, title, upright)

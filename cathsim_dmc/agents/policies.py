@@ -184,7 +184,7 @@ def task_and_options(
     Returns:
         Name of the task, and its options. What chose the anatomy of the training stays
         behind where the task is another one; the devices go with the policy to
-        `navigate`.
+        `navigate`. Settings of `fluoroscopy` go over those of the training one by one.
 
     Raises:
         ValueError: `task` is None, and the policy was trained on none; or it is one of
@@ -209,6 +209,9 @@ def task_and_options(
         suite.known(task, config.modules)
     if task != policy.task:
         trained = {name: value for name, value in trained.items() if name not in own}
+    machine, asked = trained.get("fluoroscopy"), options.get("fluoroscopy")
+    if isinstance(machine, Mapping) and isinstance(asked, Mapping):
+        options["fluoroscopy"] = {**machine, **asked}
     return task, {**trained, **options}
 
 

@@ -1,4 +1,4 @@
-"""Where the device presses on the wall, seen from the front."""
+"""Where the device presses on the wall, along y (phantoms: from the front)."""
 
 import os
 from dataclasses import dataclass
@@ -83,6 +83,7 @@ def heatmap(
     surface: Surface,
     path: str | os.PathLike[str],
     title: str = "",
+    upright: bool = True,
 ) -> ForceMap:
     """Draw the mean of contact forces over the vessel, as a PNG.
 
@@ -91,6 +92,7 @@ def heatmap(
         force: (K,) magnitudes, N.
         surface: The vessel.
         path: Target, ``*.png``; appears whole or not at all.
+        upright: Whether +x is the patient's left and +z the head.
     """
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
@@ -117,7 +119,8 @@ def heatmap(
     bar = figure.colorbar(image, ax=axes, shrink=0.8)
     bar.set_label("mean contact force at the ends of control steps, mN")
     axes.set(xlim=x_mm[[0, -1]], ylim=z_mm[[0, -1]], aspect="equal")
-    axes.set(xlabel="x, mm (patient left →)", ylabel="z, mm (head ↑)")
+    left, head = (" (patient left →)", " (head ↑)") if upright else ("", "")
+    axes.set(xlabel=f"x, mm{left}", ylabel=f"z, mm{head}")
     axes.set_title(title, fontsize=11)
     with atomic_path(path, ".png") as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from cathsim_dmc.anatomy import Anatomy
-from cathsim_dmc.anatomy.scan.aorta import bend_of
+from cathsim_dmc.anatomy.scan.aorta import is_upright
 from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.style import COLOURS, tidy
 
@@ -85,14 +85,14 @@ def anatomy_figure(anatomy: Anatomy) -> Picture:
     rows = [line for column in range(_COLUMNS) for line in lines[column::_COLUMNS]]
     place = {"loc": "outside lower center", "ncols": _COLUMNS}
     figure.legend(handles=rows, fontsize=8, **place)
-    figure.suptitle(anatomy.name + ": axes of the scan" * (not _upright(anatomy)))
+    figure.suptitle(anatomy.name + ": axes of the scan" * (not is_upright(anatomy)))
     return figure
 
 
 def draw_anatomy(axes: Any, anatomy: Anatomy, view: str = "front") -> None:
     """Draw an anatomy into axes whose units are millimetres."""
     projection, picture = background(anatomy.surface, view, 450)
-    prepare(axes, projection, view, _upright(anatomy))
+    prepare(axes, projection, view, is_upright(anatomy))
     axes.imshow(picture.behind, extent=projection.extent_mm, interpolation="bilinear")
     for number, (name, vessel) in enumerate(anatomy.tree.vessels.items()):
         line = projection.flat_mm(vessel.centreline.points)
@@ -110,13 +110,6 @@ def draw_anatomy(axes: Any, anatomy: Anatomy, view: str = "front") -> None:
     arrow = {"arrowstyle": "->", "color": "k"}
     head, tail = projection.flat_mm(ends)
     axes.annotate("", head, tail, arrowprops=arrow)
-
-
-def _upright(anatomy: Anatomy) -> bool:
-    if anatomy.scan is None:
-        return True
-    bend = bend_of(anatomy.tree)
-    return bend is not None and bend.upright
 
 
 def prepare(

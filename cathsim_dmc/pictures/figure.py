@@ -83,7 +83,7 @@ def scene_figure(
     panels = figure.subplots(1, len(ratios), width_ratios=ratios, squeeze=False)[0]
     for panel, view, (projection, seen) in zip(panels, views, drawn, strict=False):
         draw_scene(panel, moment, projection, seen)
-        prepare(panel, projection, view)
+        prepare(panel, projection, view, moment.upright)
     if views:
         scale = Normalize(0, 1e3 * moment.force_scale)
         beside = panels[: len(views)].tolist()

@@ -38,6 +38,7 @@ class Moment:
         title: Text above the picture.
         x_ray: How X-rays show the episode.
         shadows: The devices as X-rays meet them.
+        upright: Whether the sides of the patient are known, see `is_upright`.
     """
 
     surface: Any
@@ -54,6 +55,7 @@ class Moment:
     x_ray: XRayRecord
     shadows: list[Shadow]
     outermost: np.ndarray | None = None
+    upright: bool = True
     ends: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
@@ -118,6 +120,7 @@ class Moment:
             path=episode.head[: step + 1],
             title=f"{episode.task}, {episode.time[step] - episode.time[0]:.1f} s",
             x_ray=x_ray,
+            upright=episode.meta.get("upright", True),
             shadows=_first(x_ray.shadows(episode, slice(step, step + 1))),
             **own,
         )

@@ -13,6 +13,7 @@ import numpy as np
 from dm_control.rl import control
 
 from cathsim_dmc import __version__, bounds
+from cathsim_dmc.anatomy.scan.aorta import is_upright
 from cathsim_dmc.physics.forces import NAMES
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.records import (
@@ -210,6 +211,7 @@ class EpisodeRecorder:
             "goal_radius": float(task.objective.goal_radius),
             "distance": rows["distance"],
             "anatomy": task.scene.anatomy.name,
+            "upright": is_upright(task.scene.anatomy),
             "x_ray": x_ray_meta(task),
         }
         if task.devices is not None:

@@ -41,7 +41,7 @@ class BatchedEnv(EnvBase):
         seed: int | Sequence[int] = 0,
         observation: str | Sequence[str] = "internal",
         task_kwargs: Mapping[str, Any] | None = None,
-        device: str = "cpu",
+        device: str | torch.device = "cpu",
     ):
         """Builds the simulations.
 
@@ -61,6 +61,8 @@ class BatchedEnv(EnvBase):
             ValueError: an option is not allowed.
         """
         options = bounds.options("task_kwargs", task_kwargs)
+        if isinstance(device, torch.device):
+            device = str(device)
         for given, argument in {"observation": "observation", "random": "seed"}.items():
             if given in options:
                 own = f"without {given}, for which there is the argument {argument}"

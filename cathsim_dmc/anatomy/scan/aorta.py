@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree, arc_lengths
 from cathsim_dmc.anatomy.scan.centring import resample, tangents
 from cathsim_dmc.anatomy.scan.ends import FreeEnd
@@ -240,6 +241,17 @@ def _facing(azimuth: float) -> float:
     peak = np.exp(-0.5 * (off / FACING_SPREAD) ** 2)
     peak /= FACING_SPREAD * np.sqrt(2.0 * np.pi)
     return float((1.0 - TURNED) * peak + TURNED / (2.0 * np.pi))
+
+
+def is_upright(anatomy: Anatomy) -> bool:
+    """Whether +x is the patient's left and +z the head, as far as can be told.
+
+    So it is for phantoms, and for scans whose arch is seen to stand upright.
+    """
+    if anatomy.scan is None:
+        return True
+    bend = bend_of(anatomy.tree)
+    return bend is not None and bend.upright
 
 
 def chord(row: np.ndarray) -> np.ndarray:

@@ -121,7 +121,8 @@ def inside_part(name: str, curve: np.ndarray, measure: SurfaceDepth) -> np.ndarr
         if (measure(curve * (-1.0, -1.0, 1.0)) > 0.0).mean() >= INSIDE:
             hint = (
                 "With x and y negated it lies inside: one of the two is in RAS; pass "
-                "mesh_frame='RAS' or correct coordinateSystem in the markup"
+                "mesh_frame='RAS' (--frame RAS) or correct coordinateSystem in the "
+                "markup"
             )
         raise ValueError(
             f"only {inside.mean():.0%} of the centreline lies in the lumen (at least "

@@ -250,7 +250,7 @@ def _anatomy(name: str, parts: _Parts, bore: Calibre, told: _Told) -> Anatomy:
                 raise ValueError(
                     f"the tree does not agree with the surface ({check}): {wrong}. "
                     "Mend the surface or the centrelines there, or give its frame "
-                    "(mesh_frame, axes), another inlet (--inlet X Y Z), other names or "
+                    "(--frame, --axes), another inlet (--inlet X Y Z), other names or "
                     "other centrelines."
                 )
     return anatomy

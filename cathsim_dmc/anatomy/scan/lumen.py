@@ -209,7 +209,9 @@ def guess_units(
     best = max(odds, key=lambda unit: odds[unit], default="")
     fits = [unit for unit in usual if unit in likely] or usual or likely
     better = (
-        f"pass units={' or '.join(map(repr, fits))}" if fits else "check the export"
+        f"pass units={' or '.join(map(repr, fits))} (--units)"
+        if fits
+        else "check the export"
     )
     if np.isnan(found[0]):
         raise ValueError(f"{name} is no tube: too few walls face others; {better}.")
@@ -245,7 +247,9 @@ def guess_units(
         )
     said = f"unit guessed: {best}, which makes {makes[best]}"
     others = " or ".join(repr(unit) for unit in likely if unit != best)
-    doubt = f" ({sure:.0%} sure; else pass units={others})" if sure < 0.995 else ""
+    doubt = (
+        f" ({sure:.0%} sure; else pass units={others}, --units)" if sure < 0.995 else ""
+    )
     return best, said + doubt, float(scaled[best][0])
 
 
