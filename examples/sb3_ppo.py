@@ -13,6 +13,9 @@ translation. The evaluation is that of the task: its reward, its start, its time
 import json
 from pathlib import Path
 
+# torchrl goes before dm_control.
+from cathsim_dmc import agents  # isort: skip
+
 import gymnasium
 import numpy as np
 import stable_baselines3
@@ -25,7 +28,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 import cathsim_dmc
 import cathsim_dmc.gym
-from cathsim_dmc import agents, files, suite
+from cathsim_dmc import files, suite
 from cathsim_dmc.simulation.environments import VECTOR
 
 OBSERVATION = "internal"  # numbers, without images
