@@ -365,11 +365,11 @@ def _processes() -> list[Check]:
     ]
 
 
-def _in_fresh_process(code: str, runs: int = RUNS) -> float:
+def _in_fresh_process(code: str, runs: int = RUNS, **environment: str) -> float:
     """Median of the number that a fresh interpreter prints."""
-    command = [sys.executable, "-c", code]
+    command, own = [sys.executable, "-c", code], {**os.environ, **environment}
     return statistics.median(
-        float(subprocess.check_output(command, text=True).split()[-1])
+        float(subprocess.check_output(command, text=True, env=own).split()[-1])
         for _ in range(runs)
     )
 
@@ -382,7 +382,7 @@ def _import_seconds(statement: str) -> float:
 
 
 def peak_memory() -> float:
-    """Peak memory of a process that loads a task and steps it, MB."""
+    """Peak memory of a process that loads a task and steps it, without OpenGL, MB."""
     # The kernel's high-water mark of the address space: ru_maxrss would hold what the
     # parent had when it forked.
     return _in_fresh_process(
@@ -392,6 +392,7 @@ def peak_memory() -> float:
         "print([int(line.split()[1]) / 1024 for line in open('/proc/self/status') "
         "if line.startswith('VmHWM')][0])",
         runs=3,
+        MUJOCO_GL="disable",
     )
 
 
