@@ -8,6 +8,7 @@ The two sides of a ratio take turns, so that a machine whose speed drifts bends 
 
 import argparse
 import contextlib
+import os
 import statistics
 import subprocess
 import sys
