@@ -49,5 +49,6 @@ class ContactLog:
             return
         title = f"{result.task}, {result.policy}: {len(result.episodes)} episodes"
         anatomy = task.scene.anatomy
-        contacts, upright = self.contacts(), is_upright(anatomy)
-        heatmap.heatmap(*contacts, anatomy.surface, path, title, upright)
+        positions, magnitudes = self.contacts()
+        upright, surface = is_upright(anatomy), anatomy.surface
+        heatmap.heatmap(positions, magnitudes, surface, path, title, upright)
