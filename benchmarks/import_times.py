@@ -27,7 +27,6 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.cli.options import show
 from cathsim_dmc.validation.checks import Check, Report
 
-COMMAND = "import sys; from cathsim_dmc.cli import main; sys.exit(main())"
 RUNS = 3
 _MM = 1e3
 _BORDER = 3  # voxels around the lumen
@@ -60,7 +59,7 @@ def seconds(path: Path, folder: Path) -> float:
     """Median wall time of imports of a file, s."""
     taken = []
     for run in range(RUNS):
-        command = [sys.executable, "-c", COMMAND, "phantom", "import", path]
+        command = [sys.executable, "-m", "cathsim_dmc.cli", "phantom", "import", path]
         home = {**os.environ, "XDG_CACHE_HOME": str(folder / f"cache-{run}")}
         start = time.perf_counter()
         subprocess.run(

@@ -150,6 +150,12 @@ def indices(
     return np.unique(found)
 
 
+def option_threads(value: int | None) -> None:
+    """Checks the number of threads of an option --threads, None for one per core."""
+    if value is not None:
+        whole("num_threads (--threads)", value, 1, MOST_THREADS)
+
+
 def random_state(name: str, value: Any) -> np.random.RandomState:
     """A RandomState: the given one, or one of a seed; None draws a seed."""
     if isinstance(value, np.random.RandomState):

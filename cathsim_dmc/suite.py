@@ -34,9 +34,9 @@ SUITE = containers.TaggedTasks()
 # Rewards are distances, not in [0, 1], and nothing is coloured by them.
 _TAG = "no_reward_visualization"
 _CONFIG_FIELDS = tuple(field.name for field in dataclasses.fields(NavigationConfig))
+_OF_ARCHES = "arches", "pool", "first", "numbers"  # what chooses random arches
 # Other names of options that an objective cannot have.
-_TAKEN = "random", "environment_kwargs", "anatomy", "goal", "access"
-_TAKEN += "arches", "pool", "first", "numbers"
+_TAKEN = "random", "environment_kwargs", "anatomy", "goal", "access", *_OF_ARCHES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +70,7 @@ class TaskDefinition:
         """Names of the options that choose the anatomy and the goal."""
         if self.random_arch:
             own = ("goal", "access") if self.goal == "any" else ()
-            return ("arches", "pool", "first", "numbers", *own)
+            return (*_OF_ARCHES, *own)
         own = () if self.anatomy is not None else ("anatomy", "access")
         return own if self.goal is not None else (*own, "goal")
 

@@ -96,8 +96,7 @@ def record_demonstrations(
     bounds.whole("episodes", episodes, 1)
     bounds.seeds("seed", seed, episodes)
     bounds.number("noise", noise, 0.0, 1.0)
-    if num_threads is not None:
-        bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
+    bounds.option_threads(num_threads)
     dataset.check_free(out)
     extras.require("gym", "gymnasium", "minari", "h5py")
     from cathsim_dmc.simulation import gymnasium

@@ -162,8 +162,7 @@ class _Plan:
         start: Snapshot | None,
     ) -> list["_Group"]:
         """The episodes of each part, side by side."""
-        if num_threads is not None:
-            bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
+        bounds.option_threads(num_threads)
         errors = None
         if out_dir is not None:
             # Now: an evaluation that cannot be written would be lost.

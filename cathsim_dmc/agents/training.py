@@ -3,8 +3,6 @@
 import contextlib
 import math
 import os
-import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -18,7 +16,6 @@ from filelock import FileLock, Timeout
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.checkpoint import (
@@ -31,6 +28,7 @@ from cathsim_dmc.agents.collection import make_collector
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
+from cathsim_dmc.agents.interruption import noted_interruption
 from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.learners import LEARNERS, check_usable
 from cathsim_dmc.agents.networks import NetworkShapes, bounded
@@ -43,7 +41,6 @@ CONFIG_FILE = "config.json"
 # What must agree for the weights of another policy to mean the same.
 _ALIKE = ("hidden", "activation", "subtract_background",
           "convolutions", "cnn_features", "observation_clip")  # fmt: skip
-_ENDING = "ends after this batch, with a checkpoint; once more ends it at once"
 _COIN = 0.5  # deviation of an entry that is 0 or 1 equally often
 
 
@@ -134,7 +131,7 @@ def train(
             torch.manual_seed(config.seed + 1)
         log = TrainingLog(run, learner, state, progress)
         stack.callback(log.close)
-        interruption = stack.enter_context(_interruption(progress))
+        interruption = stack.enter_context(noted_interruption(progress))
         call = on_checkpoint or (lambda checkpoint: None)
         return _loop(run, iter(collector), learner, log, interruption, call)
 
@@ -201,8 +198,8 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
     checkpoint = Checkpoint.open(existing[-1])
     if changed := checkpoint.config.changed_for_resume(config):
         # With another algorithm nearly all settings differ.
-        other = {name: changed[name] for name in ("algorithm",) if name in changed}
-        changed = other or changed
+        if "algorithm" in changed:
+            changed = {"algorithm": changed["algorithm"]}
         raise ConfigError(
             f"{run} cannot be resumed with other settings ({_differing(changed)}). "
             "Resume with the run's own, or start a new run in another directory. These "
@@ -387,25 +384,3 @@ def _truncate_diverged(batch: TensorDictBase) -> None:
     """Count a diverged simulation as cut off, not as ended by the task."""
     # Rewards are negative distances: the agent would learn to break the simulation.
     batch["next", "terminated"] &= ~batch["next", "info", "physics_error"].bool()
-
-
-@contextlib.contextmanager
-def _interruption(say: bool) -> Iterator[threading.Event]:
-    """Yield an event that the first SIGINT or SIGTERM of the main thread sets.
-
-    Args:
-        say: Whether standard error then tells what happens next.
-    """
-    requested = threading.Event()
-    with contextlib.ExitStack() as handlers:
-
-        def note(number: int, frame: object) -> None:
-            requested.set()
-            handlers.close()
-            if say:
-                tqdm.write(_ENDING, file=sys.stderr)
-
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                handlers.callback(signal.signal, number, signal.signal(number, note))
-        yield requested

@@ -54,12 +54,14 @@ def console(width: int | None = None) -> Any:
     """A console on standard output, which raises BrokenPipeError as `print` does."""
     from rich.console import Console
 
-    class Ours(Console):
+    class OwnConsole(Console):
+        """A console whose broken pipe is told to the caller."""
+
         def on_broken_pipe(self) -> None:
             # Rich's own ends with exit code 1, which is that of a failed check.
             raise BrokenPipeError
 
-    return Ours(width=width)
+    return OwnConsole(width=width)
 
 
 def print_json(values: Any) -> None:

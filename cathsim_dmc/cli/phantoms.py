@@ -94,9 +94,7 @@ def import_phantom(
     where = {"directory": str(out), "picture": str(out / _PICTURE), "notes": notes}
     radius = () if bore is None else (bore.outer_radius,)
     print_json({**where, **describe(anatomy, *radius), "next": commands})
-    say("next:")
-    for command in commands:
-        say(f"  {command}")
+    say("\n  ".join(("next:", *commands)))
     return 0
 
 
