@@ -8,6 +8,7 @@ import socket
 import struct
 import threading
 import time
+import types
 
 import numpy as np
 import pytest
@@ -542,6 +543,17 @@ def test_a_welcome_without_tables_is_refused():
     welcome = {"action": ["push"], "observation": [PLACE]}
     with pytest.raises(bridge.BridgeError, match="action of welcome is .'push'.*list"):
         fit.sizes(WANTED, welcome)
+
+
+@pytest.mark.parametrize("wrong", [{"shape": [-1]}, {"shape": [1e999]}, {"key": [1]}])
+def test_a_welcome_whose_arrays_have_no_size_or_name_is_refused(wrong):
+    link = types.SimpleNamespace(send=lambda *_, **__: None)
+    link.receive = lambda until: {
+        "kind": "welcome", "protocol": 1, "name": "x", "period": PERIOD,
+        "action": Robot.action, "observation": [{**PLACE, **wrong}],
+    }  # fmt: skip
+    with pytest.raises(bridge.BridgeError, match="bad_message: observation of welcome"):
+        Driver(link)
 
 
 def test_a_driver_gets_the_arrays_that_it_reads_alone():

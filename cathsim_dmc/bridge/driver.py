@@ -135,7 +135,10 @@ class Driver:
         table = self.welcome["observation"]
         try:
             self._table = {
-                str(one["key"]): (tuple(map(int, one["shape"])), str(one["dtype"]))
+                bounds.text("key", one["key"]): (
+                    tuple(bounds.whole("shape", n, 0) for n in one["shape"]),
+                    str(one["dtype"]),
+                )
                 for one in table
             }
         except (TypeError, KeyError, ValueError) as error:
