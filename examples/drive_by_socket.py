@@ -49,7 +49,7 @@ def main() -> None:
         send(sock, "start", seed=options.seed)
         back = 0
         while (state := receive(stream))["kind"] == "state" and state["end"] is None:
-            if state["force"]["largest"] > LIMIT:
+            if state["force"].get("largest", 0.0) > LIMIT:  # if it is measured
                 back = WITHDRAWAL
             action = [0.0] * (len(names) - 1) + [-1.0 if back else 1.0]
             back = max(0, back - 1)

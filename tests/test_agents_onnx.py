@@ -92,6 +92,9 @@ def test_what_cannot_be_exported_is_said(exported, tmp_path, cathsim):
         onnx_export.write_onnx("pretrained:navigator", exported)
     code, _, told = cathsim("export", "expert", "--out", tmp_path / "a")
     assert code == 2 and "has no network" in told
+    walls = "--out", tmp_path / "a", "--wall", "prisms"
+    code, _, told = cathsim("export", "pretrained:navigator", *walls)
+    assert code == 2 and "leave --wall out" in told
     code, _, told = cathsim("export", "type1_lca", "--out", tmp_path / "a")
     assert code == 2 and "type1_lcca" in told and "pretrained:NAME" in told
     assert not list(tmp_path.iterdir())

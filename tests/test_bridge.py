@@ -8,6 +8,7 @@ import socket
 import struct
 import threading
 import time
+import types
 
 import numpy as np
 import pytest
@@ -303,6 +304,66 @@ def test_a_driver_that_reads_nothing_is_left():
     link.close()
 
 
+def test_a_stop_counts_at_once_and_what_was_applied_before_is_logged(tmp_path):
+    robot = Robot(steps=100)
+    robot.period = 10.0
+    with bridge.Log(tmp_path / "device.jsonl") as log:
+        served = Served(robot, log=log, watchdog=WAIT)
+        link = served.raw()
+        link.send(1.0, "start", seed=None)
+        link.send(1.0, "action", step=0, action=[0.3, 1.0])
+        link.send(1.0, "stop", reason="enough")
+        began = time.monotonic()
+        (done,) = served.joined()
+    assert time.monotonic() - began < 5.0 and done["reason"] == "driver: enough"
+    lines = [
+        json.loads(x) for x in (tmp_path / "device.jsonl").read_text().split("\n")[:-1]
+    ]
+    assert [one["event"] for one in lines] == ["connected", "applied", "stop", "end"]
+    assert lines[1]["action"] == [0.3, 1.0] == robot.taken[0].tolist()
+    link.close()
+
+
+def test_the_forces_of_all_states_count_on_both_sides():
+    """Those of states that a slow policy skips, and of the last one."""
+
+    def slow(observation):
+        time.sleep(6 * PERIOD)
+        return push(observation)
+
+    served = Served(Robot(steps=50, force=lambda count: 2.0 * (count == 3)),
+                    force_limit=None)  # fmt: skip
+    how = bridge.DriveOptions(watchdog=WAIT, warm_up=0)
+    found = bridge.drive(slow, served.address, options=how)
+    served.joined()
+    assert (found.end, found.force, found.steps) == ("force_limit", 2.0, 1)
+    served = Served(Robot(steps=3, force=lambda n: np.float32(n == 3)), lockstep=True)
+    found = bridge.drive(push, served.address, options=SLOW)
+    assert found.force == 1.0 == served.joined()[0]["force"]
+
+
+def test_an_episode_after_one_that_the_driver_has_stopped_is_its_own():
+    robot = Robot(steps=20, force=lambda count: 2.0 * (len(robot.seeds) == 1))
+    served = Served(robot, episodes=2, force_limit=None)
+    link = connect(served.address)
+    driver = Driver(link)
+    assert driver.episode(push, 1, SLOW).end == "force_limit"
+    assert driver.episode(push, 2, SLOW).end == "success"
+    assert [one["end"] for one in served.joined()] == ["stopped", "success"]
+    link.close()
+
+
+def test_a_watchdog_that_a_period_outlasts_is_refused():
+    robot, said = Robot(), "watchdog is 0.02; it must be longer than a period.*0.02 s"
+    with pytest.raises(ValueError, match=said):
+        bridge.serve(robot, None, bridge.ServeOptions(watchdog=PERIOD))
+    served = Served(robot)
+    with pytest.raises(ValueError, match=said):
+        bridge.drive(push, served.address, options=bridge.DriveOptions(watchdog=PERIOD))
+    bridge.drive(push, served.address, options=SLOW)
+    served.joined()
+
+
 @pytest.fixture
 def interrupts():
     """Ctrl-C raises, also where the tests run in the background."""
@@ -381,7 +442,9 @@ def test_an_action_before_the_start_is_out_of_order_at_once(monkeypatch):
     served = Served(Robot(steps=2))
     link = served.raw()
     with pytest.raises(bridge.BridgeError, match=r"idle: no start came within 0.2 s"):
-        link.receive(time.monotonic() + WAIT)
+        for _ in range(100):  # a stop is no start
+            link.send(1.0, "stop", reason="none")
+            link.receive(time.monotonic() + 0.1)
     bridge.drive(push, served.address, options=SLOW)
     served.joined()
 
@@ -410,6 +473,10 @@ def test_an_end_that_is_none_is_refused_on_both_sides():
         (b'{"kind": "action", "step": -1, "action": []}', "is -1; it must be 0 or"),
         (b'{"kind": "action", "step": 0, "action": 0.5}', "is 0.5; it must be a list$"),
         (b'{"kind": "start", "seed": "a"}', 'is "a"; .*whole number or null$'),
+        (b'{"kind": "welcome", "protocol": 1, "name": "a", "period": 0, "action": [], '
+         b'"observation": []}', "period of welcome is 0; it must be above 0"),
+        (b'{"kind": "state", "step": 0, "time": 1' + b"0" * 400 + b', "observation": '
+         b'{}, "force": {}, "end": null}', "not_finite: time of state is 1000"),
         ('{"kind": "start", "seed": 1}'.encode("utf-16"), "no JSON in UTF-8"),
         ('{"kind": "start", "seed": 1}'.encode("utf-16-be"), "no JSON in UTF-8"),
     ],
@@ -429,11 +496,13 @@ def test_what_is_no_message_is_said_with_what_it_must_be(data, said):
         ([10**400, 0.0], r"wrong_shape: action\[0\] is 10000"),
         ([[0.0], 1.0], "wrong_shape: action is .*must be numbers of shape"),
         ([0.0], r"action has shape \[1\]; it must be \[2\]"),
+        ([[0.5, True]], r"wrong_shape: action\[0\]\[1\] is true"),
     ],
 )
 def test_the_entry_that_is_no_number_is_named(value, said):
     with pytest.raises(bridge.BridgeError, match=said):
-        messages.to_array("action", value, (2,), "float64")
+        shape = (1, 2) if isinstance(value[0], list) and len(value) == 1 else (2,)
+        messages.to_array("action", value, shape, "float64")
 
 
 WANTED = fit.Interface(
@@ -474,6 +543,17 @@ def test_a_welcome_without_tables_is_refused():
     welcome = {"action": ["push"], "observation": [PLACE]}
     with pytest.raises(bridge.BridgeError, match="action of welcome is .'push'.*list"):
         fit.sizes(WANTED, welcome)
+
+
+@pytest.mark.parametrize("wrong", [{"shape": [-1]}, {"shape": [1e999]}, {"key": [1]}])
+def test_a_welcome_whose_arrays_have_no_size_or_name_is_refused(wrong):
+    link = types.SimpleNamespace(send=lambda *_, **__: None)
+    link.receive = lambda until: {
+        "kind": "welcome", "protocol": 1, "name": "x", "period": PERIOD,
+        "action": Robot.action, "observation": [{**PLACE, **wrong}],
+    }  # fmt: skip
+    with pytest.raises(bridge.BridgeError, match="bad_message: observation of welcome"):
+        Driver(link)
 
 
 def test_a_driver_gets_the_arrays_that_it_reads_alone():
@@ -522,6 +602,9 @@ BAD = {
     "bad_message      ": action(action=0.5),
     "not_json   ": frame('{"kind": "stop", "reason": "x"}'.encode("utf-16-le")),
     "wrong_shape     ": action(action=[True, 0.0]),
+    "wrong_shape      ": frame(
+        b'{"kind": "action", "step": 0, "action": ' + b"[" * 800 + b"]" * 800 + b"}"
+    ),
     "flood": action() * 200,  # all but the first are late
 }
 
@@ -556,7 +639,7 @@ def test_what_is_no_action_is_refused_by_name_and_stops_the_device(patient, name
 def test_another_version_another_program_and_a_stranger_are_refused(monkeypatch):
     monkeypatch.setattr(serving, "HANDSHAKE", 0.3)
     robot = Robot(steps=2)
-    served = Served(robot, lockstep=True)
+    served = Served(robot, episodes=2, lockstep=True)
     stranger = socket.create_connection(served.address.split(":"), WAIT)
     assert b"idle" in stranger.recv(1000)
     stranger.close()
@@ -565,8 +648,10 @@ def test_another_version_another_program_and_a_stranger_are_refused(monkeypatch)
     with pytest.raises(bridge.BridgeError, match="wrong_version.* 2, this one 1"):
         link.receive(time.monotonic() + WAIT)
     first = served.raw()
-    with pytest.raises(bridge.BridgeError, match="busy"):
-        Driver(connect(served.address))
+    first.send(1.0, "start", seed=None)
+    for _ in range(2):  # while it waits for the first action too
+        with pytest.raises(bridge.BridgeError, match="busy"):
+            Driver(connect(served.address))
     first.close()
     for address in ("localhost", "a:b", ":5", "localhost:0"):
         with pytest.raises(ValueError, match="host:port"):
@@ -575,7 +660,7 @@ def test_another_version_another_program_and_a_stranger_are_refused(monkeypatch)
         with contextlib.suppress(bridge.BridgeError):
             assert bridge.drive(push, served.address, options=SLOW).end == "success"
             break
-    assert [one["end"] for one in served.joined()] == ["success"]
+    assert [one["end"] for one in served.joined()] == ["peer_lost", "success"]
     with pytest.raises(OSError, match="no device answers"):
         connect(served.address)
 
@@ -605,17 +690,19 @@ def test_options_are_checked(kind):
 
 
 def test_what_was_driven_is_a_table_in_milliseconds(capsys):
-    from rich.console import Console
-
     from cathsim_dmc.cli.bridging import _table
+    from cathsim_dmc.cli.options import console
 
     served = Served(Robot(steps=3), lockstep=True)
     one = vars(bridge.drive(push, served.address, options=SLOW))
     served.joined()
-    Console(width=80).print(_table([one, {**one, "compute": None}]))
+    console().print(_table([one, {**one, "compute": None, "reason": "[/dev/tty1]"}]))
     told = capsys.readouterr().out
+    assert "[/dev/tty1]" in told
     assert "state to action, ms: p50" in told and "state to state, ms: max" in told
-    assert "success" in told and "{" not in told and "reason" not in told
+    assert "success" in told and "{" not in told
+    console().print(_table([one]))
+    assert "reason" not in capsys.readouterr().out
 
 
 def test_a_shipped_policy_drives_its_task_as_it_plays_it(cathsim, shared_environment):

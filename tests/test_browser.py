@@ -57,7 +57,7 @@ def test_a_gamepad_holds_what_that_of_the_window_holds(tmp_path):
     shutil.copy(PAGES / "controls.js", tmp_path / "controls.mjs")
     code = """
 import { Gamepads, leaning, strength, withoutRest } from "./gamepad.mjs";
-import { Controls } from "./controls.mjs";
+import { Controls, commandOf } from "./controls.mjs";
 const buttons = [..."0123456789"].map(() => ({ value: 0, pressed: false }));
 const pad = { connected: true, mapping: "standard", axes: [0.3, -0.5, 0.9, -0.2],
               buttons };
@@ -72,7 +72,10 @@ pad.connected = false;
 gamepads.poll(controls, (command) => pressed.push(command));
 controls.restart();
 const shares = [-1, -0.5, -0.1, 0, 0.15, 0.6, 1].map(withoutRest);
+const few = leaning({ axes: [0, -1], buttons: [] });
+const keys = [{}, { ctrlKey: true }].map((k) => commandOf({ code: "KeyR", ...k }));
 console.log(JSON.stringify({ action, pressed, shares, still: [...controls.action(0.04)],
+  few, keys,
   strengths: [-1, 0, 0.015, 0.5, 1.5, 9].map(strength) }));
 """
     (tmp_path / "run.mjs").write_text(code)
@@ -92,6 +95,8 @@ console.log(JSON.stringify({ action, pressed, shares, still: [...controls.action
     controls.poll()
     np.testing.assert_allclose(page["action"], controls.action(0.04), rtol=1e-6)
     assert page["pressed"] == ["straight", "restart"] and not any(page["still"])
+    assert page["few"] == {"translation": 1, "bendX": 0, "bendY": 0}
+    assert page["keys"] == ["restart", None]  # Ctrl+R is the browser's
     given = [-1, -0.5, -0.1, 0, 0.15, 0.6, 1]
     np.testing.assert_allclose(page["shares"], [*map(hands.without_rest, given)])
     given = [-1, 0, 0.015, 0.5, 1.5, 9]

@@ -88,11 +88,23 @@ def test_a_bar_shows_the_largest_contact(
     env.reset()
     shown = window.FluoroscopyWindow(env.task, Controls(10))
     monkeypatch.setattr(
-        type(env.task), "wall_force", property(lambda _: WallForce(*6 * [force]))
-    )
+        type(env.task), "wall_force",
+        property(lambda _: WallForce(0.7, 0.7, 0.7, 0.7, force, force)),
+    )  # fmt: skip
     shown.show(env.task)
     length, drawn = screen.bars[-1]
     assert length == pytest.approx(share * (window._PANEL - 28)) and drawn == colour
+
+
+def test_a_policy_is_watched_in_the_vessel_of_its_training(cathsim, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(
+        "cathsim_dmc.play.play", lambda task, out, **how: asked.update(how) or []
+    )
+    policy = "pretrained:femoral_type1_lcca_living"
+    cathsim("play", "femoral_type1_lcca", "--policy", policy, "--max-steps", 5)
+    assert asked["task_kwargs"]["vessel"]["wall"] is True
+    assert asked["task_kwargs"]["max_steps"] == 5
 
 
 def test_without_a_display_the_message_says_so(monkeypatch):

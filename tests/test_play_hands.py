@@ -205,6 +205,13 @@ def test_a_spacemouse_does_what_the_keys_do(monkeypatch):
     # The newest report of those that have come.
     np.testing.assert_allclose(action, [0.0, -STEP, 1.0, 1.0], rtol=1e-6)
     assert controls.requested == "restart" and not reports
+
+    def lost():
+        raise OSError("read error")  # its own class of easyhid is an Exception
+
+    hand._mouse.read = lost
+    controls.poll()
+    assert not controls.action(STEP)[-2:].any()
     hand.feel(1.0)
     hand.close()
     assert hand._mouse.closed

@@ -207,6 +207,7 @@ def test_a_physics_error_ends_an_episode_of_a_vector_as_of_a_single_one():
     "options, word",
     [
         ({"render_mode": "human"}, "render_mode"),
+        ({"render_mode": ""}, "render_mode"),
         ({"autoreset_mode": "Never"}, "SameStep"),
         ({"dtype": "int8"}, "dtype"),
         ({"num_envs": 0}, "num_simulations"),
@@ -223,6 +224,8 @@ def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
     )
     with pytest.raises(RuntimeError, match="reset"):
         many.step(many.action_space.sample())
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        many.render()
     for seed in (-1, [1], [1, "a"], 1.5):
         with pytest.raises(ValueError, match="seed"):
             many.reset(seed=seed)
@@ -239,6 +242,11 @@ def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
     assert len(shown) == 2 and shown[0].shape == (32, 64, 3)
     np.testing.assert_array_equal(shown[1], one.render())
     many.close()
+    one.close()
+    with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="make another"):
+        one.reset()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        one.step(one.action_space.sample())
 
 
 def test_a_vector_takes_the_seed_of_its_task():

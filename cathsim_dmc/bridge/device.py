@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.interface import action_table, observation_table
 
@@ -13,6 +14,13 @@ MOST_FRAMES = 50  # in one period; more are a flood
 # Proposed threshold of rupture, docs/limits.md.
 FORCE_LIMIT = 1.5  # N
 LIMITED = ("largest", "push")
+
+
+def require_watchdog(watchdog: float, period: float) -> None:
+    """ValueError unless a watchdog, s, lasts longer than a period of the device."""
+    if watchdog <= period:
+        allowed = f"longer than a period of the device, {period:g} s"
+        bounds.refuse("watchdog", watchdog, allowed)
 
 
 class State(NamedTuple):
@@ -41,7 +49,7 @@ class Device(Protocol):
         period: Duration of a control step, s.
         action: A dictionary for each entry of an action, see `interface.action_table`:
             "name" and "unit"; "scale", "low" and "high" where they are known. Entries
-            whose unit is a speed are 0 where the device is to hold still.
+            whose unit holds "/s", such as m/s, are 0 where the device is to hold still.
         observation: A dictionary for each array, see `interface.observation_table`:
             "key", "shape" and "dtype", and "unit" where it is known.
     """

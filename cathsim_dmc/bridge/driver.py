@@ -17,6 +17,7 @@ from cathsim_dmc.bridge.device import (
     HANDSHAKE,
     LIMITED,
     MOST_FRAMES,
+    require_watchdog,
 )
 from cathsim_dmc.bridge.messages import BridgeError, Connection
 from cathsim_dmc.bridge.records import Log, milliseconds
@@ -104,17 +105,15 @@ class _Run:
     times: list[float] = dataclasses.field(default_factory=list)
     gaps: list[float] = dataclasses.field(default_factory=list)
 
-    def arrived(self, message: Mapping[str, Any], now: float) -> float:
-        """Count a state; its largest force, N."""
+    def arrived(self, message: Mapping[str, Any], now: float) -> None:
+        """Count a state that may be answered."""
         if message["step"] <= self.answered:
             text = f"state {message['step']} came after state {self.answered}"
             raise BridgeError("out_of_order", text)
         self.answered = message["step"]
         if math.isfinite(self.before):
             self.gaps.append(now - self.before)
-        self.before, largest = now, _largest(message["force"])
-        self.force = max(self.force, largest)
-        return largest
+        self.before, self.force = now, max(self.force, _largest(message["force"]))
 
 
 class Driver:
@@ -136,7 +135,10 @@ class Driver:
         table = self.welcome["observation"]
         try:
             self._table = {
-                str(one["key"]): (tuple(map(int, one["shape"])), str(one["dtype"]))
+                bounds.text("key", one["key"]): (
+                    tuple(bounds.whole("shape", n, 0) for n in one["shape"]),
+                    str(one["dtype"]),
+                )
                 for one in table
             }
         except (TypeError, KeyError, ValueError) as error:
@@ -177,6 +179,8 @@ class Driver:
                 not finite or of another size.
         """
         options = options or DriveOptions()
+        if not self.welcome.get("lockstep"):
+            require_watchdog(options.watchdog, self.welcome["period"])
         self._link.send(HANDSHAKE, "start", seed=seed)
         self._log.write("start", seed=seed)
         try:
@@ -203,10 +207,11 @@ class Driver:
                 reason = message["reason"][:200]
                 return self._ended(run, "stopped", told=True, reason=reason)
             messages.require_end(message["end"])
-            largest = run.arrived(message, arrived)
+            run.arrived(message, arrived)
             if message["end"] is not None:
                 return self._ended(run, message["end"], told=True)
-            if options.force_limit is not None and largest > options.force_limit:
+            # The forces of states that are skipped count too.
+            if options.force_limit is not None and run.force > options.force_limit:
                 return self._ended(run, "force_limit")
             action = self._checked(choose(self._observation(message["observation"])))
             values, step = action.tolist(), message["step"]
@@ -233,6 +238,7 @@ class Driver:
             newer = None if final else self._link.receive(0.0)
             if newer is None:
                 return message
+            run.force = max(run.force, _largest(message["force"]))
             message, run.skipped = newer, run.skipped + 1
         raise BridgeError("flood", f"over {MOST_FRAMES} states at once")
 
@@ -270,6 +276,11 @@ class Driver:
         self._log.write("stop", reason=reason)
         with contextlib.suppress(BridgeError):  # it may be gone
             self._link.send(0.2, "stop", reason=reason)
+            # What the device had sent before is not of the next episode.
+            until = time.monotonic() + 0.2
+            while (left := self._link.receive(until)) and left["kind"] == "state":
+                if left["end"] is not None:
+                    break
 
 
 def _largest(force: Mapping[str, Any]) -> float:

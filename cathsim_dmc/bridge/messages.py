@@ -8,7 +8,6 @@ import base64
 import binascii
 import contextlib
 import json
-import math
 import socket
 import struct
 import time
@@ -66,9 +65,12 @@ class BridgeError(RuntimeError):
 def pack(message: Mapping[str, Any]) -> bytes:
     """A message as a frame; BridgeError if it is too long or holds NaN."""
     try:
-        data = json.dumps(message, allow_nan=False, separators=(",", ":")).encode()
+        text = json.dumps(
+            message, allow_nan=False, separators=(",", ":"), default=np.generic.item
+        )
     except ValueError as error:
         raise BridgeError("not_finite", f"{message.get('kind')}: {error}") from error
+    data = text.encode()
     _require_length(len(data))
     return _LENGTH.pack(len(data)) + data
 
@@ -94,10 +96,13 @@ def parse(data: bytes) -> dict[str, Any]:
             names = " or ".join(_NAMES[one] for one in types if one is not float)
             names = names.replace("whole ", "") if float in types else names
             _refuse(f"{name} of {kind}", value, names)
-        if isinstance(value, float) and not math.isfinite(value):
-            raise BridgeError("not_finite", f"{name} of {kind} is {value}")
+        if float in types and not bounds.is_number(value):
+            text = f"{name} of {kind} is {_shown(value)}; it must be finite"
+            raise BridgeError("not_finite", text)
     if "step" in KINDS[kind] and message["step"] < 0:
         _refuse(f"step of {kind}", message["step"], "0 or more")
+    if "period" in KINDS[kind] and message["period"] <= 0:
+        _refuse(f"period of {kind}", message["period"], "above 0")
     return message
 
 
@@ -151,12 +156,12 @@ def to_array(name: str, value: Any, shape: Sequence[int], dtype: str) -> np.ndar
             raise ValueError(found.dtype)  # texts, integers without end
         found = found.astype(np.float64)
     except (ValueError, TypeError) as error:
-        odd, given = _odd(name, value) or (name, value)
+        odd, given = _odd(name, value, len(shape)) or (name, value)
         text = f"{odd} is {_shown(given)}; {name} must be numbers of shape {[*shape]}"
         raise BridgeError("wrong_shape", text) from error
     _require_shape(name, found, tuple(shape))
     if not np.isfinite(found).all():
-        odd, given = _odd(name, found) or (name, found)
+        odd, given = _odd(name, found.tolist(), len(shape)) or (name, found)
         raise BridgeError("not_finite", f"{odd} is {given}; it must be finite")
     return found
 
@@ -181,15 +186,20 @@ def _require_shape(name: str, found: np.ndarray, shape: tuple[int, ...]) -> None
 
 def _has_switch(value: Any) -> bool:
     """Whether numbers have true or false among them, which would count as 1 and 0."""
-    return isinstance(value, list) and bool in map(type, value)
+    return type(value) is bool or (
+        isinstance(value, list) and any(map(_has_switch, value))
+    )
 
 
-def _odd(name: str, value: Any) -> tuple[str, Any] | None:
-    """Name and value of the first entry that is no finite number, if there is one."""
-    value = value.tolist() if isinstance(value, np.ndarray) else value
+def _odd(name: str, value: Any, depth: int) -> tuple[str, Any] | None:
+    """Name and value of the first entry that is no finite number, if there is one.
+
+    Lists deeper than `depth` are not looked into: there may be hundreds in each other.
+    """
     if not isinstance(value, list):
         return None if bounds.is_number(value) else (name, value)
-    each = (_odd(f"{name}[{place}]", one) for place, one in enumerate(value))
+    inner = value if depth else []
+    each = (_odd(f"{name}[{n}]", one, depth - 1) for n, one in enumerate(inner))
     return next(filter(None, each), None)
 
 
@@ -224,7 +234,7 @@ class Connection:
         while True:
             if (message := self._next()) is not None:
                 if message["kind"] == "error":
-                    raise BridgeError(message["fault"], message["reason"])
+                    raise BridgeError(message["fault"][:80], message["reason"][:1000])
                 return message
             left = until - time.monotonic()
             self._socket.settimeout(max(left, 0.0))

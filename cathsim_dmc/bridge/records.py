@@ -38,7 +38,8 @@ class Log:
         if self._file is not None:
             line = {"t": round(time.monotonic() - self._began, 6), "event": event}
             with files.naming(self._file.name):  # on a full disk
-                self._file.write(json.dumps({**line, **values}) + "\n")
+                text = json.dumps({**line, **values}, default=np.generic.item)
+                self._file.write(text + "\n")
                 self._file.flush()
 
     def __enter__(self) -> "Log":

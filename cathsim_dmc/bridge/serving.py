@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import itertools
 import socket
 import time
 from collections.abc import Callable, Mapping
@@ -19,6 +18,7 @@ from cathsim_dmc.bridge.device import (
     MOST_FRAMES,
     Device,
     State,
+    require_watchdog,
 )
 from cathsim_dmc.bridge.messages import BridgeError, Connection
 from cathsim_dmc.bridge.records import Log, milliseconds
@@ -79,7 +79,9 @@ def serve(
         state to its action) and "tick" (by how much a period begins late), ms.
     """
     done: list[dict[str, Any]] = []
-    log = log or Log(None)
+    log, options = log or Log(None), options or ServeOptions()
+    if not options.lockstep:
+        require_watchdog(options.watchdog, device.period)
     while episodes is None or len(done) < episodes:
         listener.settimeout(_SLICE)
         try:
@@ -88,7 +90,7 @@ def serve(
             continue
         link, wrong = Connection(sock), None
         log.write("connected", peer=f"{peer}:{port}")
-        session = _Session(device, link, listener, options or ServeOptions(), log)
+        session = _Session(device, link, listener, options, log)
         try:
             session.greet()
             while (episodes is None or len(done) < episodes) and session.begins():
@@ -177,11 +179,6 @@ class _Session:
         """Wait for the start of an episode; False if the driver has left."""
         try:
             message = self._wait(IDLE, "start", "action", "stop")
-            while message["kind"] != "start":
-                # Those on their way when the last episode ended have no effect.
-                if message["kind"] == "action":
-                    self._require_past(message["step"])
-                message = self._wait(IDLE, "start", "action", "stop")
         except BridgeError as error:
             if error.fault == "peer_lost":
                 return False
@@ -214,12 +211,13 @@ class _Session:
             while True:
                 if state.end is not None:
                     bounds.choice("end of a State", state.end, messages.ENDS)
-                end = state.end or self._too_much(state.force)
+                over = self._too_much(state.force)
+                end = state.end or over
                 self._send(run.step, state, end)
                 if end is not None:
                     break
                 due = max(due, time.monotonic() - device.period) + device.period
-                action, reason = self._action(due)
+                action, reason = self._action(due, state)
                 if reason is not None:
                     end = "stopped"
                     self._log.write("stop", step=run.step, reason=reason)
@@ -230,15 +228,10 @@ class _Session:
                     run.missed += 1
                     hold = options.missed == "hold"
                     action = last if hold else np.where(self._speeds, 0.0, last)
-                    device.command(action)
+                    self._apply(action, state)
                 if not options.lockstep:
-                    time.sleep(max(0.0, due - time.monotonic()))
                     run.ticks.append(time.monotonic() - due)
                 last = action
-                self._log.write(
-                    "applied", step=run.step, action=action.tolist(),
-                    force=dict(state.force),
-                )  # fmt: skip
                 run.step += 1
                 state = device.read()
         finally:
@@ -270,47 +263,66 @@ class _Session:
             observation=observation, force=dict(state.force), end=end,
         )  # fmt: skip
 
-    def _action(self, due: float) -> tuple[np.ndarray | None, str | None]:
-        """The action of the present period, if it comes, and why to stop, or None."""
+    def _apply(self, action: np.ndarray, state: State) -> None:
+        """Give the device an action, and log it with the forces that led to it."""
+        self._device.command(action)
+        step, force = (self.running or _Running()).step, dict(state.force)
+        self._log.write("applied", step=step, action=action.tolist(), force=force)
+
+    def _action(self, due: float, state: State) -> tuple[np.ndarray | None, str | None]:
+        """The action of the present period, if it comes, and why to stop, or None.
+
+        It is applied as it comes. The rest of the period is listened to as well, so
+        that a stop or a loss of the driver counts at once.
+        """
         run, options = self.running or _Running(), self._options
-        for frames in itertools.count():
-            now = time.monotonic()
-            until = self._heard + options.watchdog
+        action, frames = None, 0
+        while True:
+            now, until = time.monotonic(), self._heard + options.watchdog
             if now > until:
-                return None, f"watchdog: no action for {now - self._heard:.3f} s"
-            message = self._link.receive(until if options.lockstep else min(due, until))
+                return action, f"watchdog: no action for {now - self._heard:.3f} s"
+            until = min(until, now + _SLICE) if options.lockstep else min(due, until)
+            message = self._link.receive(until)
             self._turn_away()
             if message is None:
                 if options.lockstep or time.monotonic() < due:
                     continue
-                return None, None
+                return action, None
+            frames += 1
             if frames > MOST_FRAMES:
                 raise BridgeError("flood", f"over {MOST_FRAMES} frames in a period")
             message = messages.require_kind(message, "action", "stop")
             if message["kind"] == "stop":
-                return None, f"driver: {message['reason'][:200]}"
+                return action, f"driver: {message['reason'][:200]}"
             self._heard = time.monotonic()
             size = (len(self._speeds),)
             given = messages.to_array("action", message["action"], size, "float64")
             if message["step"] > run.step:
                 text = f"action of step {message['step']}, but step {run.step} runs"
                 raise BridgeError("out_of_order", text)
-            if message["step"] < run.step:
-                run.late += 1  # of a state that is over
+            if message["step"] < run.step or action is not None:
+                run.late += 1  # of a state that is over, or answered
                 continue
             run.answers.append(self._heard - self._sent)
             action = np.clip(given, -1.0, 1.0)
-            self._device.command(action)
-            return action, None
-        raise AssertionError("unreachable")
+            self._apply(action, state)
+            if options.lockstep:
+                return action, None
 
     def _wait(self, seconds: float, *kinds: str) -> dict[str, Any]:
+        """The first message of the first of some kinds, without those of the others."""
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
             message = self._link.receive(time.monotonic() + min(left, _SLICE))
             self._turn_away()
-            if message is not None:
-                return messages.require_kind(message, *kinds)
+            if message is None:
+                continue
+            message = messages.require_kind(message, *kinds)
+            if message["kind"] == kinds[0]:
+                return message
+            # Those on their way when the last episode ended have no effect.
+            if message["kind"] == "action":
+                self._require_past(message["step"])
         raise BridgeError("idle", f"no {kinds[0]} came within {seconds:g} s")
 
     def _turn_away(self) -> None:

@@ -331,11 +331,14 @@ def play(
             a checkpoint, or name of a policy, such as "pretrained:type1_bca".
         hands: What you hold (extra `hands`): a gamepad vibrates with the largest
             contact; the keys act beside it.
-        options: Options of the task.
+        options: Options of the task, over those that the policy was trained with.
     """
-    player = agents.load_policy(policy, seed) if policy else None
+    player, task_kwargs = None, options.given
+    if policy:
+        player = agents.load_policy(policy, seed)
+        task, task_kwargs = task_and_options(player, task, task_kwargs)
     how: Any = {"seed": seed, "episodes": episodes, "speed": speed, "policy": player}
     how["hands"] = hands
-    for path in by_hand.play(task, out, task_kwargs=options.given, **how):
+    for path in by_hand.play(task, out, task_kwargs=task_kwargs, **how):
         print(path)
     return 0

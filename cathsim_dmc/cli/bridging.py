@@ -16,6 +16,7 @@ from cathsim_dmc import agents  # isort: skip
 from cathsim_dmc import bounds, bridge, suite
 from cathsim_dmc.agents.policies import FunctionPolicy, task_and_options
 from cathsim_dmc.bridge import fit
+from cathsim_dmc.bridge.device import require_watchdog
 from cathsim_dmc.bridge.driver import Driver, connect
 from cathsim_dmc.bridge.serving import listen
 from cathsim_dmc.cli.options import (
@@ -65,6 +66,8 @@ def serve(
     if episodes is not None:
         bounds.whole("episodes", episodes, 1)
     bridge.Log.require(log)
+    if not how.lockstep:
+        require_watchdog(how.watchdog, CONTROL_TIMESTEP)
     suite.known(task)
     listen(host, port).close()  # now: what is compiled below may take a minute
     env = suite.load(suite.DOMAIN, task, options.given)

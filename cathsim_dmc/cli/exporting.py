@@ -62,6 +62,8 @@ def export(
                 f"a task of `cathsim list`{like and ', such as '}{like}, the directory "
                 f"of a run or checkpoint, or pretrained:NAME",
             )
+        if wall != "merged":
+            raise ValueError(f"the policy {what} has no wall; leave --wall out")
         seed = EVALUATION_SEED if seed is None else seed
         player = agents.load_policy(what)
         written = write_onnx(

@@ -61,7 +61,8 @@ def console(width: int | None = None) -> Any:
             # Rich's own ends with exit code 1, which is that of a failed check.
             raise BrokenPipeError
 
-    return OwnConsole(width=width)
+    # What another program said is no markup.
+    return OwnConsole(width=width, markup=False)
 
 
 def print_json(values: Any) -> None:

@@ -150,7 +150,10 @@ class Gamepad:
 
 
 class SpaceMouse:
-    """The first SpaceMouse, by way of pyspacemouse; it has no motor."""
+    """The first SpaceMouse, by way of pyspacemouse; it has no motor.
+
+    One that is pulled out is at rest.
+    """
 
     help = (
         "push the cap away/towards you: push/pull   twist: rotate   tilt towards "
@@ -178,7 +181,10 @@ class SpaceMouse:
         before = None
         # Reports that have come since the last call; the newest counts.
         for _ in range(100):
-            state = self._mouse.read()
+            try:
+                state = self._mouse.read()
+            except Exception:  # of hidapi: it is gone
+                return {}, set()
             if state.t == before:
                 break
             before = state.t

@@ -93,7 +93,7 @@ def _play(
     def act(timestep: Any) -> np.ndarray:
         nonlocal due
         due += CONTROL_TIMESTEP / speed
-        controls.feel(float(env.task.wall_force.max))
+        controls.feel(float(env.task.wall_force.mean_max))
         window.show(env.task, until=due)
         # A machine that cannot keep pace runs slower and does not catch up later.
         due = max(due, time.monotonic() - CONTROL_TIMESTEP)

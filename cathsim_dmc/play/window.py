@@ -102,7 +102,7 @@ class FluoroscopyWindow:
             box = x - radius, y - radius, x + radius, y + radius
             self._screen.create_oval(box, outline="green2")
         self._panel.delete("all")
-        force, (most, colour) = float(task.wall_force.max), FORCE_LEVELS[-1]
+        force, (most, colour) = float(task.wall_force.mean_max), FORCE_LEVELS[-1]
         colour = next((c for level, c in FORCE_LEVELS if force <= level), colour)
         for share, fill in ((1.0, "grey20"), (min(force / most, 1.0), colour)):
             box = 14, rows - 30, 14 + share * (_PANEL - 28), rows - 14

@@ -53,7 +53,7 @@ def _float_type(dtype: str) -> np.dtype:
 
 
 def _render_mode(mode: str | None) -> str | None:
-    return mode and bounds.choice("render_mode", mode, RENDER_MODES)
+    return None if mode is None else bounds.choice("render_mode", mode, RENDER_MODES)
 
 
 def _fluoroscopy(rollout: Rollout) -> np.ndarray:
@@ -110,6 +110,10 @@ class CathSimEnv(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Starts an episode; see `gymnasium.Env.reset`. `options` has no meaning."""
+        if self._closed:
+            raise gymnasium.error.ClosedEnvironmentError(
+                "the environment is closed; make another one"
+            )
         super().reset(seed=seed)
         if seed is not None:
             self.environment.random_state.seed(seed)
@@ -164,7 +168,7 @@ class CathSimEnv(gymnasium.Env):
         """Frees the simulator; closing twice does nothing."""
         if not self._closed:
             self.environment.close()
-        self._closed = True
+        self._closed, self._ended = True, None
 
 
 class CathSimVectorEnv(gymnasium.vector.VectorEnv):
@@ -313,6 +317,8 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
                 'render() without a render_mode; make the environment with "rgb_array"'
             )
             return None
+        if not hasattr(self.simulation.rollout, "readings"):
+            raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")
         return tuple(_fluoroscopy(self.simulation.rollout))
 
 

@@ -21,6 +21,11 @@ export const KEYS = {
   KeyR: "restart",
 };
 
+/** What a key does; undefined with a modifier, which is the browser's, as in Ctrl+R. */
+export function commandOf(event) {
+  return event.ctrlKey || event.metaKey || event.altKey ? undefined : KEYS[event.code];
+}
+
 export class Controls {
   /** @param {number} tipJoints Steerable joints of the device, two motors each. */
   constructor(tipJoints) {

@@ -21,7 +21,7 @@ export function strength(force) {
 
 /** What a gamepad of the standard mapping holds: shares by axis of the controls. */
 export function leaning(pad) {
-  const [, leftY, rightX, rightY] = pad.axes.map(withoutRest);
+  const [, leftY = 0, rightX = 0, rightY = 0] = pad.axes.map(withoutRest);
   const trigger = (number) => withoutRest(pad.buttons[number]?.value ?? 0);
   return {
     translation: clamp(-leftY + trigger(7) - trigger(6)),

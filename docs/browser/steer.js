@@ -2,7 +2,7 @@
 
 import loadMujoco from "./vendor/mujoco.js";
 import { Canvases } from "./canvases.js";
-import { Controls, KEYS } from "./controls.js";
+import { Controls, KEYS, commandOf } from "./controls.js";
 import { FluoroscopyScreen, GlassView, Trace } from "./drawing.js";
 import { Gamepads } from "./gamepad.js";
 import { Headset } from "./headset.js";
@@ -55,9 +55,10 @@ function listen(page) {
     else page().state.controls.release(command);
   };
   addEventListener("keydown", (event) => {
-    if (event.target.tagName === "SELECT" || !(event.code in KEYS)) return;
+    const command = commandOf(event);
+    if (event.target.tagName === "SELECT" || !command) return;
     event.preventDefault();
-    if (!event.repeat) act(KEYS[event.code], true);
+    if (!event.repeat) act(command, true);
   });
   addEventListener("keyup", (event) => {
     if (event.code in KEYS) act(KEYS[event.code], false);
@@ -111,8 +112,11 @@ async function main() {
   const headset = new Headset(element("headset"), () => page.shown());
   const open = async () => {
     await headset.leave();
+    const name = select.value;
+    const loaded = await loadPage(mujoco, name);
+    if (name !== select.value) return; // another one was chosen meanwhile
     if (page) page.running = false;
-    page = await loadPage(mujoco, select.value);
+    page = loaded;
     globalThis.cathsim = { state: page.state, headset, steers: true }; // for tests, and for the curious
     requestAnimationFrame((now) => page.frame(now, headset));
     select.blur();
