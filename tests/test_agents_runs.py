@@ -6,6 +6,7 @@ import subprocess
 import sys
 import types
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import synthetic_env
@@ -14,6 +15,7 @@ from tensordict import TensorDict
 from test_agents_training import run, small_ppo, small_sac
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from cathsim_dmc import suite
 from cathsim_dmc.agents import Checkpoint, ConfigError, evaluate
 from cathsim_dmc.agents.learners import make_config
 from cathsim_dmc.agents.networks import NetworkShapes, make_policy
@@ -21,6 +23,7 @@ from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 from cathsim_dmc.agents.replay import ReplayError
 from cathsim_dmc.agents.training import take_over
 from cathsim_dmc.agents.training_log import read_metrics
+from cathsim_dmc.cli import agents, task_options
 from cathsim_dmc.simulation import environments
 
 
@@ -100,6 +103,19 @@ def test_a_policy_names_a_device_and_an_observation_of_another_size(trained):
     for entries in ({}, {environments.VECTOR: torch.zeros(1, 3)}):
         with pytest.raises(ValueError, match="reads 20 numbers, the task gives [03]:"):
             policy.act(TensorDict(entries, [1]))
+
+
+def test_another_number_of_actions_is_refused_before_the_task_is_made(monkeypatch):
+    monkeypatch.setattr(suite, "make_task", lambda *_, **__: pytest.fail("work lost"))
+    turned, text = task_options.task_kind()(rotation=True), "the task gives 22: play it"
+    policy, given = "pretrained:type1_lcca", {"options": turned}
+    for play in (
+        lambda: agents.evaluate(policy, **given),
+        lambda: agents.record(policy, out=Path("one.npz"), **given),
+        lambda: agents.play("type1_lcca", policy=policy, **given),
+    ):
+        with pytest.raises(ValueError, match=f"has actions of 21 numbers, {text}"):
+            play()
 
 
 def test_a_policy_that_ships_starts_a_training():

@@ -230,7 +230,7 @@ def test_a_policy_that_does_not_ship_is_replayed_by_its_actions(short, tmp_path)
         entries.replay(entries.read(sealed(out, values)))
     wrong = {
         "seeds": (np.arange(4), "not the 4 of the varied"),
-        "actions": (changed["actions"][..., :7], "has 7 numbers in an action"),
+        "actions": (changed["actions"][..., :7], "has actions of 7 numbers"),
         "header": (
             json.dumps({**json.loads(str(changed["header"])), "task": "type1_lcca"}),
             "not the 4 of the varied protocol on type1_bca",

@@ -21,6 +21,7 @@ from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.policies import (
     PolicyLike,
     load_policy,
+    require_actions,
     task_and_options,
     view_of,
 )
@@ -150,6 +151,7 @@ class _Plan:
         task, options = task_and_options(player, task, task_kwargs)
         options = options if task_kwargs is None else task_kwargs
         options = conditions.beside(options, task_kwargs or {})
+        require_actions(player, task, options)
         observed = observation or player.observation or "internal"
         parts = protocols.parts(conditions, task, options, episodes, seed)
         return cls(player, task, options, observed, protocol, parts)

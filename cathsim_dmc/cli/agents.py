@@ -17,7 +17,7 @@ from cathsim_dmc import play as by_hand
 from cathsim_dmc.agents import evaluation, protocols, submission
 from cathsim_dmc.agents.demonstrations import DEMONSTRATION_SEED
 from cathsim_dmc.agents.evaluation import EvaluationResult
-from cathsim_dmc.agents.policies import task_and_options
+from cathsim_dmc.agents.policies import require_actions, task_and_options
 from cathsim_dmc.agents.training_log import LINE_INTERVAL, progress_bar
 from cathsim_dmc.analysis.force_statistics import millinewtons, recorded_forces
 from cathsim_dmc.cli.options import (
@@ -242,6 +242,7 @@ def _played(
     player: Any, task: str, task_kwargs: Mapping[str, Any], seed: int
 ) -> tuple[Episode, Any]:
     """An episode of a policy, and the environment that it was played in."""
+    require_actions(player, task, task_kwargs)
     options = dict(task_kwargs)
     if player.observation is not None:
         options["observation"] = player.observation
@@ -334,8 +335,12 @@ def play(
         options: Options of the task.
     """
     player = agents.load_policy(policy, seed) if policy else None
+    given = options.given
+    if player is not None:
+        _, given = task_and_options(player, suite.known(task), given)
+        require_actions(player, task, given)
     how: Any = {"seed": seed, "episodes": episodes, "speed": speed, "policy": player}
-    how["hands"] = hands
-    for path in by_hand.play(task, out, task_kwargs=options.given, **how):
+    how |= {"hands": hands, "task_kwargs": given}
+    for path in by_hand.play(task, out, **how):
         print(path)
     return 0
