@@ -274,6 +274,9 @@ def test_the_page_lists_the_submissions(script):
         (row,) = [r for r in rows if without_figures(r) == without_figures(line)]
         if row.rstrip(" |").endswith(("no", "100 of 100 equal")):
             assert row.split("|")[:-2] == line.split("|")[:-2], row + told
+    entry, _ = found[0]
+    force = 1e3 * np.mean([one.forces.mean_sum.mean for one in entry.result.episodes])
+    assert f"| {force:.1f} |" in script.table(found[:1])[2]
 
 
 @pytest.mark.parametrize(
