@@ -188,6 +188,7 @@ class _Plan:
         """What was played; `started` from a snapshot, or at starts of the task."""
         trained = getattr(self.player, "checkpoint", None)
         first, count = self.parts[0].task_kwargs, sum(len(p.seeds) for p in self.parts)
+        drawn = () if started else [one for p in self.parts for one in p.conditions]
         return EvaluationResult(
             task=self.task,
             policy=name or self.player.name,
@@ -200,7 +201,7 @@ class _Plan:
                 "frames": trained and trained.frames,
             },
             distinct=started or protocols.distinct(self.task, first, count),
-            conditions=tuple(drawn for part in self.parts for drawn in part.conditions),
+            conditions=tuple(drawn),
         )
 
 
