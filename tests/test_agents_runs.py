@@ -75,6 +75,17 @@ def test_a_run_without_its_replay_goes_on_if_asked(tmp_path, trained):
     assert evaluate(tmp_path / "run", episodes=1, make_env=synthetic_env.make_env)
 
 
+def test_a_replay_that_was_begun_anew_is_not_that_of_the_checkpoint(tmp_path, trained):
+    shutil.copytree(trained / "sac", tmp_path / "run")
+    killed = {"make_env": synthetic_env.calling(lambda: 1 / 0, at=9), "resume": True}
+    config = small_sac(total_frames=1_536)
+    with pytest.raises(ZeroDivisionError):
+        run(config, tmp_path / "run", without_replay=True, **killed)
+    assert list((tmp_path / "run" / "replay").glob("*.npy"))
+    with pytest.raises(ReplayError, match="they are those of another process"):
+        run(config, tmp_path / "run", resume=True)
+
+
 @pytest.mark.parametrize(
     ("name", "full"), [("policy.pt", 20_000), ("config.json", 400)]
 )
