@@ -22,11 +22,16 @@ from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.tasks import observations, placement
 from cathsim_dmc.tasks.anatomies import load_anatomy, load_arches_to
 from cathsim_dmc.tasks.anatomies import load_arches as load_arches  # for users, too
-from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.config import NavigationConfig, refuse_replaced
 from cathsim_dmc.tasks.environment import Environment
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation, Objective
-from cathsim_dmc.tasks.scene import Scene, chosen_devices, longest_tip
+from cathsim_dmc.tasks.scene import (
+    Scene,
+    chosen_devices,
+    count_actions,
+    longest_tip,
+)
 
 DOMAIN = "cathsim"
 SUITE = containers.TaggedTasks()
@@ -165,18 +170,8 @@ def make_task(
         ValueError: if the task or an option does not exist; lists those that do.
     """
     definition = TASKS[known(name)]
-    options = {**definition.options, **options}
-    if unknown := sorted(set(options) - {*task_options(name)}):
-        having = [task for task in TASKS if {*unknown} <= {*task_options(task)}]
-        others = f"; {', '.join(having)} have it" if having else ""
-        raise ValueError(
-            f"{name} has no task option {', '.join(map(repr, unknown))}; there are "
-            f"random, {', '.join(task_options(name))}{others}"
-        )
-    own = {key: options.pop(key) for key in definition.own_options if key in options}
-    config = NavigationConfig(
-        **{key: value for key, value in options.items() if key in _CONFIG_FIELDS}
-    )
+    chosen, config = _configured(name, options)
+    own = {key: chosen.pop(key) for key in definition.own_options if key in chosen}
     # Checked before the anatomy is built, which takes seconds.
     coaxial, living = config.devices is not None, config.vessel.living
     observations.resolve(config.observation, coaxial, living)
@@ -187,9 +182,8 @@ def make_task(
         entered = {} if access is None else {"access": access}
         anatomies, named = load_arches_to(goal, {**entered, **own})
     else:
-        chosen = own.get("anatomy", definition.anatomy or "type1")
-        anatomies, named = [load_anatomy(chosen, access)], [goal]
-    chosen = {k: v for k, v in options.items() if k not in _CONFIG_FIELDS}
+        anatomy = own.get("anatomy", definition.anatomy or "type1")
+        anatomies, named = [load_anatomy(anatomy, access)], [goal]
     if "farthest_shift" in definition.objective_options:
         chosen["farthest_shift"] = config.randomisation.farthest_shift
     goals = list(map(placement.resolve_goal, anatomies, named))
@@ -204,6 +198,29 @@ def make_task(
     others = map(room, range(1, len(anatomies))) if len(anatomies) > 1 else None
     scene, objective = room(0)
     return Navigation(scene, objective, config, random, others=others, name=name)
+
+
+def _configured(
+    name: str, given: Mapping[str, Any]
+) -> tuple[dict[str, Any], NavigationConfig]:
+    """Options of a task that are not of the configuration, and that; or ValueError."""
+    options = {**TASKS[name].options, **given}
+    if unknown := sorted(set(options) - {*task_options(name)}):
+        having = [task for task in TASKS if {*unknown} <= {*task_options(task)}]
+        others = f"; {', '.join(having)} have it" if having else ""
+        raise ValueError(
+            f"{name} has no task option {', '.join(map(repr, unknown))}; there are "
+            f"random, {', '.join(task_options(name))}{others}"
+        )
+    if (devices := options.get("devices")) is not None:
+        refuse_replaced(options, devices)  # the defaults, too
+    config = {k: options.pop(k) for k in _CONFIG_FIELDS if k in options}
+    return options, NavigationConfig(**config)
+
+
+def num_actions(name: str, **options: Any) -> int:
+    """Number of entries of an action of a task, see `make_task`, which is not made."""
+    return count_actions(_configured(known(name), options)[1])
 
 
 def _one_length(

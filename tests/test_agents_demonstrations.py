@@ -20,6 +20,7 @@ from cathsim_dmc.suite import make_task
 TASK = "simple1_bca"
 # The goal is reached within a second or two of steps.
 OPTIONS = {"goal_radius": 0.045}
+EXPERT = f"infos/{EXPERT_ACTION}"
 
 
 @pytest.fixture(scope="module")
@@ -168,6 +169,8 @@ def replace(group, name, value):
         (lambda g: replace(g, "actions", np.zeros((3, 21))), "finite rows"),
         (lambda g: g["actions"].__setitem__((0, 0), np.nan), "finite rows"),
         (lambda g: g.__delitem__("rewards"), "rewards"),
+        (lambda g: g[EXPERT].__setitem__(slice(None), np.nan), "of finite numbers"),
+        (lambda g: replace(g, EXPERT, g[EXPERT][:, :3]), "float32 of shape"),
     ],
 )
 def test_a_damaged_dataset_is_refused(copied, shapes, change, message):

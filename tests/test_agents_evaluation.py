@@ -338,8 +338,8 @@ def test_a_function_of_one_observation_is_told_what_to_do():
 
 
 def test_an_evaluation_goes_on_from_a_snapshot(tmp_path, cathsim):
-    options = {"max_steps": 12}
-    task = suite.make_task("simple1_bca", **options)
+    drawn = {"friction": [0.1, 0.2]}
+    task = suite.make_task("simple1_bca", max_steps=12, randomisation=drawn)
     simulation = BatchSimulation(task, 2, num_threads=1, seeds=5)
     simulation.reset()
     push = np.zeros((2, simulation.num_actions))
@@ -352,10 +352,13 @@ def test_an_evaluation_goes_on_from_a_snapshot(tmp_path, cathsim):
     code, out, err = cathsim(
         *("eval", "push", "--task", "simple1_bca", "--max-steps", "12", "--json"),
         *("--no-baseline", "--threads", "1", "--start", path),
+        *("--randomisation", json.dumps(drawn)),
     )
     assert code == 0, err
     episodes = json.loads(out)["policy"]["episodes"]
     assert [one["length"] for one in episodes] == [8, 8]
+    # The seeds have not drawn what the snapshot holds.
+    assert not any("conditions" in one for one in episodes)
     rewards = [one["reward"] for one in episodes]
     np.testing.assert_allclose(rewards, expected, rtol=1e-6)
     for wrong, text in (
@@ -364,3 +367,10 @@ def test_an_evaluation_goes_on_from_a_snapshot(tmp_path, cathsim):
     ):
         with pytest.raises(ValueError, match=text):
             evaluate("push", "simple1_bca", start=snapshot, **wrong)
+
+
+@pytest.mark.parametrize(("protocol", "most"), [("published", 94), ("varied", 16)])
+def test_seeds_beyond_the_last_are_refused_by_name(protocol, most):
+    conditions, first = protocols.get(protocol), 2**32 - 1
+    with pytest.raises(ValueError, match=rf"seed is {first}; .* to 42949672{most}"):
+        protocols.parts(conditions, "type1_bca", {}, 2, first)

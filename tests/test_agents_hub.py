@@ -71,16 +71,20 @@ def test_a_policy_comes_back_as_it_went(local, cathsim):
     assert "Success 100 % of 30 episodes" in page and "cathsim eval hf:me/lcca@" in page
 
 
-def test_a_run_is_uploaded_with_what_it_reached(local, trained, tmp_path):
+@pytest.mark.parametrize("by", ["cathsim eval", "evaluate", "an earlier checkpoint"])
+def test_a_run_is_uploaded_with_what_it_reached(local, trained, tmp_path, by):
     run = tmp_path / "run"
     shutil.copytree(trained / "ppo", run)
-    reached = {"policy": {"summary": {"episodes": 4, "success": 0.5}}}
-    (run / "evaluation.json").write_text(json.dumps(reached))
+    frames = agents.Checkpoint.open(run).frames - (by == "an earlier checkpoint")
+    reached = {"settings": {"frames": frames}, "policy": "ppo"}
+    reached["summary"] = {"episodes": 4, "success": 0.5}
+    written = reached if by == "evaluate" else {"policy": reached}
+    (run / "evaluation.json").write_text(json.dumps(written))
     reference = sharing.upload(run, "hf:me/all#ppo_small", private=False)
     assert reference == f"hf:me/all@{COMMIT}#ppo_small" and not local.made[0][2]
     policy, same = agents.load_policy(reference), agents.load_policy(run)
     assert policy.card["training"]["frames"] == same.checkpoint.frames
-    assert policy.card["evaluation"] == reached["policy"]
+    assert policy.card["evaluation"] == ({} if by.startswith("an") else reached)
     for name, tensor in same.network.state_dict().items():
         assert (policy.network.state_dict()[name] == tensor).all()
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import types
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import synthetic_env
@@ -14,6 +15,7 @@ from tensordict import TensorDict
 from test_agents_training import run, small_ppo, small_sac
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from cathsim_dmc import suite
 from cathsim_dmc.agents import Checkpoint, ConfigError, evaluate
 from cathsim_dmc.agents.learners import make_config
 from cathsim_dmc.agents.networks import NetworkShapes, make_policy
@@ -21,6 +23,7 @@ from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 from cathsim_dmc.agents.replay import ReplayError
 from cathsim_dmc.agents.training import take_over
 from cathsim_dmc.agents.training_log import read_metrics
+from cathsim_dmc.cli import agents, task_options
 from cathsim_dmc.simulation import environments
 
 
@@ -72,6 +75,17 @@ def test_a_run_without_its_replay_goes_on_if_asked(tmp_path, trained):
     assert evaluate(tmp_path / "run", episodes=1, make_env=synthetic_env.make_env)
 
 
+def test_a_replay_that_was_begun_anew_is_not_that_of_the_checkpoint(tmp_path, trained):
+    shutil.copytree(trained / "sac", tmp_path / "run")
+    killed = {"make_env": synthetic_env.calling(lambda: 1 / 0, at=9), "resume": True}
+    config = small_sac(total_frames=1_536)
+    with pytest.raises(ZeroDivisionError):
+        run(config, tmp_path / "run", without_replay=True, **killed)
+    assert list((tmp_path / "run" / "replay").glob("*.npy"))
+    with pytest.raises(ReplayError, match="they are those of another process"):
+        run(config, tmp_path / "run", resume=True)
+
+
 @pytest.mark.parametrize(
     ("name", "full"), [("policy.pt", 20_000), ("config.json", 400)]
 )
@@ -100,6 +114,19 @@ def test_a_policy_names_a_device_and_an_observation_of_another_size(trained):
     for entries in ({}, {environments.VECTOR: torch.zeros(1, 3)}):
         with pytest.raises(ValueError, match="reads 20 numbers, the task gives [03]:"):
             policy.act(TensorDict(entries, [1]))
+
+
+def test_another_number_of_actions_is_refused_before_the_task_is_made(monkeypatch):
+    monkeypatch.setattr(suite, "make_task", lambda *_, **__: pytest.fail("work lost"))
+    turned, text = task_options.task_kind()(rotation=True), "the task gives 22: play it"
+    policy, given = "pretrained:type1_lcca", {"options": turned}
+    for play in (
+        lambda: agents.evaluate(policy, **given),
+        lambda: agents.record(policy, out=Path("one.npz"), **given),
+        lambda: agents.play("type1_lcca", policy=policy, **given),
+    ):
+        with pytest.raises(ValueError, match=f"has actions of 21 numbers, {text}"):
+            play()
 
 
 def test_a_policy_that_ships_starts_a_training():

@@ -230,7 +230,7 @@ def test_a_policy_that_does_not_ship_is_replayed_by_its_actions(short, tmp_path)
         entries.replay(entries.read(sealed(out, values)))
     wrong = {
         "seeds": (np.arange(4), "not the 4 of the varied"),
-        "actions": (changed["actions"][..., :7], "has 7 numbers in an action"),
+        "actions": (changed["actions"][..., :7], "has actions of 7 numbers"),
         "header": (
             json.dumps({**json.loads(str(changed["header"])), "task": "type1_lcca"}),
             "not the 4 of the varied protocol on type1_bca",
@@ -274,6 +274,9 @@ def test_the_page_lists_the_submissions(script):
         (row,) = [r for r in rows if without_figures(r) == without_figures(line)]
         if row.rstrip(" |").endswith(("no", "100 of 100 equal")):
             assert row.split("|")[:-2] == line.split("|")[:-2], row + told
+    entry, _ = found[0]
+    force = 1e3 * np.mean([one.forces.mean_sum.mean for one in entry.result.episodes])
+    assert f"| {force:.1f} |" in script.table(found[:1])[2]
 
 
 @pytest.mark.parametrize(

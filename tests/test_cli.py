@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 
 import pytest
 from conftest import TASKS
@@ -62,12 +63,30 @@ def test_a_closed_output_is_no_error(monkeypatch):
     assert ended.value.code == 0
 
 
-def test_an_import_says_that_it_replaces_an_anatomy(cathsim, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("words", "place", "file"),
+    [
+        (("phantom", "import", "x.stl"), "one", "one/anatomy.npz"),
+        (("phantom", "generate", "simple1"), "one", "one/anatomy.npz"),
+        (("phantom", "build", "tree.json"), "one", "one/anatomy.npz"),
+        (("eval", "push", "--task", "type1_bca"), "one", "one/evaluation.json"),
+        (("submit", "push", "--task", "type1_bca"), "one.json", "one.json"),
+        (("record", "push", "--task", "simple1_bca"), "one.npz", "one.npz"),
+    ],
+)
+def test_a_command_says_which_file_it_replaces(
+    cathsim, tmp_path, monkeypatch, words, place, file
+):
     anatomy = phantoms.load("simple1")
     monkeypatch.setattr(cli_phantoms, "import_scan", lambda *where, **how: anatomy)
-    for words in ("", f"the anatomy that was in {tmp_path / 'one'} is replaced"):
-        code, _, err = cathsim("phantom", "import", "x.stl", "--out", tmp_path / "one")
-        assert code == 0 and ("is replaced" in err) == bool(words) and words in err
+    tree = types.SimpleNamespace(build=lambda access: anatomy)
+    monkeypatch.setattr(cli_phantoms, "read_tree", lambda path: tree)
+    short = ("--max-steps", 1) if words[0] in ("eval", "record") else ()
+    more = {"submit": ("--episodes", 2), "eval": ("--episodes", 1)}.get(words[0], ())
+    text = f"{tmp_path / file}, which was there before, is replaced"
+    for there in (False, True):
+        code, _, err = cathsim(*words, *short, *more, "--out", tmp_path / place)
+        assert code == 0 and (text in err) == there, err
 
 
 @pytest.mark.parametrize("kind", [("type1",), ("test", "--index", 3)])

@@ -175,6 +175,10 @@ def test_a_set_is_resumed_and_refused_where_it_must_be(tmp_path, monkeypatch, pa
     assert "| train | 2 | 16 |" in (out / "README.md").read_text()
     (out / "train" / "train_001.h5").unlink()
     assert image_set.write(out, options, processes=1)["new"] == 8
+    test = out / "test" / "test_000.h5"
+    test.write_bytes(test.read_bytes()[:-1])
+    with pytest.raises(ValueError, match="test_000.h5 is damaged; remove it and give"):
+        image_set.write(out, options, processes=1)
     found = json.loads((out / "annotations/train.json").read_text())["images"]
     assert len({image["id"] for image in found}) == 16
     with pytest.raises(ValueError, match=r"other options.*\(anatomies \[2, 1, 1\]\)"):

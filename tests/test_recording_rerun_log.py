@@ -13,7 +13,8 @@ from cathsim_dmc import suite
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.pictures.moment import Moment
 from cathsim_dmc.pictures.recorded import xray_film
-from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording import rerun_text
+from cathsim_dmc.recording.episode import TERMINATIONS, Episode
 from cathsim_dmc.recording.geometry import force_text
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.recording.records import VesselRecord
@@ -183,6 +184,13 @@ def test_text_says_what_happens_when(written):
     assert "| outcome | success |" in page and page[0] == "# type1_bca"
     assert r'| versions | {"a\|b": "1.0"} |' in page
     assert not any(line.startswith("| distance |") for line in page)
+
+
+@pytest.mark.parametrize("end", TERMINATIONS)
+def test_every_end_is_an_event(end):
+    meta = {"success": end == "success", "termination": end}
+    *_, (row, text, _) = rerun_text.events(make_episode(meta=meta))
+    assert (row, text) == (6, f"end: {end.replace('_', ' ')}")
 
 
 def test_the_largest_force_of_a_step_is_written_at_the_end_of_its_arrow(written):

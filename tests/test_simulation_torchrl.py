@@ -96,6 +96,19 @@ def test_only_what_is_done_is_reset(batched):
     assert not torch.equal(after[0], before[0])
     assert not torch.equal(after[2], before[2])
     assert batched.simulation.rollout.steps.tolist() == [0, 3, 0]
+    # Where nothing is to be reset, all stay as they are.
+    tensordict["_reset"] = torch.zeros(ENVS, 1, dtype=torch.bool)
+    assert torch.equal(batched.reset(tensordict)["position"], after)
+    assert batched.simulation.rollout.steps.tolist() == [0, 3, 0]
+
+
+def test_an_action_of_half_precision(batched):
+    def reward(dtype):
+        batched.set_seed(0)
+        action = torch.full((ENVS, 21), 0.5, dtype=dtype)
+        return batched.step(batched.reset().set("action", action))["next", "reward"]
+
+    assert torch.equal(reward(torch.bfloat16), reward(torch.float32))
 
 
 def test_success_is_terminated_in_torchrl():

@@ -1,6 +1,7 @@
 """Every task of the suite keeps the contracts of dm_env, dm_control and this domain."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from scipy.stats import qmc
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Goal
+from cathsim_dmc.entities.catheter import Catheter
+from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.physics import forces
 from cathsim_dmc.simulation.batch import BatchSimulation
 
@@ -224,6 +227,19 @@ def test_wrong_options_are_refused_before_an_anatomy_is_made(monkeypatch, option
     for task in ("type1_bca", "arch_bca"):
         with pytest.raises(ValueError, match=next(iter(options))):
             suite.make_task(task, **options)
+    # Also where it is the default of a single device.
+    for option in {"device": "steerable_5f"}, {"rotation": False}:
+        with pytest.raises(ValueError, match="replaces it; leave one of the two out"):
+            suite.make_task("type1_bca_pair", **option)
+
+
+def test_the_number_of_actions_is_known_without_a_task():
+    for device, rotation in itertools.product(DEVICES, (False, True)):
+        options = {"device": device, "rotation": rotation}
+        made = Catheter(device, rotation=rotation).action_names
+        assert suite.num_actions("type1_bca", **options) == len(made), device
+    for task, count in {"type1_lcca_wire": 2, "arch_any_pair": 4}.items():
+        assert suite.num_actions(task) == count
 
 
 def test_only_a_phantom_has_an_access():

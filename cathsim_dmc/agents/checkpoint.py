@@ -18,7 +18,7 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torch.utils._pytree import tree_leaves
 
-from cathsim_dmc import files
+from cathsim_dmc import bounds, files
 from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.learners import config_from_dict
@@ -82,8 +82,8 @@ class Checkpoint:
                 path=path,
                 config=config_from_dict(values["config"]),
                 shapes=NetworkShapes.from_dict(values["shapes"]),
-                frames=int(values["frames"]),
-                seconds=float(values["seconds"]),
+                frames=bounds.whole("frames", values["frames"], 0),
+                seconds=bounds.number("seconds", values["seconds"], 0.0),
                 sha256={name: values["sha256"][name] for name in (_POLICY, _LEARNING)},
             )
 
@@ -105,9 +105,9 @@ class Checkpoint:
 
         Called before networks are made to continue from it.
         """
-        file = self.path / _POLICY
+        file, state = self.path / _POLICY, self.policy_state()
         with files.refused(CheckpointError, f"{file} {_OTHER_NETWORK}", _WRONG):
-            _require_sizes(self.policy_state(), self.shapes, self.config)
+            _require_sizes(state, self.shapes, self.config)
             # Of images a critic alone has hidden layers, in the other file.
             widths = self.config.hidden
             least = 4 * sum(a * b for a, b in itertools.pairwise(widths))

@@ -12,7 +12,7 @@ import torch
 from dm_env import specs
 from tensordict import TensorDict, TensorDictBase
 
-from cathsim_dmc import bounds, extras, suite
+from cathsim_dmc import bounds, extras, files, suite
 from cathsim_dmc.agents import hub
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import View
@@ -274,6 +274,8 @@ def _tensors(path: str | Path, episode: Any, names: Sequence[str]) -> TensorDict
     ends, outs = np.asarray(episode.terminations), np.asarray(episode.truncations)
     done = ends.astype(bool) | outs.astype(bool)
     chosen = episode.infos.get(EXPERT_ACTION, episode.actions)[:steps]
+    with files.refused(DatasetError, f"{path} cannot be used", ValueError):
+        bounds.array(EXPERT_ACTION, chosen, shape=episode.actions.shape)
     return TensorDict(
         {
             **{key: value[:-1] for key, value in seen.items()},

@@ -21,6 +21,7 @@ from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.policies import (
     PolicyLike,
     load_policy,
+    require_actions,
     task_and_options,
     view_of,
 )
@@ -150,6 +151,7 @@ class _Plan:
         task, options = task_and_options(player, task, task_kwargs)
         options = options if task_kwargs is None else task_kwargs
         options = conditions.beside(options, task_kwargs or {})
+        require_actions(player, task, options)
         observed = observation or player.observation or "internal"
         parts = protocols.parts(conditions, task, options, episodes, seed)
         return cls(player, task, options, observed, protocol, parts)
@@ -186,6 +188,7 @@ class _Plan:
         """What was played; `started` from a snapshot, or at starts of the task."""
         trained = getattr(self.player, "checkpoint", None)
         first, count = self.parts[0].task_kwargs, sum(len(p.seeds) for p in self.parts)
+        drawn = () if started else [one for p in self.parts for one in p.conditions]
         return EvaluationResult(
             task=self.task,
             policy=name or self.player.name,
@@ -198,7 +201,7 @@ class _Plan:
                 "frames": trained and trained.frames,
             },
             distinct=started or protocols.distinct(self.task, first, count),
-            conditions=tuple(drawn for part in self.parts for drawn in part.conditions),
+            conditions=tuple(drawn),
         )
 
 

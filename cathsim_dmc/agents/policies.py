@@ -110,26 +110,38 @@ class TrainedPolicy(FunctionPolicy):
             self.task_kwargs, name = card["task_kwargs"], f"pretrained:{card['name']}"
         super().__init__(self._answer, name)
         self.observation = self.config.observation
+        self.num_actions = self.shapes.actions
 
     def reset(self, view: View, which: np.ndarray) -> None:
         """Refuse simulations of a device with other motors, as ValueError."""
-        self._require("has actions of", self.shapes.actions, view.num_actions)
+        _require(self, "has actions of", self.shapes.actions, view.num_actions)
 
     def _answer(self, observation: TensorDictBase) -> TensorDictBase:
         # In training its critic may have read numbers that it does not.
         if environments.VECTOR in self.network.in_keys:
             vector = observation.get(environments.VECTOR, None)
             size = 0 if vector is None else vector.shape[-1]
-            self._require("reads", self.shapes.vector, size)
+            _require(self, "reads", self.shapes.vector, size)
         return self.network(observation)
 
-    def _require(self, what: str, own: int, given: int) -> None:
-        if own != given:
-            raise ValueError(
-                f"{self.name} {what} {own} numbers, the task gives {given}: play it "
-                "with the device and the options that it was trained with, "
-                f"{self.task} with {self.task_kwargs}"
-            )
+
+def require_actions(policy: Policy, task: str, options: Mapping[str, Any]) -> None:
+    """ValueError if the actions of a policy have another size than those of a task.
+
+    Making the task, by which the size is known otherwise, takes seconds.
+    """
+    if policy.num_actions is not None and task in suite.TASKS:
+        given = suite.num_actions(task, **options)
+        _require(policy, "has actions of", policy.num_actions, given)
+
+
+def _require(policy: Policy, what: str, own: int, given: int) -> None:
+    if own != given:
+        raise ValueError(
+            f"{policy.name} {what} {own} numbers, the task gives {given}: play it with "
+            "the device and the options that it was trained with, "
+            f"{policy.task} with {policy.task_kwargs}"
+        )
 
 
 def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:

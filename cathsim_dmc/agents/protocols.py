@@ -101,6 +101,8 @@ def parts(
         pools = [{**options, "device": name} for name in protocol.devices]
     drawn_from = definition is not None and definition.random_arch
     arches = len(arch_numbers(options)) if drawn_from else 1
+    most = episodes * (len(pools) * _CANDIDATES if protocol.task_kwargs else 1)
+    bounds.seeds("seed", seed, most)
     found, played = [], 0
     for number, own in enumerate(pools[:episodes]):
         count = len(range(number, episodes, len(pools)))
@@ -110,8 +112,9 @@ def parts(
             wanted = [n % arches for n in range(played, played + count)]
             seeds = stratified(ranges, wanted, first, arches)
         played += count
-        drawn = tuple(_conditions(ranges, one, arches, own) for one in seeds)
-        found.append(Part(own, seeds, drawn if ranges != Randomisation() else ()))
+        varied = () if ranges == Randomisation() else seeds
+        drawn = tuple(_conditions(ranges, one, arches, own) for one in varied)
+        found.append(Part(own, seeds, drawn))
     return tuple(found)
 
 

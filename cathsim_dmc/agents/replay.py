@@ -1,5 +1,6 @@
 """A ring buffer of transitions in memory-mapped .npy files."""
 
+import hashlib
 import os
 import shutil
 from collections.abc import Mapping, Sequence
@@ -11,6 +12,8 @@ from numpy.lib.format import open_memmap
 from tensordict import TensorDict, TensorDictBase
 
 from cathsim_dmc import files
+
+_DIGEST = "first.sha256"  # file with the digest of the first transitions, see `load`
 
 
 class ReplayError(ValueError):
@@ -39,6 +42,7 @@ class ReplayMemory:
         names = {key: key if isinstance(key, str) else ".".join(key) for key in keys}
         self._paths = {key: self.directory / f"{n}.npy" for key, n in names.items()}
         self._storage: TensorDictBase | None = None
+        self._digest: str | None = None
 
     def __len__(self) -> int:
         """Number of transitions that can be sampled."""
@@ -68,15 +72,17 @@ class ReplayMemory:
         return self._storage[torch.randint(self.size, (count,))]
 
     def state(self) -> dict[str, Any]:
-        """How far the ring is filled."""
-        return {"cursor": self.cursor, "size": self.size, "capacity": self.capacity}
+        """How far the ring is filled, and which one it is."""
+        own = {"cursor": self.cursor, "size": self.size, "capacity": self.capacity}
+        return {**own, "digest": self._digest}
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Open the files of an earlier process; ReplayError if missing or damaged."""
         size, cursor, capacity = state["size"], state["cursor"], state["capacity"]
         if size == 0:
             return
-        storage = TensorDict({}, [capacity])
+        storage, digest = TensorDict({}, [capacity]), self.directory / _DIGEST
+        self._digest = state.get("digest")  # None in older checkpoints
         for key, path in self._paths.items():
             text = (
                 f"the replay of {size:,} transitions is lost: {path} is missing, "
@@ -89,6 +95,9 @@ class ReplayMemory:
                 # "r+" would extend a file that is too short.
                 open_memmap(path, mode="r")
                 storage[key] = torch.from_numpy(open_memmap(path, mode="r+"))
+                # A process that began without it has made others in their place.
+                if self._digest and self._digest != files.read_text(digest):
+                    raise ValueError("they are those of another process")
         self._storage, self.capacity = storage, capacity
         self.cursor, self.size = cursor, size
 
@@ -103,9 +112,10 @@ class ReplayMemory:
                 f"the replay needs {needed / 1e9:.1f} GB in {self.directory}, "
                 f"{free / 1e9:.1f} GB are free: lower replay_bytes."
             )
-        storage = TensorDict({}, [self.capacity])
+        storage, digest = TensorDict({}, [self.capacity]), hashlib.sha256()
         for key, path in self._paths.items():
             example = like[key]
+            digest.update(example.cpu().numpy().tobytes())
             shape = (self.capacity, *example.shape[1:])
             dtype = example[:0].cpu().numpy().dtype
             with files.naming(path):
@@ -114,4 +124,6 @@ class ReplayMemory:
                     with open(path, "rb+") as stream:
                         os.posix_fallocate(stream.fileno(), 0, path.stat().st_size)
             storage[key] = torch.from_numpy(array)
+        self._digest = digest.hexdigest()
+        files.write_text(self.directory / _DIGEST, self._digest)
         return storage

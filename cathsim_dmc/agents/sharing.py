@@ -93,7 +93,12 @@ def _write_policy(source: str | Path, folder: Path, name: str) -> dict[str, Any]
         state, judged = one.policy_state(), Path(source) / "evaluation.json"
         evaluation = {}
         if judged.is_file():
-            evaluation = json.loads(judged.read_text()).get("policy", {})
+            found = json.loads(judged.read_text())
+            # `evaluate` writes one result, `cathsim eval` that of the baseline, too.
+            found = found if "summary" in found else found.get("policy", {})
+            # Of this policy, not of another or of an earlier checkpoint.
+            if found.get("settings", {}).get("frames") == one.frames:
+                evaluation = found
         card = {
             "task": one.config.task,
             "task_kwargs": dict(one.config.task_kwargs),

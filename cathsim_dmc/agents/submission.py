@@ -179,15 +179,11 @@ class RecordedActions(Policy):
             shape = len(self.seeds), -1, -1
             self.actions = bounds.array("actions", actions, "f", shape)
             bounds.whole("steps", self.actions.shape[1], 1, MAX_STEPS)
+        self.num_actions = self.actions.shape[-1]
         self._rows, self._step = slice(0, 0), 0
 
     def reset(self, view: View, which: np.ndarray) -> None:
         """Begin episodes; those of other simulations follow those before."""
-        if self.actions.shape[-1] != view.num_actions:
-            raise ValueError(
-                f"{self.name} has {self.actions.shape[-1]} numbers in an action, the "
-                f"task {self.task} takes {view.num_actions}"
-            )
         if which.all():
             first = self._rows.stop
             self._rows, self._step = slice(first, first + view.num_simulations), 0
@@ -218,6 +214,7 @@ class _Recorder(Policy):
         self._policy, self.name, self.task = policy, policy.name, policy.task
         self.observation, self.task_kwargs = policy.observation, policy.task_kwargs
         self.checkpoint = getattr(policy, "checkpoint", None)
+        self.num_actions = policy.num_actions
         self.batches: list[list[np.ndarray]] = []
 
     def reset(self, view: View, which: np.ndarray) -> None:

@@ -17,7 +17,7 @@ from cathsim_dmc import play as by_hand
 from cathsim_dmc.agents import evaluation, protocols, submission
 from cathsim_dmc.agents.demonstrations import DEMONSTRATION_SEED
 from cathsim_dmc.agents.evaluation import EvaluationResult
-from cathsim_dmc.agents.policies import task_and_options
+from cathsim_dmc.agents.policies import require_actions, task_and_options
 from cathsim_dmc.agents.training_log import LINE_INTERVAL, progress_bar
 from cathsim_dmc.analysis.force_statistics import millinewtons, recorded_forces
 from cathsim_dmc.cli.options import (
@@ -29,6 +29,7 @@ from cathsim_dmc.cli.options import (
     print_json,
     say,
     told_of_losses,
+    told_of_replaced,
 )
 from cathsim_dmc.cli.result_tables import print_episodes, print_results
 from cathsim_dmc.cli.task_options import TaskOptions, task_kind
@@ -105,14 +106,16 @@ def evaluate(
         with _observer(who, log, ray) as observer:
             return agents.evaluate(who, observer=observer, out_dir=out_dir, **asked)
 
-    results = {"policy": play(player, out)}
-    if baseline and policy != "random":
-        results["baseline"] = play("random")
-    values: dict[str, Any] = {name: one.to_dict() for name, one in results.items()}
-    values["seconds"] = round(time.monotonic() - began, 1)
-    if out is not None:
-        files.write_json(out / "evaluation.json", values)
-        contacts.draw(results["policy"], out / "heatmap.png")
+    written = [] if out is None else [out / "evaluation.json", out / "heatmap.png"]
+    with told_of_replaced(*written):
+        results = {"policy": play(player, out)}
+        if baseline and policy != "random":
+            results["baseline"] = play("random")
+        values: dict[str, Any] = {name: one.to_dict() for name, one in results.items()}
+        values["seconds"] = round(time.monotonic() - began, 1)
+        if written:
+            files.write_json(written[0], values)
+            contacts.draw(results["policy"], written[1])
     _print(results, values, report, json)
     return 0
 
@@ -169,7 +172,9 @@ def submit(
         out: File to write, ending in .json.
         episodes: Number of episodes; fewer than the 100 of the protocol are not listed.
     """
-    done = submission.submit(policy, out, task, episodes=episodes, num_threads=threads)
+    how: Any = {"episodes": episodes, "num_threads": threads}
+    with told_of_replaced(out, out.with_suffix(submission.RECORDED)):
+        done = submission.submit(policy, out, task, **how)
     rates = done["summary"]["success"], done["summary"]["safe_success"]
     print(f"{out}: success {rates[0]}, safe success {rates[1]}, {done['sha256']}")
     return 0
@@ -222,12 +227,13 @@ def record(
     episode, env = _played(player, task, task_kwargs, seed)
     for path in targets:
         files.require_file(path, make=True)
-    if out is not None:
-        recorded.write(episode, env, out, fluoroscopy)
-    for path in beside:
-        episode.save(path)
-    if gif is not None:
-        recorded.write(episode, env, gif)
+    with told_of_replaced(*targets):
+        if out is not None:
+            recorded.write(episode, env, out, fluoroscopy)
+        for path in beside:
+            episode.save(path)
+        if gif is not None:
+            recorded.write(episode, env, gif)
     print(f"{episode.steps} steps, {episode.termination}:", *targets)
     forces = recorded_forces(episode)
     if forces.mean_force is not None:
@@ -242,6 +248,7 @@ def _played(
     player: Any, task: str, task_kwargs: Mapping[str, Any], seed: int
 ) -> tuple[Episode, Any]:
     """An episode of a policy, and the environment that it was played in."""
+    require_actions(player, task, task_kwargs)
     options = dict(task_kwargs)
     if player.observation is not None:
         options["observation"] = player.observation
@@ -333,12 +340,13 @@ def play(
             contact; the keys act beside it.
         options: Options of the task, over those that the policy was trained with.
     """
-    player, task_kwargs = None, options.given
-    if policy:
-        player = agents.load_policy(policy, seed)
-        task, task_kwargs = task_and_options(player, task, task_kwargs)
+    player = agents.load_policy(policy, seed) if policy else None
+    given = options.given
+    if player is not None:
+        _, given = task_and_options(player, suite.known(task), given)
+        require_actions(player, task, given)
     how: Any = {"seed": seed, "episodes": episodes, "speed": speed, "policy": player}
-    how["hands"] = hands
-    for path in by_hand.play(task, out, task_kwargs=task_kwargs, **how):
+    how |= {"hands": hands, "task_kwargs": given}
+    for path in by_hand.play(task, out, **how):
         print(path)
     return 0

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,6 +42,16 @@ def say(text: str) -> None:
 def told_of_losses() -> contextlib.redirect_stdout:
     """A context in which Ray tells of lost processes on standard error."""
     return contextlib.redirect_stdout(sys.stderr)
+
+
+@contextlib.contextmanager
+def told_of_replaced(*paths: Path) -> Iterator[None]:
+    """A context that tells on standard error which of some files it has replaced."""
+    before = {path: path.stat().st_mtime_ns for path in paths if path.is_file()}
+    yield
+    for path, written in before.items():
+        if path.stat().st_mtime_ns != written:
+            say(f"{path}, which was there before, is replaced")
 
 
 def require_png(path: Path, later: bool = False) -> None:

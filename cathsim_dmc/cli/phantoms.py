@@ -15,13 +15,20 @@ from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.places import describe
 from cathsim_dmc.anatomy.tree_file import read_tree
-from cathsim_dmc.cli.options import Json, print_json, require_png, say, show
+from cathsim_dmc.cli.options import (
+    Json,
+    print_json,
+    require_png,
+    say,
+    show,
+    told_of_replaced,
+)
 from cathsim_dmc.entities import devices
 from cathsim_dmc.pictures.anatomies import anatomy_figure
 
 phantoms = SubcommandApp()
 _FIRST = ("lcca", "bca")  # goals that are tried first
-_PICTURE = "check.png"  # three views of an anatomy, in its directory
+_FILE, _PICTURE = "anatomy.npz", "check.png"  # of an anatomy: itself, three views
 
 
 @phantoms.command(name="import")
@@ -68,7 +75,7 @@ def import_phantom(
     bore = None if device is None else devices.get(device, "--device")
     if out is None:
         out = Path(mesh.name.split(".")[0])
-        if out.exists() and not (out / "anatomy.npz").is_file():
+        if out.exists() and not (out / _FILE).is_file():
             raise ValueError(
                 f"{out} exists and is no anatomy; give a directory (--out)"
             )
@@ -79,23 +86,25 @@ def import_phantom(
                 f"rename is {rename}; give computed=wanted, e.g. branch_1=lra"
             )
     files.require_place(out)  # now: the import would be lost
-    replaced = (out / "anatomy.npz").is_file()
     notes: list[str] = []
     anatomy = import_scan(
         mesh, centreline, units=units, mesh_frame=frame, axes=axes, labels=label,
         name=name or out.name, inlet=inlet, heart=heart, progress=say, notes=notes,
         rename={old: new for old, _, new in changes}, device=bore,
     )  # fmt: skip
-    anatomy.save(out)
+    _save(anatomy, out)
     style.save(anatomy_figure(anatomy), out / _PICTURE)
-    if replaced:
-        say(f"the anatomy that was in {out} is replaced")
     commands = _next_commands(anatomy, out, device)
     where = {"directory": str(out), "picture": str(out / _PICTURE), "notes": notes}
     radius = () if bore is None else (bore.outer_radius,)
     print_json({**where, **describe(anatomy, *radius), "next": commands})
     say("\n  ".join(("next:", *commands)))
     return 0
+
+
+def _save(anatomy: Anatomy, out: Path) -> None:
+    with told_of_replaced(out / _FILE):
+        anatomy.save(out)
 
 
 def _next_commands(anatomy: Anatomy, out: Path, device: str | None) -> list[str]:
@@ -134,7 +143,7 @@ def build(
     """
     files.require_place(out)
     anatomy = read_tree(tree).build(access)
-    anatomy.save(out)
+    _save(anatomy, out)
     print(f"{anatomy.name}: goals {', '.join(anatomy.goals)}: {out}")
     return 0
 
@@ -187,7 +196,7 @@ def generate(
         anatomy = arch.build_seed(arches[index], access=access)
     else:
         anatomy = shipped.load(kind, access=access)
-    anatomy.save(out)
+    _save(anatomy, out)
     print(f"{anatomy.name}: goals {', '.join(anatomy.goals)}: {out}")
     return 0
 
@@ -249,6 +258,7 @@ def export(
 
     files.require_file(out)
     exported.check_wall(wall)
-    found = exported.write_mjcf(load_anatomy(phantom), out, wall)
+    with told_of_replaced(out):
+        found = exported.write_mjcf(load_anatomy(phantom), out, wall)
     print_json({"file": str(out), **found})
     return 0

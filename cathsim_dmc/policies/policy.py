@@ -43,12 +43,14 @@ class Policy:
         observation: Name or names of the observations that it reads; None if it reads
             none.
         task_kwargs: Further options of the task that it was made for.
+        num_actions: Number of entries of its actions; None for any.
     """
 
     name: str = "policy"
     task: str | None = None
     observation: str | Sequence[str] | None = None
     task_kwargs: Mapping[str, Any] | None = None
+    num_actions: int | None = None
 
     def reset(self, view: View, which: np.ndarray) -> None:
         """Begin new episodes; called after the simulations were reset.

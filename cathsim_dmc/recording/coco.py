@@ -71,7 +71,10 @@ def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[An
     from PIL import Image
 
     images, annotations = [], []
-    with h5py.File(path) as file:
+    text = f"{path} is damaged; remove it and give the command again, which writes it"
+    with files.refused(ValueError, text, OSError):
+        file = h5py.File(path)
+    with file:
         rows, height, width = file["image"].shape
         sequence = file["sequence"][:].tolist()
         cameras = file["camera_matrix"][:].round(6).tolist()

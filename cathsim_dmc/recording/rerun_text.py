@@ -12,7 +12,7 @@ from cathsim_dmc.recording.rerun_scene import Log
 EVENTS, PAGE = "events", "info"  # entities
 # Steps without contact after which the next contact is an event again.
 _QUIET = 10
-_LEVELS = {"success": "INFO", "truncated": "WARN", "physics_error": "ERROR"}
+_LEVELS = {"success": "INFO", "physics_error": "ERROR"}  # of an end; others: WARN
 _LONG = 200  # characters of a value: longer ones are series, which belong in plots
 
 
@@ -48,7 +48,8 @@ def events(episode: Episode) -> list[tuple[int, str, str]]:
         for row in np.flatnonzero(distance <= distance[0] / 2)[:1].tolist():
             found.append((row, "half of the distance to the goal", "INFO"))
     end = episode.termination
-    found.append((episode.steps, f"end: {end.replace('_', ' ')}", _LEVELS[end]))
+    level = _LEVELS.get(end, "WARN")
+    found.append((episode.steps, f"end: {end.replace('_', ' ')}", level))
     return sorted(found, key=lambda event: event[0])
 
 

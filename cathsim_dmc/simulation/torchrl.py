@@ -131,11 +131,14 @@ class BatchedEnv(EnvBase):
         chosen = None
         if tensordict is not None and "_reset" in tensordict.keys():
             mask = tensordict["_reset"].reshape(self.batch_size).cpu().numpy()
+            if not mask.any():  # TorchRL keeps what it has of all
+                return self.observation_spec.zero()
             chosen = np.flatnonzero(mask)
         return self._tensors(self.simulation.reset(chosen))
 
     def _step(self, tensordict: TensorDict) -> TensorDict:
-        step = self.simulation.step(tensordict["action"].cpu().numpy())
+        # Numpy has no bfloat16.
+        step = self.simulation.step(tensordict["action"].cpu().double().numpy())
         result = self._tensors(step)
         result["reward"] = self._tensor(step.outcome.reward)[:, None]
         result["terminated"] = self._tensor(step.terminated)[:, None]

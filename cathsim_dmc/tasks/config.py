@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -46,6 +46,17 @@ _LONGEST_TIMESTEP = 5e-3  # s
 _STIFFEST = 5e-3  # N·m², EI
 # Composer does the last two of them itself.
 _SUBSTEPS = (2, 1000)
+_REPLACED = "device", "rotation"  # by devices
+
+
+def refuse_replaced(given: Mapping[str, Any], devices: Any) -> None:
+    """Raise ValueError if an option is given that coaxial devices replace."""
+    for name in _REPLACED:
+        if name in given:
+            raise ValueError(
+                f"{name} is {given[name]!r}, but devices is {devices!r}, which "
+                "replaces it; leave one of the two out"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,12 +178,9 @@ class NavigationConfig:
                 "['wire_035_glide', 'berenstein_5f']",
             )
         object.__setattr__(self, "devices", tuple(self.devices))
-        for name in ("device", "rotation"):
-            if getattr(self, name) != getattr(type(self), name):
-                raise ValueError(
-                    f"{name} is {getattr(self, name)!r}, but devices is "
-                    f"{self.devices!r}, which replaces it; leave one of the two out"
-                )
+        given = {name: getattr(self, name) for name in _REPLACED}
+        changed = {n: v for n, v in given.items() if v != getattr(type(self), n)}
+        refuse_replaced(changed, self.devices)
 
     def _check_numbers(self):
         required = {

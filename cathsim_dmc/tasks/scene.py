@@ -145,6 +145,15 @@ def chosen_devices(config: NavigationConfig) -> tuple[devices.Device, ...]:
     return tuple(devices.get(one, "a name in devices") for one in config.devices)
 
 
+def count_actions(config: NavigationConfig) -> int:
+    """Number of entries of an action; no entity is built."""
+    chosen = chosen_devices(config)
+    if config.devices is not None:
+        return 2 * len(chosen)
+    motors = 2 * chosen[0].tip_links * chosen[0].steerable
+    return motors + 1 + config.rotation
+
+
 def longest_tip(chosen: Sequence[devices.Device]) -> devices.Device:
     """The device whose tip decides how far the chain starts inside."""
     return max(chosen, key=lambda device: device.tip_length)

@@ -43,7 +43,8 @@ def table(found):
     lines = []
     for entry, again in found:
         values = entry.values
-        summary = (entry if again is None else again).result.summary()
+        result = (entry if again is None else again).result
+        summary, (force, _) = result.summary(), result.mean_sd("forces.mean_force")
         low, high = summary["success_ci95"]
         digest, commit = values["policy_sha256"], values["commit"]
         safe = summary["safe_success"][SAFE]
@@ -53,7 +54,7 @@ def table(found):
             f"({100 * low:.0f}–{100 * high:.0f}) "
             f"| {100 * safe:.0f} "
             f"| {0.04 * summary['length']:.1f} "
-            f"| {1e3 * summary['forces']['sum']['mean']['mean']:.1f} "
+            f"| {1e3 * force:.1f} "
             f"| {cell(values['package'])}, {cell(commit) if commit else '–'} "
             f"| {cell(digest[:12]) if digest else '–'} | {replayed(again)} |"
         )
