@@ -179,6 +179,11 @@ def test_a_damaged_dataset_is_refused(copied, shapes, change, message):
         load_transitions(copied, "tracking", shapes)
 
 
+def test_actions_are_learnt_as_the_drives_clip_them(copied, shapes):
+    edit(copied, lambda g: g["actions"].__setitem__((0, 0), 3.0))
+    assert load_transitions(copied, "tracking", shapes)["action"].max() == 1.0
+
+
 def test_failed_episodes_are_no_demonstrations(recorded, copied, shapes):
     edit(copied, lambda g: g["infos/success"].__setitem__(slice(None), False))
     lengths = [len(episode.actions) for episode in read_episodes(recorded.path)]

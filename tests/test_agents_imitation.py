@@ -88,8 +88,13 @@ def test_a_clone_does_what_the_expert_did(cloned, dataset, shapes):
 
 
 def test_cloning_needs_a_dataset(tmp_path):
-    with pytest.raises(ConfigError, match="cathsim demos"):
-        train(small("bc"), tmp_path, progress=False)
+    def make_env(config):
+        pytest.fail("the environment is made, which takes long")
+
+    for place in (None, "gone"):
+        with pytest.raises(DatasetError, match="cathsim demos"):
+            config = small("bc", demonstrations=place)
+            train(config, tmp_path, progress=False, make_env=make_env)
 
 
 def test_a_run_is_resumed_after_its_dataset_has_moved(cloned, dataset, tmp_path):

@@ -749,6 +749,18 @@ def test_a_shipped_policy_drives_its_task_as_it_plays_it(cathsim, shared_environ
     assert code == 2 and "type1_lcca" in told
 
 
+def test_a_simulated_device_measures_as_a_load_cell_does(shared_environment):
+    """The mean over a period, by which the suite judges, not its last moment."""
+    env = shared_environment("femoral_type1_lcca", observation="tracking", max_steps=15)
+    device = bridge.SimulatedDevice(env, "femoral_type1_lcca")
+    device.start(0)
+    device.command(np.ones(21))
+    force = [device.read().force for _ in range(10)][-1]
+    measured = env.task.wall_force
+    assert force["largest"] == measured.mean_max != measured.max
+    assert force["sum"] == measured.mean_sum > 0.0
+
+
 def test_a_port_that_is_taken_is_refused_before_anything_compiles(cathsim, monkeypatch):
     monkeypatch.setattr(suite, "load", lambda *task: pytest.fail("it compiles"))
     with bridge.listen("127.0.0.1", 0) as taken:

@@ -205,6 +205,17 @@ def alike(task_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     return {k: list(v) if isinstance(v, tuple) else v for k, v in given.items()}
 
 
+def require_dataset(path: str | Path | None) -> None:
+    """DatasetError if there is none; what is in it is looked at when it is read."""
+    if not path:
+        raise DatasetError(
+            "demonstrations is not given: bc needs the directory of a dataset; "
+            "`cathsim demos` writes one."
+        )
+    if not (hub.is_reference(path) or recordings_in(path)):
+        dataset.metadata_of(path)
+
+
 def load_transitions(
     path: str | Path,
     observation: str | Sequence[str],
@@ -279,8 +290,8 @@ def _tensors(path: str | Path, episode: Any, names: Sequence[str]) -> TensorDict
     return TensorDict(
         {
             **{key: value[:-1] for key, value in seen.items()},
-            "action": torch.as_tensor(episode.actions).float(),
-            EXPERT_ACTION: torch.as_tensor(chosen).float(),
+            "action": torch.as_tensor(episode.actions).float().clamp(-1.0, 1.0),
+            EXPERT_ACTION: torch.as_tensor(chosen).float().clamp(-1.0, 1.0),
             "next": {
                 **{key: value[1:] for key, value in seen.items()},
                 "reward": torch.as_tensor(np.asarray(episode.rewards)).float()[:, None],

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from typing_extensions import override
 
-from cathsim_dmc.agents.config import ConfigError, TrainingConfig, positive, within
+from cathsim_dmc.agents.config import TrainingConfig, positive, within
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, alike, load_transitions
 from cathsim_dmc.agents.learner import Learner, means
 from cathsim_dmc.agents.networks import NetworkShapes, bounded, network_of
@@ -144,14 +144,9 @@ class BC(CloningLearner):
     metrics: ClassVar[tuple[str, ...]] = ("loss", "deviation", "gradient_steps")
 
     def __init__(self, config: BCConfig, shapes: NetworkShapes, directory: Path):
-        """Makes the policy; ConfigError or DatasetError if there is no dataset."""
-        if not config.demonstrations:
-            raise ConfigError(
-                "demonstrations is not given: bc needs the directory of a dataset; "
-                "`cathsim demos` writes one."
-            )
+        """Makes the policy; DatasetError if the dataset cannot be used."""
         self.states = load_transitions(
-            config.demonstrations,
+            config.demonstrations or "",
             config.observation,
             shapes,
             task=config.task,

@@ -10,6 +10,7 @@ from cathsim_dmc.agents import loggers
 from cathsim_dmc.agents.collection import check_collector
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.dagger import DAgger, DAggerConfig
+from cathsim_dmc.agents.demonstrations import require_dataset
 from cathsim_dmc.agents.imitation import BC, BCConfig
 from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.ppo import PPO, PPOConfig
@@ -55,10 +56,11 @@ def _choice(table: Mapping[str, Any], name: object, what: str) -> Any:
 
 
 def check_usable(config: TrainingConfig) -> None:
-    """Refuses settings that cannot be used here: modules, device, logger, collectors.
+    """Refuses settings that cannot be used here.
 
     Raises:
-        ConfigError: one of them cannot; the message says what can.
+        ConfigError: modules, device, logger or collectors cannot; says what can.
+        DatasetError: there are no demonstrations where they must be.
     """
     if config.modules:
         suite.known(config.task, config.modules)
@@ -66,4 +68,7 @@ def check_usable(config: TrainingConfig) -> None:
     with files.refused(ConfigError, text, (RuntimeError, AssertionError)):
         torch.zeros(1, device=config.torch_device)
     loggers.require(config.logger)
+    shown = getattr(config, "demonstrations", None)
+    if shown or config.algorithm == "bc":
+        require_dataset(shown)
     check_collector(config, LEARNERS[config.algorithm].learner)

@@ -29,7 +29,8 @@ class State(NamedTuple):
     Attributes:
         observation: Arrays by key, as the device's table says.
         force: Newtons by name, those that are measured: "largest", the largest contact
-            with the wall, "sum", of all contacts, and "push", at the base.
+            with the wall, and "sum", of all contacts, means over the period, and
+            "push", at the base.
         time: Clock of the device, s.
         end: Why the episode is over: "success", "truncated", "physics_error" or
             "force_limit"; None while it goes on.
@@ -111,7 +112,8 @@ class SimulatedDevice:
         if timestep.last():
             kinds = (k for k in ("success", "physics_error") if info[k])
             end = next(kinds, "truncated")
-        force = {"largest": task.wall_force.max, "sum": task.wall_force.sum}
+        measured = task.wall_force  # means over the period, as a load cell reads
+        force = {"largest": measured.mean_max, "sum": measured.mean_sum}
         force["push"] = task.readings.push_force
         forces = {name: float(np.asarray(value)) for name, value in force.items()}
         return State(timestep.observation, forces, float(self._env.physics.time()), end)

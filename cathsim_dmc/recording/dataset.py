@@ -94,6 +94,22 @@ class DatasetError(ValueError):
     """A dataset is missing, damaged or of another kind."""
 
 
+def metadata_of(path: str | os.PathLike[str]) -> Path:
+    """The file that tells what is in a dataset; DatasetError if there is none."""
+    data = next(Path(path).glob("data"), Path(path)) / "metadata.json"
+    if not data.is_file():
+        if Path(path).suffix == SUFFIX:
+            raise DatasetError(
+                f"{path} is a file: put episodes of `cathsim play` or `cathsim record` "
+                "into a folder and give that (--demonstrations)"
+            )
+        raise DatasetError(
+            f"no dataset in {path}: give one of `cathsim demos`, also to a run that is "
+            "resumed (--demonstrations)"
+        )
+    return data
+
+
 def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]:
     """Episodes of a dataset, one after the other, as `minari.EpisodeData`.
 
@@ -108,17 +124,7 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
     extras.require("gym", "minari")
     import minari
 
-    data = next(Path(path).glob("data"), Path(path)) / "metadata.json"
-    if not data.is_file():
-        if Path(path).suffix == SUFFIX:
-            raise DatasetError(
-                f"{path} is a file: put episodes of `cathsim play` or `cathsim record` "
-                "into a folder and give that (--demonstrations)"
-            )
-        raise DatasetError(
-            f"no dataset in {path}: give one of `cathsim demos`, also to a run that is "
-            "resumed (--demonstrations)"
-        )
+    data = metadata_of(path)
     try:
         # Without its spaces Minari would make the environment that the file names.
         named = json.loads(data.read_text())
