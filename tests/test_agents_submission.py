@@ -80,7 +80,9 @@ def test_a_submission_holds_hashes_and_every_episode(played, script, tmp_path):
     assert lines == 100 + len(found) + 3  # a line for each episode and entry
     card = json.loads(pretrained.pretrained_path(name).with_suffix(".json").read_text())
     assert found["policy_sha256"] == card["sha256"]
-    assert found["package"] == __version__ and found["commit"]
+    assert found["package"] == __version__
+    in_git = (Path(__file__).parents[1] / ".git").exists()  # not in the container
+    assert bool(found["commit"]) is in_git
     assert found["versions"]["cathsim-dmc"] == __version__
     assert found["versions"]["mujoco"] == mujoco.__version__
     assert len(found["episodes"]) == 100 and found["summary"]["success"] == 0.5
