@@ -107,7 +107,7 @@ def evaluate(
             return agents.evaluate(who, observer=observer, out_dir=out_dir, **asked)
 
     written = [] if out is None else [out / "evaluation.json", out / "heatmap.png"]
-    with told_of_replaced(*written):
+    with told_of_replaced(written):
         results = {"policy": play(player, out)}
         if baseline and policy != "random":
             results["baseline"] = play("random")
@@ -173,7 +173,7 @@ def submit(
         episodes: Number of episodes; fewer than the 100 of the protocol are not listed.
     """
     how: Any = {"episodes": episodes, "num_threads": threads}
-    with told_of_replaced(out, out.with_suffix(submission.RECORDED)):
+    with told_of_replaced([out, out.with_suffix(submission.RECORDED)]):
         done = submission.submit(policy, out, task, **how)
     rates = done["summary"]["success"], done["summary"]["safe_success"]
     print(f"{out}: success {rates[0]}, safe success {rates[1]}, {done['sha256']}")
@@ -227,7 +227,7 @@ def record(
     episode, env = _played(player, task, task_kwargs, seed)
     for path in targets:
         files.require_file(path, make=True)
-    with told_of_replaced(*targets):
+    with told_of_replaced(targets):
         if out is not None:
             recorded.write(episode, env, out, fluoroscopy)
         for path in beside:

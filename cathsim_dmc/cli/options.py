@@ -3,7 +3,7 @@
 import contextlib
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -45,7 +45,7 @@ def told_of_losses() -> contextlib.redirect_stdout:
 
 
 @contextlib.contextmanager
-def told_of_replaced(*paths: Path) -> Iterator[None]:
+def told_of_replaced(paths: Iterable[Path]) -> Iterator[None]:
     """A context that tells on standard error which of some files it has replaced."""
     before = {path: path.stat().st_mtime_ns for path in paths if path.is_file()}
     yield

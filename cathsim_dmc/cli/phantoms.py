@@ -103,7 +103,7 @@ def import_phantom(
 
 
 def _save(anatomy: Anatomy, out: Path) -> None:
-    with told_of_replaced(out / _FILE):
+    with told_of_replaced([out / _FILE]):
         anatomy.save(out)
 
 
@@ -258,7 +258,7 @@ def export(
 
     files.require_file(out)
     exported.check_wall(wall)
-    with told_of_replaced(out):
+    with told_of_replaced([out]):
         found = exported.write_mjcf(load_anatomy(phantom), out, wall)
     print_json({"file": str(out), **found})
     return 0
