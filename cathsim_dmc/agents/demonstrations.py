@@ -205,8 +205,8 @@ def alike(task_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     return {k: list(v) if isinstance(v, tuple) else v for k, v in given.items()}
 
 
-def require_dataset(path: str | Path | None) -> None:
-    """DatasetError if there is none; what is in it is looked at when it is read."""
+def require_dataset(path: str | Path | None) -> str | Path:
+    """The path; DatasetError if no dataset is there. It is not read."""
     if not path:
         raise DatasetError(
             "demonstrations is not given: bc needs the directory of a dataset; "
@@ -214,6 +214,7 @@ def require_dataset(path: str | Path | None) -> None:
         )
     if not (hub.is_reference(path) or recordings_in(path)):
         dataset.metadata_of(path)
+    return path
 
 
 def load_transitions(

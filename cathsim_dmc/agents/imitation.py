@@ -12,7 +12,12 @@ from torch import nn
 from typing_extensions import override
 
 from cathsim_dmc.agents.config import TrainingConfig, positive, within
-from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, alike, load_transitions
+from cathsim_dmc.agents.demonstrations import (
+    EXPERT_ACTION,
+    alike,
+    load_transitions,
+    require_dataset,
+)
 from cathsim_dmc.agents.learner import Learner, means
 from cathsim_dmc.agents.networks import NetworkShapes, bounded, network_of
 
@@ -146,7 +151,7 @@ class BC(CloningLearner):
     def __init__(self, config: BCConfig, shapes: NetworkShapes, directory: Path):
         """Makes the policy; DatasetError if the dataset cannot be used."""
         self.states = load_transitions(
-            config.demonstrations or "",
+            require_dataset(config.demonstrations),
             config.observation,
             shapes,
             task=config.task,

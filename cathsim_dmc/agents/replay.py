@@ -82,7 +82,7 @@ class ReplayMemory:
         if size == 0:
             return
         storage, digest = TensorDict({}, [capacity]), self.directory / _DIGEST
-        self._digest = state.get("digest")  # None in older checkpoints
+        self._digest = state.get("digest")  # a checkpoint may name none
         for key, path in self._paths.items():
             text = (
                 f"the replay of {size:,} transitions is lost: {path} is missing, "
