@@ -61,7 +61,9 @@ def configuration(number):
         seen |= {"route"}
     else:
         name = str(rng.choice(ONE_DEVICE))
-        options["rotation"] = bool(rng.integers(2)) and not name.endswith("_wire")
+        rotation = bool(rng.integers(2))
+        if not name.endswith("_wire"):  # whose devices have their own
+            options["rotation"] = rotation
     if kind == 2:
         vessel = "living"
         options["effects"] = [SideWind(rng.uniform(-0.05, 0.05, 3))]
