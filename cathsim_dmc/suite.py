@@ -9,7 +9,7 @@ import difflib
 import inspect
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,13 +19,16 @@ from dm_control.utils import containers
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
-from cathsim_dmc.tasks import observations, placement
+from cathsim_dmc.tasks import observations, placement, registered
 from cathsim_dmc.tasks.anatomies import load_anatomy, load_arches_to
 from cathsim_dmc.tasks.anatomies import load_arches as load_arches  # for users, too
 from cathsim_dmc.tasks.config import NavigationConfig, refuse_replaced
+from cathsim_dmc.tasks.definition import OF_ARCHES
+from cathsim_dmc.tasks.definition import TaskDefinition as TaskDefinition
 from cathsim_dmc.tasks.environment import Environment
 from cathsim_dmc.tasks.navigation import Navigation
-from cathsim_dmc.tasks.objectives import Cannulation, Objective
+from cathsim_dmc.tasks.objectives import Objective
+from cathsim_dmc.tasks.registered import COAXIAL as COAXIAL
 from cathsim_dmc.tasks.scene import (
     Scene,
     chosen_devices,
@@ -39,52 +42,8 @@ SUITE = containers.TaggedTasks()
 # Rewards are distances, not in [0, 1], and nothing is coloured by them.
 _TAG = "no_reward_visualization"
 _CONFIG_FIELDS = tuple(field.name for field in dataclasses.fields(NavigationConfig))
-_OF_ARCHES = "arches", "pool", "first", "numbers"  # what chooses random arches
 # Other names of options that an objective cannot have.
-_TAKEN = "random", "environment_kwargs", "anatomy", "goal", "access", *_OF_ARCHES
-
-
-@dataclasses.dataclass(frozen=True)
-class TaskDefinition:
-    """A registered task: its anatomy, goal, objective and options.
-
-    Attributes:
-        description: one line.
-        anatomy: anatomy or its name; None where the user chooses.
-        goal: name of a goal; None where the user chooses.
-        access: where the device enters a phantom or arch, see `load_anatomy`.
-        objective: function of an anatomy, a goal and keyword options, which become
-            options of the task. An option `farthest_shift` receives the largest shift
-            of the goal by randomisation, m.
-        options: fields of `NavigationConfig` that differ from their defaults.
-        random_arch: whether each episode draws a random arch, from those that the
-            task's options `arches`, `pool`, `first` and `numbers` name; there is no
-            `anatomy` then.
-    """
-
-    description: str
-    anatomy: str | Anatomy | None
-    goal: str | None
-    access: str | None = None
-    objective: Callable[..., Objective] = Cannulation.to
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    random_arch: bool = False
-
-    @property
-    def own_options(self) -> tuple[str, ...]:
-        """Names of the options that choose the anatomy and the goal."""
-        if self.random_arch:
-            own = ("goal", "access") if self.goal == "any" else ()
-            return (*_OF_ARCHES, *own)
-        own = () if self.anatomy is not None else ("anatomy", "access")
-        return own if self.goal is not None else (*own, "goal")
-
-    @property
-    def objective_options(self) -> tuple[str, ...]:
-        """Names of the options that the objective takes."""
-        parameters = inspect.signature(self.objective).parameters.values()
-        return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
-
+_TAKEN = "random", "environment_kwargs", "anatomy", "goal", "access", *OF_ARCHES
 
 TASKS: dict[str, TaskDefinition] = {}
 
@@ -337,101 +296,9 @@ def _register_domain() -> None:
     dm_suite.TASKS_BY_DOMAIN = grouped
 
 
-_ARTERIES = {
-    "bca": "the brachiocephalic artery",
-    "lcca": "the left common carotid",
-    "lsa": "the left subclavian artery",
-}
-_PHANTOMS = {
-    "type1": "Type-I phantom",
-    "type2": "Type-II phantom",
-    "simple1": "Idealised Type-I arch",
-    "simple2": "Idealised Type-II arch",
-    "type3": "Type-III arch",
-    "bovine": "Bovine arch",
-}
+def _register_own() -> None:
+    for name, definition, difficulty in registered.definitions():
+        register(name, definition, *filter(None, [difficulty]))
 
 
-# What the longest routes to BCA and LCCA need, 0.167 and 0.274 m, see `placement`.
-_ARCH_LENGTHS = {"ascending": 0.24, "descending": placement.COMMON_LENGTH}
-# Access, prefix of the name, anatomies ("arch" for random ones) and goals.
-_TABLE = (
-    ("ascending", "", ("type1", "type2", "simple1", "simple2"), ("bca", "lcca")),
-    ("descending", "femoral_", ("type1", "type2", "type3", "bovine"), _ARTERIES),
-    ("ascending", "", ("arch",), ("bca", "lcca")),
-    ("descending", "femoral_", ("arch",), ("bca", "lcca")),
-)
-
-
-def _register_plain() -> None:
-    rows = [(*row[:2], a, g) for row in _TABLE for a in row[2] for g in row[3]]
-    for access, prefix, anatomy, goal in rows:
-        drawn = anatomy == "arch"
-        where = "A random arch in each episode" if drawn else _PHANTOMS[anatomy]
-        definition = TaskDefinition(
-            f"{where}: cannulate {_ARTERIES[goal]} from the {access} aorta.",
-            None if drawn else anatomy,
-            goal,
-            access,
-            # One length for all arches of the sets, in every pool.
-            options={"working_length": _ARCH_LENGTHS[access]} if drawn else {},
-            random_arch=drawn,
-        )
-        easy = goal == "bca" and not (drawn or prefix)
-        register(f"{prefix}{anatomy}_{goal}", definition, "easy" if easy else "hard")
-
-
-def _register_coaxial() -> None:
-    """Variants of each task: a guidewire, and a guidewire in a catheter."""
-    for name, definition in list(TASKS.items()):
-        for suffix, (chosen, words) in COAXIAL.items():
-            register(
-                f"{name}_{suffix}",
-                dataclasses.replace(
-                    definition,
-                    description=f"{definition.description.rstrip('.')}, {words}.",
-                    options={**definition.options, "devices": chosen},
-                ),
-                "hard",
-            )
-
-
-# Devices of the tasks with that suffix, from the innermost outwards.
-COAXIAL = {
-    "wire": (("wire_035_glide",), "with a guidewire that is pushed and turned"),
-    "pair": (
-        ("wire_035_glide", "berenstein_5f"),
-        "with a guidewire in a catheter, both pushed and turned",
-    ),
-}
-
-_register_plain()
-register(
-    "arch_any",
-    TaskDefinition(
-        "A random arch, access and branch in each episode.",
-        None,
-        "any",
-        "any",
-        options={"working_length": placement.COMMON_LENGTH},
-        random_arch=True,
-    ),
-    "hard",
-)
-register(
-    "neck_any",
-    TaskDefinition(
-        "A random arch with the arteries of neck and arms, from the descending aorta.",
-        None,
-        "any",
-        "descending",
-        options={"working_length": 0.44, "arches": "neck"},
-        random_arch=True,
-    ),
-    "hard",
-)
-_register_coaxial()
-register(
-    "navigate",
-    TaskDefinition("Any anatomy, such as an imported scan: reach a goal.", None, None),
-)
+_register_own()

@@ -1,0 +1,53 @@
+"""What a task of the suite is made of."""
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.tasks.objectives import Cannulation, Objective
+
+OF_ARCHES = "arches", "pool", "first", "numbers"  # what chooses random arches
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskDefinition:
+    """A registered task: its anatomy, goal, objective and options.
+
+    Attributes:
+        description: one line.
+        anatomy: anatomy or its name; None where the user chooses.
+        goal: name of a goal; None where the user chooses.
+        access: where the device enters a phantom or arch, see `load_anatomy`.
+        objective: function of an anatomy, a goal and keyword options, which become
+            options of the task. An option `farthest_shift` receives the largest shift
+            of the goal by randomisation, m.
+        options: fields of `NavigationConfig` that differ from their defaults.
+        random_arch: whether each episode draws a random arch, from those that the
+            task's options `arches`, `pool`, `first` and `numbers` name; there is no
+            `anatomy` then.
+    """
+
+    description: str
+    anatomy: str | Anatomy | None
+    goal: str | None
+    access: str | None = None
+    objective: Callable[..., Objective] = Cannulation.to
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    random_arch: bool = False
+
+    @property
+    def own_options(self) -> tuple[str, ...]:
+        """Names of the options that choose the anatomy and the goal."""
+        if self.random_arch:
+            own = ("goal", "access") if self.goal == "any" else ()
+            return (*OF_ARCHES, *own)
+        own = () if self.anatomy is not None else ("anatomy", "access")
+        return own if self.goal is not None else (*own, "goal")
+
+    @property
+    def objective_options(self) -> tuple[str, ...]:
+        """Names of the options that the objective takes."""
+        parameters = inspect.signature(self.objective).parameters.values()
+        return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
