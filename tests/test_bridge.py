@@ -132,6 +132,18 @@ def test_an_empty_host_does_not_let_all_machines_in():
         serving.listen("", 0)
 
 
+@pytest.mark.parametrize("host", ["::1", "[::1]", "127.0.0.1"])
+def test_a_device_listens_on_either_protocol(host):
+    try:
+        listener = serving.listen(host, 0)
+    except OSError:
+        pytest.skip(f"no {host} on this machine")
+    with listener:
+        port = listener.getsockname()[1]
+        shown = f"[{host.strip('[]')}]" if ":" in host else host
+        connect(f"{shown}:{port}").close()
+
+
 def test_a_log_is_never_overwritten(tmp_path):
     (tmp_path / "a.jsonl").write_text("old")
     with pytest.raises(FileExistsError):

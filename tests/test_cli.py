@@ -414,6 +414,14 @@ BAD = {
         ["drive", "pretrained:type1_lcca", "--connect", "127.0.0.1:1", "--seed", -5],
         ["seed is -5", "from 0 to"],
     ),
+    "no spread of the published forces": (
+        ["validate", "forces", "--sd", 0],
+        ["sd is 0", "above 0"],
+    ),
+    "a film that is written twice": (
+        ["record", "push", "--task", "type1_bca", "--out", "a.gif", "--gif", "a.gif"],
+        ["both a.gif"],
+    ),
     "no task to evaluate on": (["eval", "random"], ["needs a task"]),
     "arches where there are none": (
         ["eval", "push", "--task", "type1_bca", "--pool", 2],

@@ -247,6 +247,9 @@ def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
         one.reset()
     with pytest.raises(gymnasium.error.ResetNeeded):
         one.step(one.action_space.sample())
+    for use in (many.reset, lambda: many.step(many.action_space.sample())):
+        with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="another"):
+            use()
 
 
 def test_a_vector_takes_the_seed_of_its_task():

@@ -121,13 +121,17 @@ def _told(episode: Mapping[str, Any]) -> str:
 def listen(host: str, port: int) -> socket.socket:
     """A socket that listens; OSError if the port is taken, 0 takes a free one.
 
+    A host with colons, in brackets or not, is one of IPv6.
+
     Raises:
         ValueError: the port is none, or the host is empty, which would let all in.
     """
     bounds.text("host", host)
     bounds.whole("port", port, 0, 65535)
     try:
-        return socket.create_server((host, port), backlog=8)
+        host = host.strip("[]")
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        return socket.create_server((host, port), family=family, backlog=8)
     except OSError as error:
         text = f"cannot listen on {host}:{port}; choose another --port or --host"
         raise OSError(f"{text}: {error}") from error

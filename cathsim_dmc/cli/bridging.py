@@ -56,7 +56,7 @@ def serve(
     password, so other machines are let in by --host alone.
 
     Args:
-        host: Address to listen on; 0.0.0.0 for all of this machine.
+        host: Address to listen on, of IPv4 or IPv6; 0.0.0.0 for all of this machine.
         port: Port to listen on; 0 takes a free one.
         episodes: Number of episodes after which it ends; by default it goes on.
         log: File of JSON lines to write, with what was applied.
@@ -74,7 +74,8 @@ def serve(
     env.reset()  # compiles what a first reset compiles
     device = bridge.SimulatedDevice(env, task)
     with listen(host, port) as listener, bridge.Log(log) as kept:
-        place = "{}:{}".format(*listener.getsockname()[:2])
+        at, taken = listener.getsockname()[:2]
+        place = f"[{at}]:{taken}" if ":" in at else f"{at}:{taken}"
         say(f"{env.task!r} listens on {place}")
         done = bridge.serve(device, listener, how, episodes=episodes, log=kept, say=say)
     if json:

@@ -110,10 +110,7 @@ class CathSimEnv(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Starts an episode; see `gymnasium.Env.reset`. `options` has no meaning."""
-        if self._closed:
-            raise gymnasium.error.ClosedEnvironmentError(
-                "the environment is closed; make another one"
-            )
+        _require_open(self._closed)
         super().reset(seed=seed)
         if seed is not None:
             self.environment.random_state.seed(seed)
@@ -245,6 +242,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
             options: {"reset_mask": mask} resets simulations where the mask (N,) bool
                 is true; the others stay.
         """
+        _require_open(self.closed)
         mask = _reset_mask(options, self.num_envs)
         if seed is not None:
             seeds = _seeds(seed, self.num_envs)
@@ -263,6 +261,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         "final_obs" (N objects) and "final_info" of infos, where the next one begins in
         the same step ("SameStep").
         """
+        _require_open(self.closed)
         waiting = self._ended
         if waiting.any() and self._mode is AutoresetMode.DISABLED:
             raise gymnasium.error.ResetNeeded(
@@ -304,6 +303,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             ValueError: if the snapshot is of another task or number of simulations.
         """
+        _require_open(self.closed)
         step = self.simulation.restore(snapshot)
         self._ended = step.terminated | step.truncated
         everyone = np.ones(self.num_envs, bool)
@@ -320,6 +320,13 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         if not hasattr(self.simulation.rollout, "readings"):
             raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")
         return tuple(_fluoroscopy(self.simulation.rollout))
+
+
+def _require_open(closed: bool) -> None:
+    if closed:
+        raise gymnasium.error.ClosedEnvironmentError(
+            "the environment is closed; make another one"
+        )
 
 
 def _seeds(seed: Any, count: int) -> Sequence[int | None]:
