@@ -209,10 +209,16 @@ def test_the_catheter_follows_to_a_take_off_close_to_the_first(
     assert progress.memory is not None
     assert progress.memory.ostium[0] == (plan.ostium if close else np.inf)
     assert close or plan.ostium == plan.arc_length[np.diff(plan.radii).argmin()]
+    assert progress.memory.last[0] == take_offs.last_apart(plan) == np.inf
     if close:  # no longer, where the way between them is longer
         monkeypatch.setattr(take_offs, "CLOSE", 0.9 * (ways[0] - ways[1]))
         plan = CoaxialPlan.for_case(case)  # pyright: ignore[reportArgumentType]
         assert plan.arc_length[-1] - plan.ostium == pytest.approx(left[0])
+        last = take_offs.last_apart(plan)
+        assert plan.arc_length[-1] - last == pytest.approx(left[-1])
+        progress = Progress(["route_retry"], [case], 1, False)  # pyright: ignore[reportArgumentType]
+        progress.see(rows, True, rows, readings, {})
+        assert progress.memory is not None and progress.memory.last[0] == last
         assert plan.settings is CoaxialPlan.settings
 
 

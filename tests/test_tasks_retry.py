@@ -82,6 +82,20 @@ def test_a_hard_push_ends_an_attempt_and_several_at_one_place_all(settings):
     assert memory.pushed[0] == 0
 
 
+def test_past_take_offs_that_lie_apart_a_harder_push_ends_an_attempt():
+    memory = begun([0.1, 0.1], [0.08] * 2, last=[0.09, 0.11])
+    for push, ended in (
+        (0.9 * COAXIAL.hard_push, [0, 0]),
+        (1.1 * COAXIAL.hard_push, [0, 1]),
+        (1.1 * COAXIAL.deep_push, [1, 1]),
+    ):
+        after = memory
+        for _ in range(COAXIAL.push_patience + 1):
+            after = goes_on(after, 0.1, 0.08, push=push, settings=COAXIAL)
+        assert after.attempts.tolist() == ended
+    assert SINGLE.deep_push == SINGLE.hard_push
+
+
 def test_a_shaft_that_buckles_is_taken_back_until_the_head_comes_with_it():
     memory = begun([0.1], [0.05])
     memory = goes_on(memory, 0.1, 0.05 + COAXIAL.slack + 1e-4, settings=COAXIAL)

@@ -86,6 +86,8 @@ class Progress:
         alone = np.inf, False  # one device follows to no take-off
         ends = [take_offs.followed(r) if self._coaxial else alone for r in routes]
         self._ostium = np.array([end if close else np.inf for end, close in ends])
+        far = take_offs.last_apart if self._coaxial else lambda route: np.inf
+        self._last = np.array([far(route) for route in routes])
         nowhere = Place(np.full(self._count, np.nan), np.zeros(self._count))
         self.memory = Memory.at(nowhere, np.zeros(self._count))
 
@@ -180,8 +182,11 @@ class Progress:
         assert self.memory is not None
         new = Memory.at(place, insertion)
         if len(self._first):
-            first, ostium = self._first[chosen], self._ostium[chosen]
-            new = new._replace(first=first, ostium=ostium)
+            new = new._replace(
+                first=self._first[chosen],
+                ostium=self._ostium[chosen],
+                last=self._last[chosen],
+            )
         begun = np.zeros(self._count, bool)
         begun[rows] = True
         pairs = zip(self.memory, new, strict=True)

@@ -67,6 +67,8 @@ class RetrySettings:
         lost_patience: control steps outside the route's tube until a retry.
         tolerance: by how much of its radius the lumen may exceed the route's tube.
         hard_push: force of the base above which it is pushed too hard, N.
+        deep_push: likewise past the last of several take-offs that lie apart, where
+            the friction in the bends before takes up more of the push.
         push_patience: control steps of such a push until a retry.
         most_pushed: retries after such pushes at one place, with which it gives up.
         backoff: way back of the first retry, m.
@@ -99,6 +101,7 @@ class RetrySettings:
     lost_patience: int = 10
     tolerance: float = 0.25
     hard_push: float = 0.1
+    deep_push: float = 0.1
     push_patience: int = 2
     most_pushed: int = 6
     backoff: float = 15e-3
@@ -125,6 +128,7 @@ COAXIAL = RetrySettings(
     patience=60,
     lost_patience=15,
     hard_push=0.2,
+    deep_push=0.3,
     most_pushed=16,
     slack=12e-3,
     slack_growth=0.5,
@@ -166,6 +170,7 @@ class Memory(NamedTuple):
         first: number of the lead that the first attempt has.
         ostium: arc length of the last take-off close to the first one, m; infinite
             without.
+        last: of the last of several take-offs that lie apart, likewise.
         given_up: bool, whether there is no further attempt.
     """
 
@@ -184,6 +189,7 @@ class Memory(NamedTuple):
     attempts: np.ndarray
     first: np.ndarray
     ostium: np.ndarray
+    last: np.ndarray
     given_up: np.ndarray
 
     @classmethod
@@ -202,6 +208,7 @@ class Memory(NamedTuple):
             **dict.fromkeys(("pushed", "attempts", "first"), none),
             turn=zero,
             ostium=zero + np.inf,
+            last=zero + np.inf,
         )
 
     @property
@@ -235,7 +242,8 @@ def advance(
     gained = place.arc_length > m.best + s.progress
     stale = np.where(gained & on, 0, m.stale + 1)
     lost = np.where(outside & on, m.lost + 1, 0)
-    pressed = np.where((push > s.hard_push) & on, m.pressed + 1, 0)
+    hard_push = np.where(place.arc_length > m.last, s.deep_push, s.hard_push)
+    pressed = np.where((push > hard_push) & on, m.pressed + 1, 0)
     held = np.where(gained | m.retracting, np.minimum(insertion, m.held), m.held)
     held = np.where(gained, insertion, held)
     recent = m.attempts % _GROWING

@@ -44,6 +44,17 @@ def followed(route: Route) -> tuple[float, bool]:
     return last, last != first
 
 
+def last_apart(route: Route) -> float:
+    """The last of several take-offs, none of which follows the first one closely.
+
+    Returns:
+        Its arc length, m; infinite where there is one alone, or one is close.
+    """
+    places = take_offs(route)
+    apart = len(places) > 1 and not followed(route)[1]
+    return places[-1] if apart else float("inf")
+
+
 def bend(route: Route, place: float, way: float = 20e-3) -> tuple[float, float]:
     """Turn of a route at a place, rad, and cosine between its plane and that before.
 
