@@ -621,31 +621,26 @@ BAD = {
 }
 
 
-@pytest.fixture(scope="module")
-def patient():
+def test_what_is_no_action_is_refused_by_name_and_stops_the_device():
     robot = Robot(steps=10**9)
     robot.period = 1.0  # so that a flood is one
     served = Served(robot, episodes=len(BAD), lockstep=True, watchdog=WAIT)
-    yield served
+    for name in BAD:  # to one device, which goes on with the next driver
+        before, taken = robot.stops, len(robot.taken)
+        link = served.raw()
+        link.send(1.0, "start", seed=None)
+        assert link.receive(time.monotonic() + WAIT)["kind"] == "state", name
+        with contextlib.suppress(OSError):
+            link._socket.sendall(BAD[name])
+        with pytest.raises(bridge.BridgeError) as wrong:
+            while True:
+                assert link.receive(time.monotonic() + WAIT), name
+        faults = name.strip(), "peer_lost" if name == "flood" else ""
+        assert wrong.value.fault in faults, name
+        link.close()
+        assert robot.stops > before, name
+        assert len(robot.taken) - taken <= (name == "flood"), name
     assert [one["end"] for one in served.joined()] == [name.strip() for name in BAD]
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_what_is_no_action_is_refused_by_name_and_stops_the_device(patient, name):
-    before = patient.robot.stops
-    link = patient.raw()
-    link.send(1.0, "start", seed=None)
-    assert link.receive(time.monotonic() + WAIT)["kind"] == "state"
-    taken = len(patient.robot.taken)
-    with contextlib.suppress(OSError):
-        link._socket.sendall(BAD[name])
-    with pytest.raises(bridge.BridgeError) as wrong:
-        while True:
-            assert link.receive(time.monotonic() + WAIT)
-    assert wrong.value.fault in (name.strip(), "peer_lost" if name == "flood" else "")
-    link.close()
-    assert patient.robot.stops > before
-    assert len(patient.robot.taken) - taken <= (name == "flood")
 
 
 def test_another_version_another_program_and_a_stranger_are_refused(monkeypatch):
