@@ -297,8 +297,8 @@ def _register_domain() -> None:
 
 
 def _register_own() -> None:
-    for name, definition, difficulty in registered.definitions():
-        register(name, definition, *filter(None, [difficulty]))
+    for name, definition, tags in registered.definitions():
+        register(name, definition, *tags)
 
 
 _register_own()

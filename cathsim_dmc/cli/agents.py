@@ -209,7 +209,7 @@ def record(
     targets = [path for path in (out, gif) if path is not None]
     if not targets:
         raise ValueError("nothing is to be written; give --out, an .rrd file, or --gif")
-    if gif is not None and gif == out:
+    if gif == out:
         raise ValueError(f"--out and --gif are both {out}; leave one of them out")
     for path, endings in (out, recorded.FORMATS), (gif, SUFFIXES):
         if path is not None and path.suffix not in endings:

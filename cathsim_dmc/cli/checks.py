@@ -13,7 +13,6 @@ from typing import Annotated, Literal, NamedTuple
 from packaging.requirements import Requirement
 from tyro import conf
 
-from cathsim_dmc import bounds
 from cathsim_dmc.cli.options import (
     CHECK_FAILED,
     Json,
@@ -159,9 +158,6 @@ def _forces(options: Protocol, json: bool) -> int:
 
     if options.figure is not None:
         require_png(options.figure)
-    bounds.number("mean", options.mean, low=0.0)
-    for name in ("sd", "margin"):
-        bounds.number(name, getattr(options, name), positive=True)
     episode = None if options.episode is None else Episode.load(options.episode)
     report = force_sensors.validate_forces(
         episode=episode, mean=options.mean, sd=options.sd, margin=options.margin

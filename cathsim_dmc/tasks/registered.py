@@ -38,8 +38,8 @@ COAXIAL = {
 }
 
 
-def definitions() -> Iterator[tuple[str, TaskDefinition, str | None]]:
-    """Name, definition and difficulty of each task: "easy", "hard" or None."""
+def definitions() -> Iterator[tuple[str, TaskDefinition, tuple[str, ...]]]:
+    """Name, definition and tags of each task, which say how hard it is."""
     single = list(_single())
     yield from single
     for name, definition, _ in single:
@@ -49,12 +49,12 @@ def definitions() -> Iterator[tuple[str, TaskDefinition, str | None]]:
                 description=f"{definition.description.rstrip('.')}, {words}.",
                 options={**definition.options, "devices": chosen},
             )
-            yield f"{name}_{suffix}", variant, "hard"
+            yield f"{name}_{suffix}", variant, ("hard",)
     description = "Any anatomy, such as an imported scan: reach a goal."
-    yield "navigate", TaskDefinition(description, None, None), None
+    yield "navigate", TaskDefinition(description, None, None), ()
 
 
-def _single() -> Iterator[tuple[str, TaskDefinition, str]]:
+def _single() -> Iterator[tuple[str, TaskDefinition, tuple[str, ...]]]:
     """Those of the usual device."""
     rows = [(*row[:2], a, g) for row in _TABLE for a in row[2] for g in row[3]]
     for access, prefix, anatomy, goal in rows:
@@ -70,7 +70,7 @@ def _single() -> Iterator[tuple[str, TaskDefinition, str]]:
             random_arch=drawn,
         )
         easy = goal == "bca" and not (drawn or prefix)
-        yield f"{prefix}{anatomy}_{goal}", definition, "easy" if easy else "hard"
+        yield f"{prefix}{anatomy}_{goal}", definition, ("easy" if easy else "hard",)
     definition = TaskDefinition(
         "A random arch, access and branch in each episode.",
         None,
@@ -79,7 +79,7 @@ def _single() -> Iterator[tuple[str, TaskDefinition, str]]:
         options={"working_length": placement.COMMON_LENGTH},
         random_arch=True,
     )
-    yield "arch_any", definition, "hard"
+    yield "arch_any", definition, ("hard",)
     definition = TaskDefinition(
         "A random arch with the arteries of neck and arms, from the descending aorta.",
         None,
@@ -88,4 +88,4 @@ def _single() -> Iterator[tuple[str, TaskDefinition, str]]:
         options={"working_length": 0.44, "arches": "neck"},
         random_arch=True,
     )
-    yield "neck_any", definition, "hard"
+    yield "neck_any", definition, ("hard",)

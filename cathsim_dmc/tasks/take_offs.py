@@ -51,7 +51,7 @@ def last_apart(route: Route) -> float:
         Its arc length, m; infinite where there is one alone, or one is close.
     """
     places = take_offs(route)
-    apart = len(places) > 1 and not followed(route)[1]
+    apart = len(places) > 1 and places[1] >= places[0] + CLOSE
     return places[-1] if apart else float("inf")
 
 

@@ -179,6 +179,9 @@ def compare_forces(
     Raises:
         ValueError: if the episode has too few contacts, or a number is not positive.
     """
+    bounds.number("mean", mean, low=0.0)
+    for name, value in (("sd", sd), ("margin", margin)):
+        bounds.number(name, value, positive=True)
     if episode is None:
         episode = expert_cannulation()
     bounds.instance("episode", episode, Episode)
