@@ -42,6 +42,7 @@ PARITY_TASKS: dict[str, dict[str, Any]] = {
     "type1_lcca randomised": {"randomisation": True},
     "femoral_type1_lcca": {},
     "arch_lcca": {"pool": 2},
+    "type1_lcca_pair": {},
 }
 # Observation, worlds and actions, the most important ones first.
 SPEED = (
@@ -50,6 +51,7 @@ SPEED = (
     ("image", 4096, "random"), ("internal", 1024, "random"),
     ("route", 4096, "random"), ("internal", 1024, "push"),
     ("internal", 16384, "push"), ("image", 4096, "push"), ("route", 4096, "push"),
+    ("internal, pair", 4096, "random"), ("internal, pair", 4096, "push"),
 )  # fmt: skip
 ON_THE_CPU = 1024  # simulations on all cores
 # Hundreds of worlds, a few steps of each: an update needs no more frames.
@@ -91,12 +93,14 @@ class Report:
         return time.perf_counter() - self._began + seconds <= self._budget
 
 
-def actions(policy: str, steps: int, shape: tuple[int, int]) -> np.ndarray:
-    """Actions (steps, N, A): random ones, or a straight push."""
+def actions(policy: str, steps: int, simulation: BatchSimulation) -> np.ndarray:
+    """Actions (steps, N, A): random ones, or a straight push of all devices."""
+    shape = steps, simulation.num_simulations, simulation.num_actions
     if policy == "random":
-        return np.random.RandomState(0).uniform(-1, 1, (steps, *shape))
-    held = np.zeros((steps, *shape))
-    held[..., -1] = 1.0
+        return np.random.RandomState(0).uniform(-1, 1, shape)
+    held = np.zeros(shape)
+    coaxial = simulation.task.scene.catheter.coaxial
+    held[..., slice(0, None, 2) if coaxial else -1] = 1.0
     return held
 
 
@@ -109,7 +113,7 @@ def parity(device: str, name: str, steps: int) -> dict[str, Any]:
         simulation.seed(0)
         simulation.reset()
     tip, force, count = [], [], []
-    for action in actions("push", steps, (4, one.num_actions)):
+    for action in actions("push", steps, one):
         here, there = one.step(action), two.step(action)
         apart = here.readings.head - there.readings.head
         tip.append(np.linalg.norm(apart, axis=-1))
@@ -142,10 +146,12 @@ def speed(
 ) -> dict[str, Any]:
     """Control steps per second of the physics alone, and end to end in TorchRL."""
     began = time.perf_counter()
-    env = BatchedEnv("type1_lcca", worlds, observation=observation, device=device)
+    seen, _, pair = observation.partition(", ")
+    task = "type1_lcca_pair" if pair else "type1_lcca"
+    env = BatchedEnv(task, worlds, observation=seen, device=device)
     state = env.reset()
     built = time.perf_counter() - began
-    chosen = actions(policy, 8, (worlds, env.simulation.num_actions))
+    chosen = actions(policy, 8, env.simulation)
     given = [torch.as_tensor(a, dtype=torch.float32, device=env.device) for a in chosen]
     began = time.perf_counter()
     env.step(state.set("action", given[0]))
@@ -292,9 +298,11 @@ def tables(found: Mapping[str, Any]) -> dict[str, str]:
     ]
     for row in found.get("speed", ()):
         on_gpu = row["device"] != "cpu"
+        name, *others = row["observation"].split(", ")
+        rest = "".join(f", {each}" for each in others)
         memory = row.get("memory_mb", 0) / 1000
         speeds.append(
-            f"| `{row['observation']}` | {'GPU' if on_gpu else 'all cores'} | "
+            f"| `{name}`{rest} | {'GPU' if on_gpu else 'all cores'} | "
             f"{row['worlds']:,} | {row['policy']} | "
             f"{format(row['physics'], ',') if on_gpu else '–'} | "
             f"{row['end_to_end']:,} | {f'{memory:.1f} GB' if on_gpu else '–'} |"
@@ -313,8 +321,8 @@ def tables(found: Mapping[str, Any]) -> dict[str, str]:
         )
     place = [
         "",
-        f"`type1_lcca` on one {found.get('gpu', 'CPU')}, {found['host']}, "
-        f"{found['date']}; control steps per second:",
+        f"`type1_lcca` (pair: `type1_lcca_pair`) on one {found.get('gpu', 'CPU')}, "
+        f"{found['host']}, {found['date']}; control steps per second:",
     ]
     written = {
         "where": place,

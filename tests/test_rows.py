@@ -46,9 +46,13 @@ def test_copies_are_of_the_kind_asked_for():
 
 
 @pytest.mark.slow
-def test_many_simulations_are_those_of_few():
+@pytest.mark.parametrize(
+    ("name", "observation"),
+    [("type1_lcca", ["internal", "image"]), ("type1_lcca_pair", ["internal"])],
+)
+def test_many_simulations_are_those_of_few(name, observation):
     def play(count):
-        task = suite.make_task("type1_lcca", observation=["internal", "image"])
+        task = suite.make_task(name, observation=observation)
         batch = BatchSimulation(task, count, num_threads=2, seeds=0)
         batch.reset()
         actions = np.random.RandomState(1).uniform(-1, 1, (600, batch.num_actions))

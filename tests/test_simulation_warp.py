@@ -110,11 +110,42 @@ def test_other_scenes_follow_the_batch(task, options):
     assert equal >= 0.9 * 4 * 16
 
 
+@pytest.mark.slow
+@needs_warp
+def test_coaxial_devices_follow_the_batch():
+    """The outer device overtakes the inner one; then one world begins anew."""
+    one, two = both("type1_lcca_pair", randomisation=True)
+    one.reset(), two.reset()
+    random, forces, leads = np.random.RandomState(0), [], set()
+    for step in range(26):
+        if step == 23:
+            one.reset(np.array([1])), two.reset(np.array([1]))
+        action = random.uniform(-1, 1, (4, one.num_actions))
+        action[:, [0, 2]] = (-1.0, 1.0) if step < 20 else (1.0, 0.5)
+        here, there = one.step(action), two.step(action)
+        tips = here.readings.head - there.readings.head
+        assert np.linalg.norm(tips, axis=1).max() < 0.05e-3
+        coaxial = one.rollout.devices, two.rollout.devices
+        leads |= set(coaxial[0].insertion.argmax(axis=1).tolist())
+        for name, value in coaxial[0]._asdict().items():
+            found = getattr(coaxial[1], name)
+            np.testing.assert_allclose(found, value, rtol=2e-3, atol=2e-4, err_msg=name)
+        for key, value in here.observation.items():
+            np.testing.assert_allclose(there.observation[key], value, atol=0.02)
+        forces.append((here.wall_force.sum, there.wall_force.sum))
+    assert leads == {0, 1}
+    totals = np.array(forces).sum(axis=(0, 2))
+    assert totals[1] == pytest.approx(totals[0], rel=0.01) and totals[0] > 0.0
+    stepper = two.stepper
+    for name in ("body_mass", "geom_friction", "geom_size", "jnt_stiffness"):
+        there, own = getattr(stepper._worlds.model, name).numpy(), stepper._own[name]
+        np.testing.assert_allclose(there, own.reshape(there.shape), rtol=1e-5)
+
+
 @needs_warp
 @pytest.mark.parametrize(
     ("task", "options", "named"),
     [
-        ("type1_lcca_pair", {}, "coaxial devices"),
         ("type1_lcca", {"vessel": "living"}, "living vessel"),
         ("type1_lcca", {"solver_tolerance": 1e-8}, "solver_tolerance"),
     ],

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc import rows
 from cathsim_dmc.entities import stack_memory
 from cathsim_dmc.entities.chain import (
     MAX_PUSH_FORCE,
@@ -131,7 +132,7 @@ class SlidingDevices(SingleDevice):
         total, links = len(self._insertion), len(self._stack.tables.lengths)
         turned, force = np.zeros(self._insertion.shape), np.zeros((total, links))
         gaps, load = np.tile(gaps, (total, 1)), np.zeros(total)
-        self._write(gaps, turned, force, load, (index, index + 1), lays=True)
+        self._write(gaps, turned, force, load, laid=index)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Moves the devices and writes the properties of the chains.
@@ -194,7 +195,7 @@ class SlidingDevices(SingleDevice):
             beyond = -np.cumsum(outside[:, ::-1], axis=1)[:, ::-1]
             beyond = np.ascontiguousarray(beyond)
             sliding.leading_load(beyond, state.centreline, gaps, nodes, load)
-        axial = self._write(gaps, turned, force, load, (0, len(gaps)))
+        axial = self._write(gaps, turned, force, load)
         if count > 1:
             self._axial[:] = axial.sum(axis=-1)
             self._axial[:, :-1] += self._drag
@@ -209,14 +210,14 @@ class SlidingDevices(SingleDevice):
         turned: np.ndarray,
         force: np.ndarray,
         load: np.ndarray,
-        rows: tuple[int, int],
-        lays: bool = False,
+        laid: int | None = None,
     ) -> np.ndarray:
-        """Writes the chains of simulations, from the first to before the last of rows.
+        """Writes the chains of all simulations, or of one.
 
         Args:
             gaps: (N, K), as are the others as in `laws.sliding`, with an axis N.
-            lays: Whether the devices have just been laid and are not turned.
+            laid: Number of the one whose devices have just been laid and are not
+                turned.
 
         Returns:
             Axial forces (N, K, J) at the joints, N.
@@ -235,7 +236,20 @@ class SlidingDevices(SingleDevice):
             slipped=self.slipped[:, 1::2],
             axial=axial,
         )
-        adapters.settle(self._live, loads, state, rows, lays)
+
+        def settle(own: slice) -> None:
+            tables, live = self._stack.tables, self._live
+            if len(gaps) >= rows.MANY:  # others settle at the same time
+                live = live._replace(
+                    scratch=stack_memory.settling(tables),
+                    chain=stack_memory.chain(tables),
+                )
+            adapters.settle(live, loads, state, (own.start, own.stop), laid is not None)
+
+        if laid is None:
+            rows.each(len(gaps), settle)
+        else:
+            settle(slice(laid, laid + 1))
         return axial
 
     # What others may read.

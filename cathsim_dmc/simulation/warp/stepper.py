@@ -31,8 +31,9 @@ from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
 
-# State of a simulation, in the order in which it is written.
+# State of a simulation that the physics changes, and that the effects write.
 _STATE = ("qpos", "qvel", "act", "qacc_warmstart")
+_GIVEN = ("userdata", "qfrc_applied")
 _LEAST_TOLERANCE = 1e-6  # of the solver, which has single precision
 
 
@@ -62,6 +63,7 @@ class WarpStepper(Stepper):
         self.warnings = np.zeros((num_simulations, 1), np.int64)
         self.lost = np.zeros(num_simulations, np.int64)
         self._names = tuple(dict.fromkeys((*_STATE, *task.data_fields)))
+        self._read = [name for name in self._names if name not in _GIVEN]
         self.arrays = types.SimpleNamespace(**self._empty(model, num_simulations))
         self._force = np.zeros((7, num_simulations))
         self._own: dict[str, np.ndarray] = {}
@@ -82,7 +84,7 @@ class WarpStepper(Stepper):
     def _empty(self, model: mujoco.MjModel, count: int) -> dict[str, np.ndarray]:
         """Arrays (N, ...) of the fields of `mujoco.MjData` that are read or written."""
         data = mujoco.MjData(model)
-        names = (*self._names, "ctrl", "userdata", "time")
+        names = dict.fromkeys((*self._names, *_GIVEN, "ctrl", "time"))
         shapes = {name: np.shape(getattr(data, name)) for name in names}
         return {name: np.zeros((count, *shape)) for name, shape in shapes.items()}
 
@@ -142,7 +144,7 @@ class WarpStepper(Stepper):
 
     def reset(self, indices: np.ndarray) -> None:
         """Begins anew in some simulations (K,), at the default pose."""
-        for name in (*_STATE, "ctrl", "userdata", "time"):
+        for name in (*_STATE, *_GIVEN, "ctrl", "time"):
             getattr(self.arrays, name)[indices] = 0.0
         self.arrays.qpos[indices] = self._model.qpos0
         self._stale = True
@@ -150,11 +152,11 @@ class WarpStepper(Stepper):
     def begin(self, control: np.ndarray) -> None:
         """Begins a control step with the control (N, U) of all its physics steps."""
         self.arrays.ctrl[:] = control
-        # The physics leaves the parameters of the effects as they are.
         self._begun = {
             n: rows.copied(getattr(self.arrays, n)) for n in (*_STATE, "time")
         }
-        self._begun["userdata"] = self.arrays.userdata
+        # The physics leaves what the effects write as it is.
+        self._begun |= {name: getattr(self.arrays, name) for name in _GIVEN}
         self._warnings_before = self.warnings.copy()
 
     def step_device(self) -> None:
@@ -181,7 +183,7 @@ class WarpStepper(Stepper):
         self._dirty.clear()
         worlds.write(self.arrays, self._stale)
         worlds.step()
-        totals = worlds.read(self.arrays, self._names)
+        totals = worlds.read(self.arrays, self._read)
         self._force[:] = totals.force
         self._force[4:6] /= self.substeps
         self.arrays.time += self.substeps * self._timestep
@@ -232,7 +234,7 @@ class WarpStepper(Stepper):
         for index, state in zip(indices.tolist(), states, strict=True):
             model, data = self._mine()
             mujoco.mj_setState(model, data, state, kind)
-            for name in (*_STATE, "ctrl", "userdata", "time"):
+            for name in (*_STATE, *_GIVEN, "ctrl", "time"):
                 getattr(self.arrays, name)[index] = getattr(data, name)
         self._stale = True
 
@@ -242,7 +244,7 @@ class WarpStepper(Stepper):
     # What MuJoCo does on the host.
 
     def _write(self, index: int, data: mujoco.MjData, arrays: Any) -> None:
-        for name in (*_STATE, "userdata", "time"):
+        for name in (*_STATE, *_GIVEN, "time"):
             value = arrays[name][index]
             if name == "time":
                 data.time = value.item()
@@ -328,9 +330,8 @@ class WarpStepper(Stepper):
 
 def refuse(task: Navigation) -> None:
     """NotImplementedError by name for what is not simulated on Warp."""
-    config, chain = task.config, task.scene.catheter
+    config = task.config
     missing = {
-        "coaxial devices": chain.coaxial,
         "a living vessel (vessel=)": config.vessel.living,
         f"a solver_tolerance below {_LEAST_TOLERANCE:g}": (
             config.solver_tolerance < _LEAST_TOLERANCE

@@ -21,8 +21,8 @@ CONTACTS, ROWS = 48, 128
 # The solver takes a full matrix of constraints one contact of all worlds after the
 # other, a sparse one the contacts of a world where it is not done.
 SPARSE = True
-_WRITTEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl")
-_ALWAYS = ("qpos", "act", "ctrl")
+_WRITTEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl", "qfrc_applied")
+_ALWAYS = ("qpos", "act", "ctrl", "qfrc_applied")
 # Fields of a model that Warp does not read here: boxes serve MuJoCo's own collision.
 _HOST_ONLY = ("geom_aabb", "geom_rbound", "mesh_")
 
