@@ -35,7 +35,7 @@ from cathsim_dmc.laws import (
     wall,
 )
 from cathsim_dmc.laws.blood import Blood, drag
-from cathsim_dmc.simulation.warp import contact_kernels, reduction
+from cathsim_dmc.simulation.warp import contact_kernels, moving_kernels, reduction
 from cathsim_dmc.simulation.warp.contact_kernels import SCRATCH
 from cathsim_dmc.simulation.warp.devices import NONE
 from cathsim_dmc.simulation.warp.simulation import WarpSimulation
@@ -305,16 +305,26 @@ def test_every_law_compiles_for_a_gpu(cuda):
 
 
 @pytest.mark.slow
-def test_threads_of_warp_compile_for_a_gpu(cuda):
+@pytest.mark.parametrize("vessel", ["rigid", "living"])
+def test_threads_of_warp_compile_for_a_gpu(cuda, vessel):
     """What runs on Warp's arrays, with the arrays of a task."""
     pytest.importorskip("mujoco_warp")
-    task = suite.make_task("type1_lcca")
+    task = suite.make_task("type1_lcca", vessel=vessel)
     stepper = WarpSimulation(task, 2, device="cpu").stepper
     laws_ = stepper.contacts, stepper._passive
     world = Worlds(stepper._device, stepper._model, stepper._own, laws_, 1)
     wall_, added = stepper.contacts, world._reduction._added
+    moving = wall_._motion
+    finding = [(contact_kernels.find, SCRATCH, wall_._scene)]
+    if moving is not None:
+        shapes = moving_kernels.SCRATCH
+        finding = [
+            (moving_kernels.find_moving, shapes, moving._scene),
+            (moving_kernels.carry, shapes, moving._carried),
+        ]
+    assert len(finding) == (2 if vessel == "living" else 1)
     threads = [
-        (contact_kernels.find, SCRATCH, wall_._scene),
+        *finding,
         (contact_kernels.count, NONE, wall_._written),
         (contact_kernels.place, NONE, wall_._written),
         *((each, NONE, added) for each in (reduction.clear, reduction.add)),

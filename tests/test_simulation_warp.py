@@ -83,10 +83,12 @@ def test_worlds_follow_the_batch():
         ("femoral_type1_lcca", {}),
         ("type1_lcca", {"device": "berenstein_5f", "rotation": True}),
         ("arch_lcca", {"pool": 2, "observation": ["route", "force"]}),
+        ("type1_lcca", {"vessel": "living", "observation": ["internal", "vessel"]}),
+        ("arch_any_pair", {"pool": 2, "vessel": "living"}),
     ],
 )
 def test_other_scenes_follow_the_batch(task, options):
-    """Accesses, shaped devices, and an anatomy of its own in each world."""
+    """Accesses, shaped devices, living vessels, and an anatomy of each world's own."""
     one, two = both(task, **options)
     one.reset(), two.reset()
     scenes = {id(two.rollout.case(index).scene) for index in range(4)}
@@ -96,7 +98,7 @@ def test_other_scenes_follow_the_batch(task, options):
         if step == 4:  # into the next anatomy
             one.reset(np.array([0, 1])), two.reset(np.array([0, 1]))
         action = random.uniform(-1, 1, (4, one.num_actions))
-        action[:, -1] = 1.0
+        action[:, [0, 2] if task.endswith("pair") else -1] = 1.0
         here, there = one.step(action), two.step(action)
         tips = here.readings.head - there.readings.head
         assert np.linalg.norm(tips, axis=1).max() < 0.1e-3
@@ -146,7 +148,6 @@ def test_coaxial_devices_follow_the_batch():
 @pytest.mark.parametrize(
     ("task", "options", "named"),
     [
-        ("type1_lcca", {"vessel": "living"}, "living vessel"),
         ("type1_lcca", {"solver_tolerance": 1e-8}, "solver_tolerance"),
     ],
 )

@@ -21,7 +21,7 @@ import threading
 import types
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -108,11 +108,11 @@ class _Table:
         # The key is written last: other threads search the table concurrently.
         self._kept[key], row[0] = kept, key
 
-    def at(self, key: int) -> tuple[int, list[np.ndarray]]:
-        """Kind and arrays of an entry; KeyError if there is none."""
+    def at(self, key: int) -> tuple[int, list[np.ndarray], np.ndarray | None]:
+        """Kind, arrays and lattice of an entry; KeyError if there is none."""
         kept = self._kept[key]
         row = self._rows[np.flatnonzero(self._rows[:, 0] == key)[0]]
-        return int(row[1]), kept
+        return int(row[1]), kept, self._lattices.get(key)
 
     def move(self, key: int, lattice: np.ndarray) -> None:
         """Adds a motion lattice to an entry, for simulations of a moving vessel."""
@@ -172,14 +172,27 @@ def register(
     return (MARK, *map(float, parts))
 
 
-def registered(
-    user: Sequence[float],
-) -> tuple[bool, np.ndarray, list[np.ndarray]] | None:
+class Registered(NamedTuple):
+    """A wall in the table.
+
+    Attributes:
+        is_bore: Whether it is a bore.
+        middle: (3,) m, centre of the carrier in the frame of the wall.
+        arrays: Of the field, or the line of the bore.
+        lattice: Of its motion; None for a wall at rest.
+    """
+
+    is_bore: bool
+    middle: np.ndarray
+    arrays: Sequence[np.ndarray]
+    lattice: np.ndarray | None
+
+
+def registered(user: Sequence[float]) -> Registered | None:
     """The registered wall that a carrier's `geom_user` names.
 
     Returns:
-        Whether it is a bore; centre (3,) of the carrier in the frame of the wall, m;
-        its arrays. None for a geom that is no carrier.
+        The wall; None for a geom that is no carrier.
 
     Raises:
         KeyError: if the wall is not registered in this process.
@@ -188,10 +201,9 @@ def registered(
 
     if len(user) < USER or user[0] != MARK:
         return None
-    kind, (middle, *arrays) = _get_table().at(
-        _key([int(part) for part in user[1:USER]])
-    )
-    return kind == BORE, middle, arrays
+    key = _key([int(part) for part in user[1:USER]])
+    kind, (middle, *arrays), lattice = _get_table().at(key)
+    return Registered(kind == BORE, middle, arrays, lattice)
 
 
 def carrier(field: Field | Bore, motion: np.ndarray | None = None) -> dict[str, Any]:

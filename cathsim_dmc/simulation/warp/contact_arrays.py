@@ -38,7 +38,8 @@ class Walls(NamedTuple):
     Attributes:
         head, coarse, bricks, samples: As `laws.field.FieldArrays`, of all lumens.
         line: As `laws.wall.Wall`, of all bores.
-        starts: (F, 5, 2) first and last place of wall f in each of these arrays.
+        lattice: Of the motions of all walls, see `laws.motion`.
+        starts: (F, 6, 2) first and last place of wall f in each of these arrays.
         is_bore: (F,) whether a wall is a bore.
         middle: (F, 3) m, place of the carrier's middle in the frame of the wall.
         of_world: (N, C) wall of a carrier in each world.
@@ -52,6 +53,7 @@ class Walls(NamedTuple):
     bricks: Any
     samples: Any
     line: Any
+    lattice: Any
     starts: Any
     is_bore: Any
     middle: Any
@@ -86,8 +88,8 @@ class Found(NamedTuple):
 
     Attributes:
         number: (T,) contacts of a thread.
-        rows: (T, MOST, 7) of each the distance m, the place (3) m, and the direction
-            (3) from the link into the wall.
+        rows: (T, MOST, 8) of each the distance m, the place (3) m, the direction (3)
+            from the link into the wall, and 1 where it shares its spring, else 0.
     """
 
     number: Any

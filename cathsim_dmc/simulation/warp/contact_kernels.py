@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.laws.capsule import SAMPLES
+from cathsim_dmc.laws.compliance import share
 from cathsim_dmc.laws.contact import (
+    COMPLIANT,
     CONTACT,
     contact_law,
     contacts,
@@ -21,6 +23,7 @@ from cathsim_dmc.laws.contact import (
     world_contact,
 )
 from cathsim_dmc.laws.contact import Scratch as Memory
+from cathsim_dmc.laws.device import Contact
 from cathsim_dmc.laws.field import FieldArrays
 from cathsim_dmc.laws.places import Capsule
 from cathsim_dmc.laws.planes import MOST, PLANES
@@ -37,6 +40,7 @@ from cathsim_dmc.simulation.warp.contact_arrays import (
 from cathsim_dmc.simulation.warp.devices import Scratch
 
 SCRATCH: Scratch = ((SAMPLES,), (PLANES, 4), (MOST, CONTACT))
+_ROUNDED = 1e-6  # of a number in single precision
 _LEAST_FRICTION = 1e-5  # MuJoCo's mjMINMU
 _CONSTRAINT = 1  # mujoco_warp's ContactType.CONSTRAINT
 
@@ -57,7 +61,7 @@ def _wall(walls, number):
 
 
 @compiled
-def _matrix(turns, world, geom):
+def matrix(turns, world, geom):
     """The nine numbers of a matrix, row by row, float64."""
     m = turns[world, geom]
     return (
@@ -68,7 +72,8 @@ def _matrix(turns, world, geom):
 
 
 @compiled
-def _vector(places, world, number):
+def vector(places, world, number):
+    """A place (3), float64."""
     place = places[world, number]
     return float(place[0]), float(place[1]), float(place[2])
 
@@ -132,10 +137,10 @@ def pair_of(thread, links, walls, fields, motion):
     which = thread // (count * worlds)
     geom, number = links.geoms[link], walls.of_world[world, which]
     wall, middle = _wall(walls, number), walls.middle[number]
-    frame = _matrix(walls.turns, world, which)
-    turned = _matrix(motion.geom_xmat, world, geom)
-    centre = _vector(motion.geom_xpos, world, geom)
-    origin = _vector(walls.places, world, which)
+    frame = matrix(walls.turns, world, which)
+    turned = matrix(motion.geom_xmat, world, geom)
+    centre = vector(motion.geom_xpos, world, geom)
+    origin = vector(walls.places, world, which)
     axis = (turned[2], turned[5], turned[8])
     apart = (centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2])
     seen = into(frame, apart)
@@ -144,10 +149,12 @@ def pair_of(thread, links, walls, fields, motion):
     radius, half_length = float(size[0]), float(size[1])
     caps = (True, True)
     if links.joints[link] >= 0:
-        joint = _vector(motion.xpos, world, links.joints[link])
+        joint = vector(motion.xpos, world, links.joints[link])
         caps = end_caps(centre, axis, half_length, joint)
     capsule = Capsule(local, into(frame, axis), half_length, caps)
     impedance = float(fields.solimp[world % len(fields.solimp), geom, 0])
+    if abs(impedance - COMPLIANT) < _ROUNDED:
+        impedance = COMPLIANT
     reference = float(fields.solref[world % len(fields.solref), geom, 0])
     law = contact_law(wall, radius, 0.0, impedance, reference)
     travel, turn = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -201,21 +208,32 @@ def find(thread, scratch, scene):
         scratch: Arrays of the shapes `SCRATCH`.
         scene: `Scene`.
     """
-    found = scene.found
-    found.number[thread] = 0
+    scene.found.number[thread] = 0
     pair = pair_of(thread, scene.links, scene.walls, scene.fields, scene.motion)
-    centre = pair.capsule.centre
-    if not math.isfinite(centre[0] + centre[1] + centre[2] + pair.axis[0]):
+    if not is_finite(pair):
         return
     samples, planes, out = scratch
     memory = Memory(samples, planes)
     count = contacts(pair.wall, pair.capsule, pair.law, pair.sweep, memory, out)
+    keep(scene.found, thread, pair, out, count)
+
+
+@compiled
+def is_finite(pair):
+    """Whether the place and the axis of a link are numbers."""
+    centre = pair.capsule.centre
+    return math.isfinite(centre[0] + centre[1] + centre[2] + pair.axis[0])
+
+
+@compiled
+def keep(found, thread, pair, given, count):
+    """Writes the contacts (count, CONTACT) of a thread in the frame of the world."""
     for n in range(count):
         distance, place, towards = world_contact(
-            out[n], pair.law, pair.centre, pair.axis, pair.frame
+            given[n], pair.law, pair.centre, pair.axis, pair.frame
         )
         row = found.rows[thread, n]
-        row[0] = distance
+        row[0], row[7] = distance, given[n, 5]
         for k in range(3):
             row[1 + k], row[4 + k] = place[k], towards[k]
     found.number[thread] = count
@@ -341,6 +359,8 @@ def _write(given, at, own, row):
         out.frame[at, 1, k] = side[k]
         out.frame[at, 2, k] = other[k]
     _write_law(given.links, given.fields, out, at, (world, link, which))
+    if row[7] != 0.0:
+        share(Contact(out.pos[at], out.frame[at], out.solimp[at], out.solref[at]))
     out.worldid[at], out.type[at] = world, _CONSTRAINT
     out.geomcollisionid[at], out.adhesion[at] = n, 0.0
     for k in range(out.efc_address.shape[1]):

@@ -8,8 +8,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from cathsim_dmc.collision.fields import registered
+from cathsim_dmc.collision.fields import Registered, registered
 from cathsim_dmc.laws.planes import MOST
+from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.simulation.warp.contact_arrays import (
     Contacts,
     Fields,
@@ -27,6 +28,7 @@ from cathsim_dmc.simulation.warp.contact_kernels import (
     place,
 )
 from cathsim_dmc.simulation.warp.devices import NONE, Device
+from cathsim_dmc.simulation.warp.moving import MovingWalls
 
 
 class WallContacts:
@@ -57,11 +59,12 @@ class WallContacts:
         self._host = _links(model, self.carriers)
         self._links = Links._make(map(device.constant, self._host))
         self._numbers: dict[tuple[float, ...], int] = {}
-        self._parts: list[tuple[bool, np.ndarray, list[np.ndarray]]] = []
+        self._parts: list[Registered] = []
         shape = num_worlds, len(self.carriers)
         self._of_world = np.zeros(shape, np.int32)
         self._places, self._turns = np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
         self._walls: Walls | None = None
+        self._motion: MovingWalls | None = None
         self.enter(np.arange(num_worlds), model, mujoco.MjData(model))
         self._scene: Scene | None = None
         self._written: Written | None = None
@@ -88,7 +91,18 @@ class WallContacts:
             self._of_world[worlds, which] = self._numbers[key]
             self._places[worlds, which] = data.geom_xpos[carrier]
             self._turns[worlds, which] = data.geom_xmat[carrier].reshape(3, 3)
+        if self._motion is not None:
+            self._motion.enter(worlds, model, data)
         self._entered = True
+
+    def move(self, effect: Effect, bore: int) -> None:
+        """Has the walls move, before they are bound.
+
+        Args:
+            effect: `physics.motion.Moving`, bound to its worlds.
+            bore: Geom around the sheath; -1 for none.
+        """
+        self._motion = MovingWalls(self._device, effect, bore)
 
     @property
     def is_bound(self) -> bool:
@@ -124,6 +138,8 @@ class WallContacts:
             self._links, fields, found, contacts, self.counts, self.starts,
             self._overflow,
         )  # fmt: skip
+        if self._motion is not None:
+            self._motion.bind(model, data, self._scene, self._written)
 
     def begin(self) -> None:
         """Begins a control step."""
@@ -131,6 +147,8 @@ class WallContacts:
             self._device.write(self._walls.of_world, self._of_world)
             self._device.write(self._walls.places, self._places)
             self._device.write(self._walls.turns, self._turns)
+            if self._motion is not None:
+                self._motion.place()
             self._entered = False
         self._device.write(self._overflow, np.zeros(self.num_worlds, np.int32))
 
@@ -142,23 +160,38 @@ class WallContacts:
         """What mujoco_warp calls at the end of its own collision."""
         del model, data
         device, threads = self._device, self.num_worlds * self._host.dims.size
-        device.launch(find, threads, SCRATCH, self._scene)
+        if self._motion is None:
+            device.launch(find, threads, SCRATCH, self._scene)
+        else:
+            self._motion.find(threads)
         device.launch(count, self.num_worlds, NONE, self._written)
         device.sum_before(self._sums[0], self._sums[1])
         device.launch(place, threads, NONE, self._written)
 
+    def write(self) -> None:
+        """Writes the parameters of the motion as they are on the host."""
+        if self._motion is not None:
+            self._motion.write()
+
+    def carry(self) -> None:
+        """Adds the velocities of walls, once the rows of constraints are there."""
+        if self._motion is not None:
+            self._motion.carry(self.num_worlds)
+
     def _made(self) -> Walls:
         """The walls of all anatomies on the device."""
         empty = [np.zeros(1), *(np.zeros(1, t) for t in (np.int16, np.int32, np.int16))]
-        columns: list[list[np.ndarray]] = [[] for _ in range(5)]
-        starts = np.zeros((len(self._parts), 5, 2), np.int64)
-        for number, (is_bore, _, arrays) in enumerate(self._parts):
-            five = [*empty, arrays[0]] if is_bore else [*arrays, np.zeros(1)]
-            for which, array in enumerate(five):
+        columns: list[list[np.ndarray]] = [[] for _ in range(6)]
+        starts = np.zeros((len(self._parts), 6, 2), np.int64)
+        for number, wall in enumerate(self._parts):
+            moves = self._motion is not None and wall.lattice is not None
+            lattice = wall.lattice if moves else np.zeros(0)
+            one = [*empty, wall.arrays[0]] if wall.is_bore else [*wall.arrays, empty[0]]
+            for which, array in enumerate([*one, lattice]):
                 before = sum(map(len, columns[which]))
                 starts[number, which] = before, before + len(array)
                 columns[which].append(np.asarray(array).ravel())
-        types = (np.float64, np.int16, np.int32, np.int16, np.float64)
+        types = (np.float64, np.int16, np.int32, np.int16, np.float64, np.float64)
         joined = (
             np.concatenate(column).astype(kind)
             for column, kind in zip(columns, types, strict=True)
@@ -166,8 +199,8 @@ class WallContacts:
         constant = self._device.constant
         rest = (
             constant(starts),
-            constant(np.array([part[0] for part in self._parts])),
-            constant(np.array([part[1] for part in self._parts], np.float64)),
+            constant(np.array([part.is_bore for part in self._parts])),
+            constant(np.array([part.middle for part in self._parts], np.float64)),
             *map(constant, (self._of_world, self._places, self._turns)),
         )
         return Walls._make([*map(constant, joined), *rest])

@@ -19,7 +19,10 @@ from cathsim_dmc.laws.hinges import Bends
 from cathsim_dmc.laws.springs import Scratch, Springs, shape_torques
 from cathsim_dmc.physics.dispatcher import Places
 from cathsim_dmc.physics.effects import Effect
+from cathsim_dmc.physics.flow import Flow
 from cathsim_dmc.simulation.warp.devices import NONE, Device
+
+_OF_CONTACTS = ("compliance", "motion")  # adapters; see `contacts.WallContacts`
 
 
 class Arrays(NamedTuple):
@@ -31,6 +34,7 @@ class Arrays(NamedTuple):
         body_dofnum: (L,) of the links.
         geoms: (L,) of the links.
         hinges: (3, 2 J) joints of the hinges, places in `qpos`, degrees of freedom.
+        time: (N,) s.
     """
 
     first_link: Any
@@ -48,6 +52,7 @@ class Arrays(NamedTuple):
     body_dofnum: Any
     geoms: Any
     hinges: Any
+    time: Any
 
 
 @compiled
@@ -91,7 +96,7 @@ class Given(NamedTuple):
 
 @compiled
 def add_drag(world, scratch, all_given):
-    """Adds the drag of still blood, see `laws.blood`.
+    """Adds the drag of blood, see `laws.blood`.
 
     Args:
         world: Its number.
@@ -110,7 +115,8 @@ def add_drag(world, scratch, all_given):
         given.friction[world],
         given.space_velocity[world],
     )
-    drag(blood, 0.0, device_of(world, all_given.arrays))
+    time = float(all_given.arrays.time[world])
+    drag(blood, time, device_of(world, all_given.arrays))
 
 
 @compiled
@@ -148,9 +154,11 @@ class PassiveForces:
         """
         self._device, self._places, self._count = device, places, count
         self._laws: list[tuple[Any, Any, Any]] = []
+        self._still = True
         for effect in effects:
             if effect.adapter not in ("blood", "springs"):
-                if effect.law is None and effect.adapter is None:
+                has_law = effect.law is not None or effect.adapter is not None
+                if not has_law or effect.adapter in _OF_CONTACTS:
                     continue
                 raise NotImplementedError(
                     f"the law of {type(effect).__qualname__} is not simulated on "
@@ -160,6 +168,7 @@ class PassiveForces:
             there = type(given)._make(device.constant(np.array(each)) for each in given)
             law = add_drag if effect.adapter == "blood" else add_springs
             self._laws.append((law, given, there))
+            self._still &= type(effect) is not Flow
 
     def bind(self, model: Any, data: Any, host: mujoco.MjModel) -> None:
         """Takes the arrays of Warp's model and data, which must not be replaced."""
@@ -189,6 +198,7 @@ class PassiveForces:
                 constant(host.body_dofnum[links]),
                 constant(places.geoms.astype(np.int64)),
                 constant(places.hinges.astype(np.int64)),
+                view(data.time),
             ]
         )
         self._calls = [
@@ -202,7 +212,7 @@ class PassiveForces:
             whole: Whether those have changed that stay the same in an episode, too.
         """
         for law, given, there in self._laws:
-            if not whole and law is add_drag:
+            if not whole and law is add_drag and self._still:
                 continue
             for values, array in zip(given, there, strict=True):
                 self._device.write(array, values)

@@ -22,6 +22,7 @@ import numpy as np
 from cathsim_dmc import rows
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.dispatcher import Places
+from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.simulation.warp.contacts import WallContacts
 from cathsim_dmc.simulation.warp.devices import Device
@@ -66,6 +67,8 @@ class WarpStepper(Stepper):
         self._read = [name for name in self._names if name not in _GIVEN]
         self.arrays = types.SimpleNamespace(**self._empty(model, num_simulations))
         self._force = np.zeros((7, num_simulations))
+        # Where the last physics step was done.
+        self._on_device = np.zeros(num_simulations, bool)
         self._own: dict[str, np.ndarray] = {}
         fields = [name for effect in task.effects for name in effect.model_fields]
         self._expand(dict.fromkeys(fields))
@@ -97,6 +100,9 @@ class WarpStepper(Stepper):
         places = Places.of(self._model, rollout.index)
         count = self.num_simulations
         self._passive = PassiveForces(self._device, places, rollout.effects, count)
+        for effect in rollout.effects:
+            if isinstance(effect, Moving):
+                self.contacts.move(effect, places.bore)
 
     # Fields of the model that differ between worlds.
 
@@ -188,6 +194,7 @@ class WarpStepper(Stepper):
         self._force[4:6] /= self.substeps
         self.arrays.time += self.substeps * self._timestep
         self._stale = False
+        self._on_device[:] = True
         self._note(totals.diverged != 0, worlds.overflowed())
 
     def _note(self, diverged: np.ndarray, lost: np.ndarray) -> None:
@@ -212,7 +219,7 @@ class WarpStepper(Stepper):
     def last_contacts(self) -> np.ndarray:
         """Rows (N, M * 14) of the wall's sensor in the last physics step."""
         if self._worlds is not None:
-            self._worlds.read_sensors(self.arrays.sensordata)
+            self._worlds.read_sensors(self.arrays.sensordata, self._on_device)
         return self.arrays.sensordata[:, self._contacts]
 
     def states(self, indices: np.ndarray | None = None) -> np.ndarray:
@@ -261,6 +268,7 @@ class WarpStepper(Stepper):
         mujoco.mj_resetData(model, data)
         self._write(index, data, vars(self.arrays) if arrays is None else arrays)
         result = act(model, data)
+        self._on_device[index] = False
         for name in (*self._names, "time"):
             getattr(self.arrays, name)[index] = getattr(data, name)
         return result
@@ -330,15 +338,8 @@ class WarpStepper(Stepper):
 
 def refuse(task: Navigation) -> None:
     """NotImplementedError by name for what is not simulated on Warp."""
-    config = task.config
-    missing = {
-        "a living vessel (vessel=)": config.vessel.living,
-        f"a solver_tolerance below {_LEAST_TOLERANCE:g}": (
-            config.solver_tolerance < _LEAST_TOLERANCE
-        ),
-    }
-    named = [name for name, there in missing.items() if there]
-    if named:
+    if task.config.solver_tolerance < _LEAST_TOLERANCE:
         raise NotImplementedError(
-            f"{', '.join(named)}: not simulated on Warp; take simulation_device='cpu'"
+            f"a solver_tolerance below {_LEAST_TOLERANCE:g}: not simulated on Warp; "
+            "take simulation_device='cpu'"
         )

@@ -21,8 +21,8 @@ CONTACTS, ROWS = 48, 128
 # The solver takes a full matrix of constraints one contact of all worlds after the
 # other, a sparse one the contacts of a world where it is not done.
 SPARSE = True
-_WRITTEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl", "qfrc_applied")
-_ALWAYS = ("qpos", "act", "ctrl", "qfrc_applied")
+_WRITTEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl", "qfrc_applied", "time")
+_ALWAYS = ("qpos", "act", "ctrl", "qfrc_applied", "time")
 # Fields of a model that Warp does not read here: boxes serve MuJoCo's own collision.
 _HOST_ONLY = ("geom_aabb", "geom_rbound", "mesh_")
 
@@ -81,12 +81,17 @@ class Worlds:
             self._contacts = contacts
             self.model.callback.contactfilter = contacts
             self._passive.bind(self.model, self.data, model)
-            self.model.callback.passive = self._passive
+            self.model.callback.passive = self._act
             self._beside = np.r_[:start, start + size : model.nsensordata]
             self._reduction = Reduction(device, self.data, contacts, self._beside)
         self._staged: dict[str, Any] = {}
         self._graph: Any = None
         self.seconds: dict[str, float] = {}
+
+    def _act(self, model: Any, data: Any) -> None:
+        """What mujoco_warp calls at the end of its own passive forces."""
+        self._passive(model, data)
+        self._contacts.carry()
 
     def _expand(self, name: str, values: np.ndarray) -> bool:
         """Gives each world values (N, ...) of its own; False where none are needed."""
@@ -141,6 +146,8 @@ class Worlds:
         """
         began = time.perf_counter()
         self._passive.write(whole)
+        if whole:
+            self._contacts.write()
         for name in _WRITTEN if whole else _ALWAYS:
             self._put(name, getattr(self.data, name), getattr(arrays, name))
         self.seconds["write"] = time.perf_counter() - began
@@ -230,9 +237,14 @@ class Worlds:
         """Waits until the device has done what it was told."""
         self._warp.synchronize_device(self._device.name)
 
-    def read_sensors(self, out: np.ndarray) -> None:
-        """Reads all sensors (N, nsensordata) of the last physics step."""
-        out[...] = self.data.sensordata.numpy()
+    def read_sensors(self, out: np.ndarray, chosen: np.ndarray) -> None:
+        """Reads all sensors (N, nsensordata) of the last physics step of some worlds.
+
+        Args:
+            out: Gets them.
+            chosen: (N,) bool.
+        """
+        np.copyto(out, self.data.sensordata.numpy(), where=chosen[:, None])
 
     def overflowed(self) -> np.ndarray:
         """(N,) whether a world had too many contacts or rows in the control step."""
