@@ -7,6 +7,7 @@ field, what was given and what is allowed.
 import dataclasses
 import math
 import numbers
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
@@ -154,6 +155,19 @@ def option_threads(value: int | None) -> None:
     """Checks the number of threads of an option --threads, None for one per core."""
     if value is not None:
         whole("num_threads (--threads)", value, 1, MOST_THREADS)
+
+
+SIMULATION_DEVICE = re.compile(r"cpu|cuda(:\d+)?")
+SIMULATION_DEVICES = "'cpu', 'cuda' or 'cuda:1'"
+
+
+def option_simulation_device(value: Any) -> dict[str, str]:
+    """Arguments for `make_env` of an option --simulation-device; tensors stay here."""
+    found = isinstance(value, str) and SIMULATION_DEVICE.fullmatch(value)
+    if not found:
+        name = "simulation_device (--simulation-device)"
+        refuse(name, value, f"one of {SIMULATION_DEVICES}")
+    return {} if value == "cpu" else {"device": f"warp:{value}"}
 
 
 def random_state(name: str, value: Any) -> np.random.RandomState:

@@ -7,6 +7,13 @@ import mujoco
 import numpy as np
 import pytest
 
+# isort: off
+# torchrl goes before dm_control.
+from cathsim_dmc import agents
+from cathsim_dmc.agents.contact_log import ContactLog
+from cathsim_dmc.simulation import environments
+
+# isort: on
 from cathsim_dmc import suite
 from cathsim_dmc.physics import held
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -186,3 +193,40 @@ def test_parameters_of_contacts_are_mixed_as_in_mujoco():
     assert dims == {0: links.dims[0, 0], 1: links.dims[0, 1]}
     assert links.mix[0, 0] == 0.25
     assert links.priorities.tolist() == [[0, 1]]
+
+
+@pytest.mark.slow
+@needs_warp
+def test_a_policy_is_evaluated_on_the_device():
+    """As `--simulation-device cuda` does, here on the CPU."""
+    asked = []
+
+    def make_env(*args, device="cpu", **kwargs):
+        asked.append(device)
+        device = device.replace("cuda:1", "cpu")
+        return environments.make_env(*args, device=device, **kwargs)
+
+    how = {"episodes": 2, "task_kwargs": {"max_steps": 12}, "make_env": make_env}
+    log = ContactLog()
+    here = agents.evaluate("push", "type1_lcca", **how)
+    there = agents.evaluate(
+        "push", "type1_lcca", simulation_device="cuda:1", observer=log, **how
+    )
+    assert asked == ["cpu", "warp:cuda:1"]
+    for one, other in zip(here.episodes, there.episodes, strict=True):
+        assert (one.length, one.success) == (other.length, other.success)
+        assert other.reward == pytest.approx(one.reward, rel=1e-3)
+    forces = [each.values("forces.sum.mean") for each in (here, there)]
+    np.testing.assert_allclose(forces[1], forces[0], rtol=0.05)
+    assert forces[0].min() > 0.0
+
+
+@pytest.mark.parametrize("device", ["gpu", "warp:cuda", "cuda:-1", None])
+def test_another_place_of_an_evaluation_is_refused(device):
+    with pytest.raises(ValueError, match=r"--simulation-device.*'cuda:1'"):
+        agents.evaluate("push", "type1_lcca", simulation_device=device)
+
+
+def test_a_cluster_simulates_on_its_cpus():
+    with pytest.raises(ValueError, match="--simulation-device"):
+        agents.evaluate("push", "type1_lcca", simulation_device="cuda", on_cluster=True)

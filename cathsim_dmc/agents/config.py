@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-import re
 import types
 import typing
 from collections.abc import Mapping
@@ -233,8 +232,8 @@ class TrainingConfig:
         layers, start = self.convolutions, self.training_start
         fit = all(len(layer) == 3 for layer in layers)
         require(fit, "convolutions", layers, "(filters, kernel size, stride) of each")
-        place = re.fullmatch(r"cpu|cuda(:\d+)?", self.simulation_device)
-        named = "'cpu', 'cuda' or 'cuda:1'"
+        place = bounds.SIMULATION_DEVICE.fullmatch(self.simulation_device)
+        named = bounds.SIMULATION_DEVICES
         require(bool(place), "simulation_device", self.simulation_device, named)
         ordered = start is None or (len(start) == 2 and start[0] <= start[1])
         require(ordered, "training_start", start, "two shares (low, high), low <= high")

@@ -49,6 +49,7 @@ def evaluate(
     observation: str | Sequence[str] | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
     num_threads: int | None = None,
+    simulation_device: str = "cpu",
     out_dir: str | Path | None = None,
     observer: Observer | None = None,
     start: Snapshot | None = None,
@@ -72,6 +73,9 @@ def evaluate(
         task_kwargs: Further options of the task; None takes those that the policy was
             trained with. A device among them is played in all episodes.
         num_threads: Number of threads of the simulation; None takes one per core.
+        simulation_device: Where the simulations run: "cpu", or "cuda" for MuJoCo Warp
+            on a GPU, "cuda:1" on the second one (docs/gpu.md); the policy acts on the
+            CPU.
         out_dir: Directory for evaluation.json and, in errors/, the last physics errors;
             None writes none.
         observer: Function that is called after every step, before any reset.
@@ -87,16 +91,26 @@ def evaluate(
 
     Raises:
         ValueError: no task is known, episodes < 1, the protocol sets a given option, or
-            `start` does not fit, or the cluster has too few processors.
+            `start` does not fit, or the cluster has too few processors, or there is no
+            such device.
+        ImportError: the device needs an extra that is not installed.
+        NotImplementedError: the task has what is not simulated on the device.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     bounds.options("task_kwargs", task_kwargs)
     plan = _Plan.of(
         policy, task, episodes, seed, protocol, observation, task_kwargs, start
     )
+    place = bounds.option_simulation_device(simulation_device)
     if on_cluster:
+        if place:
+            raise ValueError(
+                "the processes of a cluster simulate on their CPUs; leave out "
+                "simulation_device (--simulation-device), or on_cluster (--ray)"
+            )
         cluster.connect()
-    groups = plan.groups(num_threads, out_dir, make_env, start)
+    make = functools.partial(make_env, **place)
+    groups = plan.groups(num_threads, out_dir, make, start)
     if on_cluster:
         outcomes = _play_on_cluster(groups, observer)
     else:

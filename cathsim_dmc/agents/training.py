@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
 
-from cathsim_dmc import files
+from cathsim_dmc import bounds, files
 from cathsim_dmc.agents.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -144,14 +144,9 @@ def _environment(config: TrainingConfig, make_env: EnvFactory, frames: int) -> E
     return make_env(
         config.task, observation=config.collected_observation,
         num_envs=config.num_envs, num_threads=config.num_threads, seed=seed,
-        task_kwargs=config.training_kwargs, **_place(config),
+        task_kwargs=config.training_kwargs,
+        **bounds.option_simulation_device(config.simulation_device),
     )  # fmt: skip
-
-
-def _place(config: TrainingConfig) -> dict[str, str]:
-    """Where the environment simulates; its tensors are on the CPU."""
-    name = config.simulation_device
-    return {} if name == "cpu" else {"device": f"warp:{name}"}
 
 
 @contextlib.contextmanager

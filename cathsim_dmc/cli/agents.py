@@ -64,6 +64,7 @@ def evaluate(
     baseline: bool = True,
     start: Path | None = None,
     threads: Threads = None,
+    simulation_device: str = "cpu",
     ray: Ray = False,
     report: bool = False,
     json: Json = False,
@@ -85,6 +86,8 @@ def evaluate(
         baseline: Whether to compare with the random policy on the same seeds.
         start: File of a snapshot (`snapshot().save`): one episode for each of its
             simulations, from there on.
+        simulation_device: Where the simulations run: "cpu", or "cuda" for MuJoCo Warp
+            on a GPU, "cuda:1" on the second one (extra gpu, docs/gpu.md).
         report: Whether to print each episode too: seed, anatomy, device, end, time,
             path and forces (docs/start.md).
         options: Options of the task, over those that the policy was trained with.
@@ -98,6 +101,7 @@ def evaluate(
     asked: Any = {
         "task": task, "episodes": episodes, "seed": seed, "protocol": protocol,
         "task_kwargs": task_kwargs, "num_threads": threads, "on_cluster": ray,
+        "simulation_device": simulation_device,
         "start": None if start is None else Snapshot.load(start),
     }  # fmt: skip
 
