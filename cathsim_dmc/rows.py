@@ -6,7 +6,7 @@ copies of numpy's do.
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -32,6 +32,26 @@ def each(count: int, act: Callable[[slice], Any], least: int = _LEAST) -> None:
     ends = [count * part // parts for part in range(parts + 1)]
     # The results raise what the calls have raised.
     list(_pool(os.getpid(), cores).map(act, map(slice, ends[:-1], ends[1:])))
+
+
+def alike(items: Iterable[Any]) -> list[tuple[Any, np.ndarray]]:
+    """Different objects, each with the rows (n,) int64 at which it is."""
+    found: dict[int, tuple[Any, list[int]]] = {}
+    for row, item in enumerate(items):
+        found.setdefault(id(item), (item, []))[1].append(row)
+    return [(item, np.array(own)) for item, own in found.values()]
+
+
+def of_each(
+    groups: Iterable[tuple[Any, np.ndarray]], act: Callable[[Any, np.ndarray], Any]
+) -> None:
+    """Calls a function with each object of `alike` and its rows, shared out."""
+    for item, own in groups:
+        each(len(own), _on(act, item, own))
+
+
+def _on(act: Callable, item: Any, own: np.ndarray) -> Callable[[slice], Any]:
+    return lambda part: act(item, own[part])
 
 
 def copy(target: np.ndarray, source: np.ndarray) -> np.ndarray:

@@ -178,7 +178,7 @@ def signatures():
     given = named(contact.Law, *[REAL] * 3, *[types.boolean] * 2, REAL)
     sweep = named(contact.Sweep, point, point, REAL)
     course = named(motion.Course, *[REAL] * 9)
-    parameters = named(motion.MotionParameters, *[REAL] * 8)
+    several = named(motion.MotionParameters, *[one] * 8)
     scratch = named(contact.Scratch, one, two)
     moving = named(moving_contact.MovingScratch, one, two, two, one)
     carried = types.Tuple((one, course))
@@ -211,7 +211,7 @@ def signatures():
         moving_contact.moving_contacts: (
             *(a_wall, capsule, given, sweep, carried, moving, two),
         ),
-        motion.course_at: (parameters, REAL),
+        motion.nth_course: (several, BITS, REAL),
         motion.wall_velocity: (one, point),
         motion.to_rest: (one, course, two, two, two),
         motion.to_space: (one, course, two, two, two, one),

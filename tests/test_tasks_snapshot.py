@@ -197,8 +197,9 @@ DERIVED = {
     "Rollout": {"objectives", "resting_goal", "resting", "_open"},
     "ImageSensors": {"planes", "thirds"},
     "BiplaneSight": {"_machines"},
-    "Moving": {"_motions", "_surfaces", "_inlets"},
-    "Flow": {"_circulations"},
+    "Moving": {"_motions", "_surfaces", "_alike", "inlets"},
+    "Flow": {"_circulations", "_murray", "_alike"},
+    "Wall": {"_fields", "_places"},
     # Scratch, and views of the model.
     "SingleDevice": {"_steering", "_held", "_sheathed", "_hinged"},
     "SlidingDevices": {"_fields", "_live", "_held", "_sheathed", "_hinged"},

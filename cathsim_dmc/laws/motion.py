@@ -111,6 +111,22 @@ def course_at(parameters, time):
     )
 
 
+@law
+def nth_course(parameters, n, time):
+    """`course_at` of row n of `MotionParameters` of arrays (N,)."""
+    own = MotionParameters(
+        parameters.heart[n],
+        parameters.breathing[n],
+        parameters.distensibility[n],
+        parameters.rate[n],
+        parameters.phase[n],
+        parameters.wave_speed[n],
+        parameters.breath_rate[n],
+        parameters.breath_phase[n],
+    )
+    return course_at(own, time)
+
+
 @inlined
 def _cell(place, count):
     """Cell of a lattice, share of it, and 0 outside, where nothing changes, else 1."""

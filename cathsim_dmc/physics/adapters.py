@@ -36,7 +36,7 @@ from cathsim_dmc.compiled import compiled
 from cathsim_dmc.entities.robot import pose
 from cathsim_dmc.laws import sliding
 from cathsim_dmc.laws.blood import Blood, drag
-from cathsim_dmc.laws.compliance import share
+from cathsim_dmc.laws.compliance import Material, share, write_contacts
 from cathsim_dmc.laws.contact import COMPLIANT
 from cathsim_dmc.laws.device import Contact, Device, Links
 from cathsim_dmc.laws.drive import follow
@@ -236,6 +236,27 @@ def act(drives, sheathed, steering, robot, load, control):
 def _rows(address, count, width):
     """An array (count, width) of float64 at an address."""
     return numbers(address)[: count * width].reshape((count, width))
+
+
+@compiled
+def press(places, radius, material, links, laws):
+    """Writes the contacts of N simulations, see `laws.compliance.write_contacts`.
+
+    Args:
+        places: (N, 2) int64, addresses of `solref` and `solimp` of the geoms; 0 where
+            there is no episode yet.
+        radius: (N, L).
+        material: (N, 3), the numbers of `laws.compliance.Material`.
+        links: `laws.compliance.Links`.
+        laws: Of the rigid wall, and of the compliant one.
+    """
+    count = links.geoms.max() + 1
+    for i in range(len(places)):
+        if places[i, 0] != 0:
+            own = Material(material[i, 0], material[i, 1], material[i, 2])
+            solref = _rows(places[i, 0], count, 2)
+            solimp = _rows(places[i, 1], count, 5)
+            write_contacts(radius[i], own, links, laws, solref, solimp)
 
 
 @compiled

@@ -11,13 +11,12 @@ import math
 import numpy as np
 from numpy.random import RandomState
 
-from cathsim_dmc import bounds
+from cathsim_dmc import bounds, rows
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.circulation import Circulation
-from cathsim_dmc.anatomy.motion import course_of
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.laws.blood import beat
-from cathsim_dmc.laws.motion import VALUES, WARP, carried, warp
+from cathsim_dmc.laws.motion import VALUES, WARP, carried, first_past, nth_course, warp
 from cathsim_dmc.physics.blood import StillBlood
 from cathsim_dmc.physics.effects import Draw, World
 from cathsim_dmc.physics.motion import Moving
@@ -86,14 +85,19 @@ class Flow(StillBlood):
         radii = world.model.geom_size[world.index.geoms, 0]
         self._link_radii = np.tile(radii, (world.num_simulations, 1))
         self._circulations: dict[int, Circulation] = {}
+        self._murray: dict[int, tuple[Anatomy, Circulation]] = {}
+        self._alike: list[tuple[Circulation, np.ndarray]] | None = None
         self._wave_speed = np.ones(world.num_simulations)
         self.radius = np.zeros(self._link_radii.shape)
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Fills the vessels of an anatomy."""
-        self._circulations[index] = anatomy.circulation
+        self._circulations[index], self._alike = anatomy.circulation, None
         if self._options is not None and self._options.split == "murray":
-            self._circulations[index] = Circulation.of(anatomy.tree, True)
+            if id(anatomy) not in self._murray:
+                made = Circulation.of(anatomy.tree, True)
+                self._murray[id(anatomy)] = anatomy, made
+            self._circulations[index] = self._murray[id(anatomy)][1]
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Draws rate, peak and phase of the heart, and pulse wave velocity."""
@@ -129,16 +133,22 @@ class Flow(StillBlood):
 
     def _at(self, points: np.ndarray) -> np.ndarray:
         """What `velocities` finds at points (N, P, 3) in space: (N, P, 8)."""
-        out = np.zeros((*points.shape[:2], 8))
-        for index, row in enumerate(np.ascontiguousarray(points)):
-            vessels = self._circulations[index].segments
-            if self._moving is None:
-                velocities(row, np.zeros(len(row)), vessels, out[index])
-            else:
-                first = self._moving.entered(index, row)
-                lattice, parameters, time = self._moving.warp(index)
-                course, there = course_of(parameters, time), out[index, first:]
-                moving_velocities(lattice, course, row[first:], vessels, there)
+        places, out = np.ascontiguousarray(points), np.zeros((*points.shape[:2], 8))
+        if self._alike is None:
+            count = range(len(points))
+            self._alike = rows.alike(self._circulations[index] for index in count)
+        moving = self._moving
+        times = None if moving is None else moving.times
+
+        def find(blood: Circulation, own: np.ndarray) -> None:
+            if moving is None:
+                velocities_of(own, places, blood.segments, out)
+                return
+            given = moving.world.parameters, times, moving.inlets
+            lattice = moving.lattice(own[0])
+            moving_velocities_of(lattice, own, given, places, blood.segments, out)
+
+        rows.of_each(self._alike, find)
         return out
 
     def read(self, time: np.ndarray, state: Readings) -> dict[str, np.ndarray]:
@@ -154,8 +164,9 @@ class Flow(StillBlood):
         blood = self.world.parameters
         phases = blood.rate * time + blood.phase
         delayed = phases - blood.rate * (found[:, 3] / self._wave_speed)
-        beats = [beat(phase) for phase in delayed.tolist()]
-        velocity = (blood.peak * np.array(beats))[:, None] * found[:, :3] + found[:, 5:]
+        beats = np.empty(len(delayed))
+        _beat(delayed, beats)
+        velocity = (blood.peak * beats)[:, None] * found[:, :3] + found[:, 5:]
         return {"heart_phase": phases % 1.0, "blood_velocity": velocity}
 
 
@@ -163,6 +174,41 @@ class Flow(StillBlood):
 def profile(share):
     """Velocity over its mean at a share of the lumen's radius; 0 outside."""
     return (1.0 - share**EXPONENT) * (EXPONENT + 2) / EXPONENT if share < 1.0 else 0.0
+
+
+@compiled
+def _beat(phases, out):
+    """Writes `laws.blood.beat` at phases (N,)."""
+    for n in range(len(phases)):
+        out[n] = beat(phases[n])
+
+
+@compiled
+def velocities_of(own, points, segments, out):
+    """`velocities` (N, P, 8) at points (N, P, 3) of the simulations (n,) at rest."""
+    growth = np.zeros(points.shape[1])
+    for n in own:
+        velocities(points[n], growth, segments, out[n])
+
+
+@compiled
+def moving_velocities_of(lattice, own, given, points, segments, out):
+    """As `velocities_of`, past the inlet of vessels that move.
+
+    Args:
+        lattice: Of `anatomy.motion.Motion`.
+        own: (n,) int64.
+        given: `laws.motion.MotionParameters` of arrays (N,), times (N,) in s, and
+            inlets (N, 2, 3).
+        points: (N, P, 3) m, in space.
+        segments: As of `velocities`.
+        out: (N, P, 8).
+    """
+    parameters, times, inlets = given
+    for n in own:
+        first = first_past(inlets[n], points[n])
+        course = nth_course(parameters, n, times[n])
+        moving_velocities(lattice, course, points[n, first:], segments, out[n, first:])
 
 
 @compiled

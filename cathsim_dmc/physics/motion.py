@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc import rows
 from cathsim_dmc.anatomy import Anatomy, Surface
 from cathsim_dmc.anatomy.motion import PARAMETERS, Motion
-from cathsim_dmc.laws.motion import MotionParameters, first_past
+from cathsim_dmc.laws.motion import MotionParameters
 from cathsim_dmc.physics.effects import Draw, Effect, World
 from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
 from cathsim_dmc.physics.readings import Readings
@@ -92,14 +93,16 @@ class Moving(Effect):
         super().bind(world)
         self._motions: dict[int, Motion] = {}
         self._surfaces: dict[int, Surface] = {}
-        self._inlets = np.zeros((world.num_simulations, 2, 3))
+        self._alike: list[tuple[Motion, np.ndarray]] | None = None
+        self.inlets = np.zeros((world.num_simulations, 2, 3))
         self._clock = np.zeros(world.num_simulations)
         self._step = world.model.opt.timestep
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Takes the motion of an anatomy."""
         self._motions[index], self._surfaces[index] = anatomy.motion, anatomy.surface
-        self._inlets[index] = anatomy.inlet.position, anatomy.inlet.direction
+        self.inlets[index] = anatomy.inlet.position, anatomy.inlet.direction
+        self._alike = None
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Draws amplitudes, rates and phases."""
@@ -136,33 +139,52 @@ class Moving(Effect):
         breath = given.breath_rate * time + given.breath_phase
         return (given.rate * time + given.phase) % 1.0, breath % 1.0
 
-    def entered(self, index: int, nodes: np.ndarray) -> int:
-        """Number of the first node (P, 3) of a device, m, that is past the inlet."""
-        return first_past(self._inlets[index], nodes)
+    @property
+    def alike(self) -> list[tuple[Motion, np.ndarray]]:
+        """Motions, each with the simulations (n,) of its anatomy."""
+        if self._alike is None:
+            count = range(self.world.num_simulations)
+            self._alike = rows.alike(self._motions[index] for index in count)
+        return self._alike
+
+    def lattice(self, index: int) -> np.ndarray:
+        """Lattice of one simulation's motion."""
+        return self._motions[index].lattice
+
+    @property
+    def times(self) -> np.ndarray:
+        """Times (N,) s, of what MuJoCo has derived, one physics step before the end."""
+        return np.maximum(self._clock - self._step, 0.0)
 
     def at_rest(self, state: Readings) -> Readings:
         """Readings with the places at rest of those in space; the sheath rests."""
-        places = state.centreline.copy()
-        for index, row in enumerate(places):
-            moved = row[self.entered(index, row) :]
-            _, parameters, time = self.warp(index)
-            moved[:] = self._motions[index].to_rest(parameters, time, moved)
+        from cathsim_dmc.physics import motion_loops  # late, as numba takes long
+
+        places, times = state.centreline.copy(), self.times
+
+        def move(motion: Motion, own: np.ndarray) -> None:
+            given = self.world.parameters, times
+            motion_loops.to_rest_of(motion.lattice, own, given, self.inlets, places)
+
+        rows.of_each(self.alike, move)
         return state._replace(centreline=places, head=places[:, -1])
 
     def to_space(self, points: np.ndarray) -> np.ndarray:
-        """Places in space (N, ..., 3) of places at rest (N, ..., 3), m."""
-        found = []
-        for index, row in enumerate(points):
-            _, parameters, time = self.warp(index)
-            found.append(self._motions[index].to_space(parameters, time, row)[0])
-        return np.array(found)
+        """Places in space (N, 3) of places at rest (N, 3), m."""
+        from cathsim_dmc.physics import motion_loops  # late, as numba takes long
+
+        places, times = np.array(points), self.times
+
+        def move(motion: Motion, own: np.ndarray) -> None:
+            given = self.world.parameters, times
+            motion_loops.to_space_of(motion.lattice, own, given, places)
+
+        rows.of_each(self.alike, move)
+        return places
 
     def warp(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
-        """Lattice and parameters of one simulation's motion, and its time, s.
-
-        The time is that of what MuJoCo has derived, one physics step before the end.
-        """
-        time = max(float(self._clock[index]) - self._step, 0.0)
+        """Lattice and parameters of one simulation's motion, and its time, s."""
+        time = float(self.times[index])
         return self._motions[index].lattice, self._numbers(index), time
 
     def surface(self, index: int) -> Surface:

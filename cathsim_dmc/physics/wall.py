@@ -6,19 +6,20 @@ contact with the rigid wall has that contact's law.
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc import rows
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import CONTACT_SOLIMP, CONTACT_SOLREF
 from cathsim_dmc.laws.compliance import (
     Law,
     Links,
-    Material,
     Sharing,
-    write_contacts,
 )
+from cathsim_dmc.physics import held
 from cathsim_dmc.physics.effects import Draw, Effect, World
 from cathsim_dmc.physics.flow import Flow
 from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
@@ -76,7 +77,7 @@ class Wall(Effect):
     """Sets the contact of each link by the vessel where it is."""
 
     acts_in, adapter, parameters = "contact", "compliance", Sharing
-    model_fields = ("geom_solref", "geom_solimp")
+    model_fields = step_fields = ("geom_solref", "geom_solimp")
     state = ("_radius", "_material")
 
     def __init__(self, options: WallOptions, blood: Flow):
@@ -92,6 +93,9 @@ class Wall(Effect):
         # Of the lumen around each link, 0 where it has never been in one.
         self._radius = np.zeros((count, len(links)))
         self._material = np.ones((count, len(_LIMITS)))
+        # Where the fields of each simulation lie, 0 where there is no episode yet.
+        self._fields: list[Any] = [None] * count
+        self._places = np.zeros((count, len(self.model_fields)), np.int64)
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Draws the material of the wall."""
@@ -100,20 +104,22 @@ class Wall(Effect):
         self._material[index] = [
             np.nan if value is None else drawn(value, random_state) for value in given
         ]
-        self._write(index)
+        fields = [self.world.field(index, name) for name in self.model_fields]
+        self._fields[index], self._places[index] = fields, held.addresses(fields)
+        self._write(slice(index, index + 1))
 
-    def _write(self, index: int) -> None:
-        solref, solimp = (self.world.field(index, name) for name in self.model_fields)
-        material = Material._make(self._material[index].tolist())
-        radius, laws = self._radius[index], (RIGID, COMPLIANT)
-        write_contacts(radius, material, self._links, laws, solref, solimp)
+    def _write(self, own: slice) -> None:
+        from cathsim_dmc.physics import adapters  # late, as numba takes long
+
+        radius, material = self._radius[own], self._material[own]
+        laws = RIGID, COMPLIANT
+        adapters.press(self._places[own], radius, material, self._links, laws)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Takes the radius of the vessel around each link."""
         radius = self._blood.radius
         np.copyto(self._radius, radius, where=radius > 0.0)
-        for index in range(len(radius)):
-            self._write(index)
+        rows.each(len(radius), self._write)
         return action
 
 

@@ -184,8 +184,9 @@ class WallContacts:
         columns: list[list[np.ndarray]] = [[] for _ in range(6)]
         starts = np.zeros((len(self._parts), 6, 2), np.int64)
         for number, wall in enumerate(self._parts):
-            moves = self._motion is not None and wall.lattice is not None
-            lattice = wall.lattice if moves else np.zeros(0)
+            lattice = wall.lattice
+            if self._motion is None or lattice is None:
+                lattice = np.zeros(0)
             one = [*empty, wall.arrays[0]] if wall.is_bore else [*wall.arrays, empty[0]]
             for which, array in enumerate([*one, lattice]):
                 before = sum(map(len, columns[which]))

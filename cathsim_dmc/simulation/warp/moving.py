@@ -54,11 +54,14 @@ class MovingWalls:
     def bind(self, model: Any, data: Any, scene: Scene, written: Written) -> None:
         """Takes Warp's arrays, and those of the contacts."""
         constant, view = self._device.constant, self._device.view
-        boxes = map(constant, (self._places, self._turns, self._sizes))
-        parameters = type(self._given)._make(
-            constant(np.array(each)) for each in self._given
+        given = [constant(np.array(each)) for each in self._given]
+        self._vessels = Vessels(
+            time=view(data.time),
+            parameters=type(self._given)._make(given),
+            places=constant(self._places),
+            turns=constant(self._turns),
+            sizes=constant(self._sizes),
         )
-        self._vessels = Vessels(view(data.time), parameters, *boxes)
         self._scene = MovingScene(scene, self._vessels)
         self._carried = Carried(
             scene.links, scene.walls, self._vessels, written.out, written.counts,

@@ -16,8 +16,7 @@ from cathsim_dmc.laws.field import FREE
 from cathsim_dmc.laws.motion import (
     VALUES,
     WARP,
-    MotionParameters,
-    course_at,
+    nth_course,
     wall_velocity,
     warp,
 )
@@ -91,23 +90,6 @@ class Carried(NamedTuple):
 
 
 @compiled
-def _course(vessels, world, after):
-    """`laws.motion.Course` of a world's vessel, at a way (s) after its time."""
-    given = vessels.parameters
-    own = MotionParameters(
-        given.heart[world],
-        given.breathing[world],
-        given.distensibility[world],
-        given.rate[world],
-        given.phase[world],
-        given.wave_speed[world],
-        given.breath_rate[world],
-        given.breath_phase[world],
-    )
-    return course_at(own, float(vessels.time[world]) + after)
-
-
-@compiled
 def _in_sheath(vessels, world, place):
     """Whether a place (3) m is in the box around the sheath."""
     origin, size = vector(vessels.places, world, 0), vessels.sizes[world]
@@ -144,10 +126,11 @@ def find_moving(thread, scratch, given):
         if _in_sheath(vessels, world, pair.centre):
             if clearance_along(pair.wall, pair.capsule, 0.0) >= FREE:
                 return
-        motion = lattice, _course(vessels, world, 0.0)
+        course = nth_course(vessels.parameters, world, float(vessels.time[world]))
         moving = MovingScratch(samples, own, planes[PLANES:], first[SAMPLES:])
+        motion, law = (lattice, course), pair.law
         made = moving_contacts(
-            pair.wall, pair.capsule, pair.law, pair.sweep, motion, moving, out
+            pair.wall, pair.capsule, law, pair.sweep, motion, moving, out
         )
     keep(scene.found, thread, pair, out, made)
 
@@ -196,7 +179,8 @@ def carry(world, scratch, given):
     walls, out, rows = given.walls, given.contacts, given.velocity.shape[1]
     there, values = scratch[0][SAMPLES:], scratch[1][PLANES:]
     step = float(given.timestep[world % len(given.timestep)])
-    course = _course(given.vessels, world, 0.5 * step)
+    time = float(given.vessels.time[world]) + 0.5 * step
+    course = nth_course(given.vessels.parameters, world, time)
     for which in range(len(given.links.carriers)):
         ends = walls.starts[walls.of_world[world, which], 5]
         lattice = walls.lattice[ends[0] : ends[1]]
