@@ -18,6 +18,7 @@ from side_wind import SideWind
 
 WIND = np.array([0.02, -0.05, 0.1])  # N/m
 STEPS = 12
+TASK = "type1_lcca"
 
 
 class WindInArrays(Effect):
@@ -359,3 +360,56 @@ def test_a_law_that_numba_refuses_is_named_in_one_line():
         suite.load("cathsim", "simple1_bca", {"effects": [Uncompiled((0, 0, 1))]})
     text = str(found.value)
     assert text.startswith("numba cannot compile") and "\n" not in text
+
+
+class Gain(Effect):
+    """Actuation with a wrong gain, which writes into what it gets."""
+
+    def act(self, action, state):
+        action *= 3.0
+        return action
+
+
+def test_drives_get_no_more_than_the_largest_action():
+    """Else they would catch up with the rest once the command is 0."""
+    plain = BatchSimulation(suite.make_task(TASK), 1)
+    gained = BatchSimulation(suite.make_task(TASK, effects=[Gain()]), 1)
+    plain.reset(), gained.reset()
+    push = np.zeros((1, plain.num_actions))
+    push[:, -1] = 1.0
+    for _ in range(6):
+        one, other = plain.step(push), gained.step(push)
+        assert gained.rollout._action[0, -1] == 1.0
+        np.testing.assert_array_equal(other.readings.head, one.readings.head)
+
+
+@pytest.mark.parametrize("given", [None, np.zeros((1, 3)), 0.0])
+def test_an_action_of_another_shape_is_refused(given):
+    class Wrong(Effect):
+        def act(self, action, state):
+            return given
+
+    batch = BatchSimulation(suite.make_task(TASK, effects=[Wrong()]), 1)
+    batch.reset()
+    with pytest.raises(ValueError, match="act of Wrong returns"):
+        batch.step(np.zeros((1, batch.num_actions)))
+
+
+@pytest.mark.parametrize(
+    ("task", "when", "message"),
+    [
+        ("type1_lcca_pair", "model_fields", "of coaxial devices.*friction"),
+        ("type1_lcca", "step_fields", "in act.*restart"),
+    ],
+)
+def test_fields_that_the_device_writes_over_are_refused(task, when, message):
+    class Stiff(Effect):
+        model_fields = ("jnt_stiffness",)
+
+    setattr(Stiff, when, ("jnt_stiffness",))
+    with pytest.raises(ValueError, match=f"Stiff writes jnt_stiffness {message}"):
+        BatchSimulation(suite.make_task(task, effects=[Stiff()]), 1)
+    if task == "type1_lcca":  # where a bore holds the device, it stays
+        BatchSimulation(
+            suite.make_task(task, effects=[Stiff()], sheath_clearance=0.35e-3), 1
+        )

@@ -103,7 +103,9 @@ class Effect:
         data_fields: Fields of `mujoco.MjData` that it reads, beside
             `ModelIndex.FIELDS`.
         model_fields: Fields of `mujoco.MjModel` that it writes.
-        step_fields: Those of `model_fields` that `act` writes.
+        step_fields: Those of `model_fields` that `act` writes. The device writes its
+            own in every control step: what it has from its hinges and masses follows
+            from options of the task, and an effect that declares one is refused.
         state: Names of its attributes, arrays with a leading axis N, that are its state
             beside parameters and fields: what an episode goes on from. A snapshot keeps
             them, and writes into them in place; what MuJoCo derives it does not keep,
@@ -154,9 +156,21 @@ class Effect:
             state: Readings after the last control step.
 
         Returns:
-            What the next effect gets, and after the last one the actuators.
+            (N, A), what the next effect gets; the drives get it clipped to [-1, 1].
         """
         return action
+
+
+def check_action(effect: Effect, action: Any, shape: tuple[int, ...]) -> None:
+    """Refuses (ValueError) what `act` of an effect has returned."""
+    name = f"act of {type(effect).__name__} returns"
+    if action is None:
+        raise ValueError(f"{name} None; return the action that takes effect")
+    if np.shape(action) != shape:
+        raise ValueError(
+            f"{name} an array of shape {np.shape(action)}; return the action that "
+            f"takes effect, of shape {shape}"
+        )
 
 
 def _kind(effect: Effect) -> Any:

@@ -156,8 +156,11 @@ class NavigationConfig:
         delay = ActionDelay(self.randomisation.longest_delay)
         model = RandomisedModel(self.randomisation)
         blood, walls = self.vessel.effects()
-        devices = devices_of(chain, holds=self.sheath_clearance is None)
+        holds = self.sheath_clearance is None
+        devices = devices_of(chain, holds=holds)
         released = [] if chain.coaxial else [Released()]
+        if chain.coaxial or holds:
+            _check_fields(own, devices, chain.coaxial)
         return [blood, *released, model, delay, *walls, *own, devices]
 
     def _check_devices(self):
@@ -238,3 +241,18 @@ class NavigationConfig:
                     f"randomisation: view is {view!r}, but fluoroscopy has no view "
                     f"that deviates by {deviation} degrees: {error}"
                 ) from error
+
+
+def _check_fields(own: Sequence[Effect], devices: Effect, coaxial: bool) -> None:
+    """Refuses (ValueError) fields of effects that the devices write over."""
+    for effect in own:
+        written = effect.model_fields if coaxial else effect.step_fields
+        if lost := sorted({*written} & {*devices.step_fields}):
+            when, instead = "in act", "write them in restart, where an episode begins"
+            if coaxial:
+                when = "of coaxial devices"
+                instead = "take friction, devices, lumen_friction and randomisation"
+            raise ValueError(
+                f"{type(effect).__name__} writes {', '.join(lost)} {when}, which the "
+                f"devices write over in every control step; {instead}"
+            )

@@ -18,7 +18,7 @@ from cathsim_dmc.imaging.angiograph import Deviation, Planes
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics import vessel as vessels
-from cathsim_dmc.physics.effects import Layout, World, of_kind
+from cathsim_dmc.physics.effects import Layout, World, check_action, of_kind
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import ModelIndex, Readings, merged, part
 from cathsim_dmc.physics.single_device import SingleDevice
@@ -225,13 +225,14 @@ class Rollout(Restorable):
             )
         self._open[:] = True
         self._previous_action, self._action = self._action, action
+        if self._config.effects:  # which may write into what they get
+            action = action.copy()
         for effect in self.effects:
+            if effect is self._devices and self._config.effects:
+                action = np.clip(action, -1.0, 1.0)
             action = effect.act(action, self.readings)
-            if action is None:
-                raise ValueError(
-                    f"act of {type(effect).__name__} returns None; return the action "
-                    "that takes effect"
-                )
+            if effect is not self._devices:
+                check_action(effect, action, self._action.shape)
         self._stepper.begin(action)
 
     def start(self, indices: np.ndarray) -> Step:
