@@ -5,6 +5,7 @@ field, what was given and what is allowed.
 """
 
 import dataclasses
+import json
 import math
 import numbers
 import re
@@ -371,3 +372,23 @@ def _allowed(
     if math.isinf(low) or above:
         return f"{kind}{above}, at most {most}{unit}"
     return f"{kind} from {least} to {most}{unit}"
+
+
+def as_json(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Options as they are read from JSON, and those that are objects, as they are."""
+    plain, objects = dict[str, Any](), dict[str, Any]()
+    for name, value in given.items():
+        try:
+            plain[name] = json.loads(json.dumps(value, default=_as_mapping))
+        except (TypeError, ValueError):
+            objects[name] = value
+    return plain, objects
+
+
+def _as_mapping(value: Any) -> dict[str, Any]:
+    """An option that is a dataclass, as the mapping that makes it again."""
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        raise TypeError
+    return dataclasses.asdict(
+        value, dict_factory=lambda pairs: {k: v for k, v in pairs if v is not None}
+    )

@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 import inspect
 import math
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -60,7 +61,8 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
         ValueError: if the name is taken, or an option of the objective has the name of
             one that tasks have.
     """
-    bounds.text("name", name)
+    if not re.fullmatch(r"[\w:.-]+", bounds.text("name", name)):
+        bounds.refuse("name", name, "of letters, digits and the signs _ : . -")
     bounds.instance("definition", definition, TaskDefinition)
     if taken := sorted({*_TAKEN, *_CONFIG_FIELDS} & {*definition.objective_options}):
         raise ValueError(
@@ -156,7 +158,9 @@ def make_task(
 
     others = map(room, range(1, len(anatomies))) if len(anatomies) > 1 else None
     scene, objective = room(0)
-    return Navigation(scene, objective, config, random, others=others, name=name)
+    made = Navigation(scene, objective, config, random, others=others, name=name)
+    made.options = dict(options)
+    return made
 
 
 def _configured(

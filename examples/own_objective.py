@@ -26,10 +26,17 @@ class GentleCannulation(Cannulation):
     }
 
 
-def gentle(anatomy, goal, *, tolerance_weight: float = 1.0):
-    """The objective of the task; keyword arguments become options of the task."""
+def gentle(
+    anatomy, goal, *, tolerance_weight: float = 1.0, farthest_shift: float = 0.0
+):
+    """The objective of the task; keyword arguments become options of the task.
+
+    But for `farthest_shift`, how far past its place the task may shift the goal, m.
+    """
     reward = {"distance": -1.0, "success": 10.0, "hard_contact": -tolerance_weight}
-    return GentleCannulation.to(anatomy, goal, reward=reward)
+    return GentleCannulation.to(
+        anatomy, goal, reward=reward, farthest_shift=farthest_shift
+    )
 
 
 suite.register(

@@ -104,7 +104,7 @@ def record_demonstrations(
     names = observation if isinstance(observation, str) else list(observation)
     options: dict[str, Any] = bounds.options("task_kwargs", task_kwargs)
     options |= {"observation": names}
-    count = min(episodes, _SIMULATIONS)
+    count, spec = min(episodes, _SIMULATIONS), gymnasium.env_spec(task, **options)
     made = suite.make_task(task, **options)
     simulation = BatchSimulation(made, count, num_threads=num_threads or 0)
     buffers: list[Any] = []
@@ -119,7 +119,7 @@ def record_demonstrations(
     dataset.write(
         out,
         buffers,
-        env_spec=gymnasium.env_spec(task, **options),
+        env_spec=spec,
         observation_space=gymnasium.space_of(made.observation_specs, single),
         action_space=gymnasium.space(action, single),
         algorithm=f"scripted expert, noise {noise:g}",
@@ -201,7 +201,7 @@ def _buffer(seed: int, row: int, columns: Mapping[str, Any]) -> Any:
 
 def alike(task_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """Options that demonstrations must have been recorded with, None for a default."""
-    given = {name: task_kwargs.get(name) for name in _ALIKE}
+    given = {name: dataset.chosen(task_kwargs, name) for name in _ALIKE}
     return {k: list(v) if isinstance(v, tuple) else v for k, v in given.items()}
 
 

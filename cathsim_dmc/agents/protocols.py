@@ -38,9 +38,12 @@ class Protocol(NamedTuple):
 
     def beside(self, options: Mapping[str, Any], given: Mapping[str, Any]) -> dict:
         """Options but those of the protocol; ValueError if one of these is given."""
-        for name in self.task_kwargs.keys() & given:
+        ranges = Randomisation.make(self.task_kwargs.get("randomisation", False))
+        drawn = () if ranges.friction is None else ("friction",)
+        own = {*self.task_kwargs, *drawn}
+        for name in sorted(own & {*given}):
             raise ValueError(f"{name}: the protocol has its own; leave {name} out")
-        return {k: v for k, v in options.items() if k not in self.task_kwargs}
+        return {name: value for name, value in options.items() if name not in own}
 
 
 VARIED_RANGES = Randomisation(
@@ -114,7 +117,13 @@ def parts(
         played += count
         varied = () if ranges == Randomisation() else seeds
         drawn = tuple(_conditions(ranges, one, arches, own) for one in varied)
-        found.append(Part(own, seeds, drawn))
+        # Objects would not go into the files of an episode; the task has its own.
+        kept = {
+            name: value
+            for name, value in own.items()
+            if name != "effects" or name in task_kwargs
+        }
+        found.append(Part(kept, seeds, drawn))
     return tuple(found)
 
 

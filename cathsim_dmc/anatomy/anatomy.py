@@ -1,5 +1,6 @@
 """The anatomy as the simulator sees it, lumen, inlet and goals: metres, frame LPS."""
 
+import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -104,6 +105,20 @@ class Anatomy:
         return field_cache.field_of(self.scan or self.tree, self.ends)
 
     @cached_property
+    def digest(self) -> str:
+        """Eight hexadecimal digits that tell its lumen from others."""
+        digest, scan = hashlib.sha256(), self.scan
+        for name, vessel in self.tree.vessels.items():
+            line = vessel.centreline
+            numbers = *line.points.ravel(), *line.radii, vessel.ostium
+            digest.update(f"{name} {vessel.parent}".encode())
+            digest.update(np.round(1e9 * np.array(numbers)).astype(np.int64).tobytes())
+        if scan is not None:
+            vertices = np.round(1e9 * scan.vertices).astype(np.int64)
+            digest.update(vertices.tobytes() + scan.faces.astype(np.int64).tobytes())
+        return digest.hexdigest()[:8]
+
+    @cached_property
     def surface(self) -> Surface:
         """Triangles of the lumen surface, closed."""
         from cathsim_dmc.anatomy.surface import lumen_surface
@@ -169,15 +184,17 @@ class Anatomy:
     def goal_room(self, goal: Goal) -> float:
         """Radius (m) of a ball around a goal that ends before what lies on the way.
 
-        That is the ostium of its vessel, or the goal before it in the same vessel.
+        That is the ostium of its vessel, or the goal before a named one in the same
+        vessel.
         """
         vessel = self.tree.vessel(goal.vessel)
         before = [vessel.ostium] if vessel.parent is not None else []
-        before += [
-            other.arc_length
-            for other in self.goals.values()
-            if other.vessel == goal.vessel and other.arc_length < goal.arc_length
-        ]
+        if self.goals.get(goal.name) is goal:
+            before += [
+                other.arc_length
+                for other in self.goals.values()
+                if other.vessel == goal.vessel and other.arc_length < goal.arc_length
+            ]
         room = goal.arc_length - max(before, default=-np.inf)
         return max(room, _LEAST_ROOM)
 

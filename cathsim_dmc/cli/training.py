@@ -94,6 +94,8 @@ def command(arguments: list[str]) -> Any:
         result = agents.train(config, run.out, progress=not run.quiet, **how)
         if result.interrupted:
             again = ["cathsim", "train", config.task, "--out", str(run.out), "--resume"]
+            for module in config.modules:
+                again += ["--import", module]
             print(
                 f"interrupted after {result.frames} of {config.total_frames} frames, "
                 f"which are saved; go on with: {shlex.join(again)}",

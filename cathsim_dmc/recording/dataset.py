@@ -18,6 +18,7 @@ from cathsim_dmc.files import (
     require_room,
 )
 from cathsim_dmc.recording.episode import SUFFIX, Episode
+from cathsim_dmc.tasks.config import NavigationConfig
 
 # Options of what is observed, which the record does not hold.
 _OBSERVED = ("observation", "fluoroscopy", "endoluminal_size", "cameras")
@@ -94,6 +95,12 @@ class DatasetError(ValueError):
     """A dataset is missing, damaged or of another kind."""
 
 
+def chosen(options: Mapping[str, Any], name: str) -> Any:
+    """An option of a task; None where it is left out or is the default."""
+    value = options.get(name)
+    return None if value == getattr(NavigationConfig, name, None) else value
+
+
 def metadata_of(path: str | os.PathLike[str]) -> Path:
     """The file that tells what is in a dataset; DatasetError if there is none."""
     data = next(Path(path).glob("data"), Path(path)) / "metadata.json"
@@ -132,7 +139,7 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
             raise ValueError("metadata.json lacks the spaces")
         own = json.loads(named.get("env_spec") or "{}").get("kwargs", {})
         for name, value in options.items():
-            if own and own.get(name) != value:
+            if own and chosen(own, name) != chosen(options, name):
                 raise ValueError(f"its {name} is {own.get(name)!r}, not {value!r}")
         for file in data.parent.glob("*.hdf5"):
             check_stored(file)
@@ -315,7 +322,8 @@ def _repeated(environment: Any, episode: Episode, kind: np.dtype) -> dict[str, A
             raise ValueError(
                 f"{name} does not repeat: reward {reward} instead of "
                 f"{episode.reward[step]} at step {step}; it was recorded with "
-                f"{episode.meta.get('versions')}"
+                f"{episode.meta.get('versions')} and the options "
+                f"{episode.meta.get('task_kwargs')}, without effects and other objects"
             )
         if ends[-1] and step + 1 < episode.steps:
             raise ValueError(

@@ -70,7 +70,8 @@ class EpisodeRecorder:
         env: What ``cathsim_dmc.suite.load`` returns; TypeError for any other.
         task_name: Registered name to write into episodes; the class name of the task
             otherwise.
-        task_kwargs: Keyword arguments the environment was made with, for ``meta``.
+        task_kwargs: Options of the task, for ``meta``; None for those that
+            `suite.make_task` was given, without objects such as effects.
     """
 
     def __init__(
@@ -81,6 +82,8 @@ class EpisodeRecorder:
     ) -> None:
         self._env, self._task = env, navigation_of(env)
         self._task_name = task_name or type(env.task).__name__
+        if task_kwargs is None:
+            task_kwargs, _ = bounds.as_json(self._task.options)
         self._task_kwargs = bounds.options("task_kwargs", task_kwargs)
 
     def record_episode(

@@ -31,7 +31,7 @@ from cathsim_dmc.tasks.step import Step
 _HOOKS = (
     "initialize_episode_mjcf", "initialize_episode", "before_step", "before_substep",
     "after_substep", "after_step", "get_reward", "get_discount",
-    "should_terminate_episode",
+    "should_terminate_episode", "task_observables", "action_spec",
 )  # fmt: skip
 _ALIVE: weakref.WeakSet["BatchSimulation"] = weakref.WeakSet()
 

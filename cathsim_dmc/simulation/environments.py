@@ -78,6 +78,17 @@ def standard(
     if numbers:
         seen[VECTOR] = torch.cat([n.flatten(batch_dims).float() for n in numbers], -1)
     if images:
+        if len({one.shape[-2:] for one in images}) > 1:
+            sizes = (
+                f"{name} {entries[name].shape[-2]} x {entries[name].shape[-3]}"
+                for name in sorted(entries)
+                if entries[name].dtype == torch.uint8
+            )
+            raise ValueError(
+                f"images of different sizes are no observation of a network: "
+                f"{', '.join(sizes)} pixels; give the options of the task that set "
+                "them, such as fluoroscopy size and endoluminal_size, one size"
+            )
         seen[PIXELS] = torch.cat(images, -3)
     return seen
 

@@ -5,7 +5,6 @@
 
 import contextlib
 import dataclasses
-import json
 import logging
 import os
 import uuid
@@ -124,12 +123,9 @@ class ErrorFiles:
     ):
         """Takes the name and options of the task, which make it again."""
         self.folder, self._task = Path(folder), task
-        options, self._whole = dict(options or {}), True
-        try:
-            text = json.dumps(options, default=_as_mapping)
-        except TypeError:
-            text, self._whole = json.dumps(options, default=repr), False
-        self._options = json.loads(text)
+        self._options, objects = bounds.as_json(options or {})
+        self._options |= {name: repr(value) for name, value in objects.items()}
+        self._whole = not objects
 
     def before(self, rollout: Rollout) -> Snapshot:
         """The state of all simulations before a control step."""
@@ -179,12 +175,3 @@ class ErrorFiles:
             for oldest in others[: 1 - KEPT]:
                 oldest.unlink()
         return path
-
-
-def _as_mapping(value: Any) -> dict[str, Any]:
-    """An option that is a dataclass, as the mapping that makes it again."""
-    if not dataclasses.is_dataclass(value) or isinstance(value, type):
-        raise TypeError
-    return dataclasses.asdict(
-        value, dict_factory=lambda pairs: {k: v for k, v in pairs if v is not None}
-    )

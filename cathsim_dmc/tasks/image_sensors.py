@@ -13,6 +13,9 @@ from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.observation_kind import BIPLANE, FLUOROSCOPY
 
+_OF_IMAGES = ("image", "sequential", "biplane", "biplane_retry")
+_SHOWING = (*_OF_IMAGES, "segmentation")  # the vessel, too
+
 
 class ImageSensors:
     """Captures the images that the observations ask for, of N simulations.
@@ -76,9 +79,9 @@ class ImageSensors:
         """
         planes = [self.planes[index] for index in rows]
         own = [shadow.of(rows) for shadow in shadows]
-        if self._wants("image", "sequential", "segmentation"):
+        if self._wants(*_SHOWING):
             planes = list(map(around, planes, rows.tolist()))
-        if self._wants("image", "sequential", "biplane", "biplane_retry"):
+        if self._wants(*_OF_IMAGES):
             noise = None
             if random_states is not None and self._noise:
                 noise = [random_states[index] for index in rows]

@@ -21,7 +21,7 @@ from cathsim_dmc.physics.stepper import SingleStepper, Stepper
 from cathsim_dmc.tasks import cases, observations, rehearsal
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
-from cathsim_dmc.tasks.objectives import Objective, Shiftable
+from cathsim_dmc.tasks.objectives import Cannulation, Objective, Shiftable
 from cathsim_dmc.tasks.observation_kind import OPENGL, FrameObservable, Sizes
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.scene import Scene
@@ -78,6 +78,7 @@ class Navigation(composer.Task):
                 the scenes differ in more than their anatomies.
         """
         self.name = name or type(self).__name__
+        self.options: dict[str, Any] = {}
         self._scene = scene
         self._objective = objective
         config = config or NavigationConfig()
@@ -92,6 +93,14 @@ class Navigation(composer.Task):
                 f"randomisation shifts the goal, but {type(objective).__name__} has no "
                 "shifted(shift): derive it from tasks.objectives.Shiftable, or leave "
                 "goal_shift out"
+            )
+        own = isinstance(objective, Cannulation) and objective.goal_arc_length is None
+        if config.randomisation.farthest_shift and own:
+            raise ValueError(
+                "randomisation shifts the goal away from the ostium, but the route of "
+                f"{type(objective).__name__} ends at the goal: give the function of "
+                "the task's objective a keyword farthest_shift and hand it on to "
+                "Cannulation.to, or leave goal_shift out"
             )
         self.num_actions = len(scene.catheter.action_names)
         living = config.vessel.living

@@ -323,7 +323,7 @@ class Cannulation(Shiftable, Routed):
 
     def in_branch(self, head: np.ndarray) -> np.ndarray:
         """Whether the head (..., 3) is in the lumen of the branch, past its ostium."""
-        place = self.branch.project(head)
+        place = self.branch.project_rows(head)
         return (place.distance <= place.radius) & (place.arc_length >= self.ostium)
 
     def lumen_distance(self, head: np.ndarray) -> np.ndarray:
@@ -342,7 +342,7 @@ class Cannulation(Shiftable, Routed):
 
     def path_distance(self, head: np.ndarray) -> np.ndarray:
         """Way (...) along the route to the goal plus distance from the route, m."""
-        place = self.route.project(head)
+        place = self.route.project_rows(head)
         if self.goal_arc_length is None:
             return self.route.length - place.arc_length + place.distance
         return np.abs(self.goal_arc_length - place.arc_length) + place.distance
@@ -359,5 +359,5 @@ class Cannulation(Shiftable, Routed):
         stop = np.clip(start + shift, self.ostium, branch.length)
         moved = branch.at(stop).position - branch.at(start).position
         goal = self.goal + moved
-        arc_length = self.route.project(goal).arc_length
+        arc_length = self.route.project_rows(goal).arc_length
         return dataclasses.replace(self, goal=goal, goal_arc_length=arc_length)

@@ -9,6 +9,7 @@ import numpy as np
 from dm_control.composer.observation import observable
 from dm_env import specs
 
+from cathsim_dmc import bounds
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.forces import WallForce
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
@@ -108,12 +109,19 @@ class Entry:
         """Its spec for one simulation."""
         shape = self.shape(sizes) if callable(self.shape) else self.shape
         shape = (shape,) if isinstance(shape, int) else shape
+        if not shape or (self.is_image and len(shape) != 3):
+            allowed = "one length or more"
+            if self.is_image:
+                allowed = "(height, width, channels)"
+            bounds.refuse(f"the shape of the entry {self.key!r}", shape, allowed)
         if math.isinf(self.low) and math.isinf(self.high):
             return specs.Array(shape, self.dtype, self.key)
         low, high = (np.asarray(end, self.dtype) for end in (self.low, self.high))
         return specs.BoundedArray(shape, self.dtype, low, high, self.key)
 
 
+# Keys of TorchRL and of the environments, beside the observation.
+_RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "next")
 # What a row of the table may need.
 FLUOROSCOPY, BIPLANE = "fluoroscopy", "fluoroscopy with two planes"
 ROUTE, OPENGL = "a route", "OpenGL"
@@ -152,6 +160,11 @@ class ObservationTable(dict[str, ObservationKind]):
 
         def add(function: Callable[[Frame], Observation]):
             name = function.__name__
+            if reserved := sorted({entry.key for entry in entries} & {*_RESERVED}):
+                raise ValueError(
+                    f"entries {', '.join(reserved)} of observation {name!r} are names "
+                    "that environments use; choose another"
+                )
             there = {entry.key: entry for entry in self.entries(self)}
             taken = [e.key for e in entries if there.get(e.key, e) != e]
             if name in self or taken:
@@ -218,6 +231,11 @@ class ObservationTable(dict[str, ObservationKind]):
                 raise ValueError(
                     f"entry {key!r} of an observation has the shape {found} for one "
                     f"simulation, and its row declares {spec}; return what it declares"
+                )
+            if observation[key].dtype != wanted[key].dtype:
+                raise ValueError(
+                    f"entry {key!r} of an observation is of {observation[key].dtype}, "
+                    f"and its row declares {wanted[key].dtype}; return what it declares"
                 )
 
     def entries(self, names: Iterable[str]) -> list[Entry]:

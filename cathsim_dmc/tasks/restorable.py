@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc import bounds
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.imaging.angiograph import Deviation
@@ -41,7 +42,12 @@ def describe(
     may not: a snapshot holds the stiffness of the hinges, those held by the sheath too,
     and the masses of links, some of which stay as they are at the start.
     """
-    anatomies = {case.scene.anatomy.name: case.scene.placement.start for case in cases}
+    anatomies = {
+        f"{case.scene.anatomy.name} {case.scene.anatomy.digest}": (
+            case.scene.placement.start
+        )
+        for case in cases
+    }
     # By the number that a state holds.
     numbered = [[case.scene.anatomy.name, case.scene.goal.name] for case in cases]
     return {
@@ -66,6 +72,18 @@ def _named(device: Device) -> str:
     if DEVICES.get(device.name) == device:
         return device.name
     return f"{device.name} {hashlib.sha256(repr(device).encode()).hexdigest()[:8]}"
+
+
+def _check_state(holder: Any, name: str, value: Any, count: int) -> None:
+    """Refuses (TypeError) what an effect names as its state and cannot be restored."""
+    wrong = isinstance(value, list) or (
+        isinstance(value, np.ndarray) and value.shape[:1] != (count,)
+    )
+    if isinstance(holder, Effect) and wrong:
+        raise TypeError(
+            f"the state {name!r} of {type(holder).__name__} is {bounds.shown(value)}; "
+            f"it must be an array with a row for each of the {count} simulations"
+        )
 
 
 class Restorable:
@@ -126,6 +144,7 @@ class Restorable:
                 if attribute == "_random_states" and not random:
                     continue
                 value = getattr(holder, attribute)
+                _check_state(holder, attribute, value, len(self._open))
                 arrays |= packed(f"{name}.{attribute}", value, indices)
         fields = {name for effect in self.effects for name in effect.model_fields}
         kept = self._stepper.kept(indices, sorted(fields))
