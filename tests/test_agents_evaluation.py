@@ -15,6 +15,7 @@ from cathsim_dmc.analysis.force_statistics import FIGURES, EpisodeForces, Statis
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.cli import agents as commands
 from cathsim_dmc.cli import task_options
+from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.randomisation import Randomisation
 from cathsim_dmc.simulation.batch import BatchSimulation
 
@@ -374,3 +375,23 @@ def test_seeds_beyond_the_last_are_refused_by_name(protocol, most):
     conditions, first = protocols.get(protocol), 2**32 - 1
     with pytest.raises(ValueError, match=rf"seed is {first}; .* to 42949672{most}"):
         protocols.parts(conditions, "type1_bca", {}, 2, first)
+
+
+def test_a_protocol_refuses_what_it_draws():
+    """And a policy that was trained with another friction is played with the drawn."""
+    varied = protocols.get("varied")
+    with pytest.raises(ValueError, match="friction: the protocol has its own"):
+        varied.beside({"friction": 1.0}, {"friction": 1.0})
+    assert varied.beside({"friction": 1.0, "max_steps": 3}, {}) == {"max_steps": 3}
+
+
+def test_effects_of_a_task_are_no_option_of_its_episodes(monkeypatch):
+    definition = suite.TaskDefinition(
+        "", "simple1", "bca", options={"effects": [Effect()], "max_steps": 3}
+    )
+    monkeypatch.setitem(suite.TASKS, "blown", definition)
+    (part,) = protocols.parts(protocols.get("published"), "blown", {}, 2, 0)
+    assert part.task_kwargs == {"max_steps": 3}
+    given = {"effects": []}
+    (part,) = protocols.parts(protocols.get("published"), "blown", given, 2, 0)
+    assert part.task_kwargs == {"max_steps": 3, "effects": []}

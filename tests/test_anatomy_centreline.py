@@ -133,3 +133,15 @@ def test_route_into_a_branch_and_between_branches():
 def test_trees_need_parents_first_and_one_root(vessels, message):
     with pytest.raises(ValueError, match=message):
         VesselTree(vessels)
+
+
+def test_one_point_is_projected_as_one_of_many():
+    line = helix()
+    points = line.points[::7] + np.random.RandomState(0).normal(0, 3e-3, (29, 3))
+    many = line.project(points)
+    for row, point in enumerate(points):
+        for shape in ((3,), (1, 3)):
+            found = line.project_rows(point.reshape(shape))
+            assert found.distance.shape == shape[:-1]
+            for one, other in zip(found, many, strict=True):
+                assert one.item() == other[row]

@@ -111,3 +111,12 @@ def test_goals_of_the_phantoms_are_reached_within_8_mm(name):
         objective = objectives.Cannulation.to(anatomy, goal)
         assert objective.goal_radius == objectives.GOAL_RADIUS == 8e-3
     assert least_ahead(anatomy.inlet) == 10e-3
+
+
+@pytest.mark.parametrize("offset", [-2e-3, 0.0, 0.5e-3, 4e-3])
+def test_a_place_near_a_named_goal_is_reached_as_it_is(offset):
+    anatomy = phantoms.load("type1")
+    named = anatomy.goal("lcca")
+    line = anatomy.tree.vessel(named.vessel).centreline
+    goal = anatomy.goal_at(line.at(named.arc_length + offset).position)
+    assert objectives.Cannulation.to(anatomy, goal).goal_radius == 8e-3

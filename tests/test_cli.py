@@ -21,9 +21,10 @@ from cathsim_dmc.agents.policies import FunctionPolicy
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.cli import agents as commands
-from cathsim_dmc.cli import checks, task_options, training
+from cathsim_dmc.cli import checks, options, task_options, training
 from cathsim_dmc.cli import phantoms as cli_phantoms
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.validation.checks import Check, Report
 
 # What works.
 
@@ -462,3 +463,12 @@ def test_record_writes_the_formats_that_python_writes(tmp_path, capsys):
     assert f"{recording} {arrays}" in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"x.csv does not end in .rrd or .npz or .gif"):
         commands.record("push", tmp_path / "x.csv", task="simple1_bca", options=options)
+
+
+def test_a_table_of_checks_has_no_markup(capsys):
+    kept = Check.at_most("[x] of a file", 1.0, 2.0, "mm")
+    lost = Check.at_most("other", 3.0, 2.0, "mm")
+    assert options.show(Report("both", [kept, lost]), as_json=False) == 1
+    shown = capsys.readouterr().out
+    assert "pass" in shown and "FAIL" in shown and "[x] of a file" in shown
+    assert "[/]" not in shown and "[green]" not in shown

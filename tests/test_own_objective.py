@@ -188,3 +188,38 @@ def test_an_outcome_that_is_none_is_refused_by_the_name_of_its_objective(
     for other in (None, "x", tuple(good)):
         with pytest.raises(ValueError, match=r"Advance returns .*Outcome\("):
             answer(other)
+
+
+@pytest.mark.parametrize("hook", ["task_observables", "action_spec"])
+def test_what_an_agent_sees_and_does_is_the_rollouts(hook):
+    task = suite.make_task("simple1_bca")
+    kind = type("Shaped", (Navigation,), {hook: getattr(Navigation, hook)})
+    setattr(kind, hook, property(lambda self: {}))
+    with pytest.raises(ValueError, match=f"Shaped overrides {hook}"):
+        BatchSimulation(kind(task.scene, task.objective, task.config), 1)
+
+
+def test_a_route_that_ends_at_a_goal_which_moves_on_is_refused(example):
+    def plain(anatomy, goal):
+        return Cannulation.to(anatomy, goal)
+
+    shifts = {"goal_shift": (0.0, 5e-3)}
+    for objective, allowed in ((plain, False), (example.gentle, True)):
+        name = f"goes_on_{allowed}"
+        definition = suite.TaskDefinition("", "simple1", "bca", objective=objective)
+        suite.register(name, definition)
+        try:
+            if allowed:
+                task = suite.make_task(name, randomisation=shifts)
+                assert task.objective.goal_arc_length is not None
+            else:
+                with pytest.raises(ValueError, match="ends at the goal.*farthest_sh"):
+                    suite.make_task(name, randomisation=shifts)
+        finally:
+            del suite.TASKS[name]
+
+
+@pytest.mark.parametrize("name", ["own short", "my/short", "a,b"])
+def test_a_name_that_no_environment_may_have_is_refused(name):
+    with pytest.raises(ValueError, match="name is .*letters, digits"):
+        suite.register(name, suite.TaskDefinition("", "simple1", "bca"))

@@ -12,6 +12,7 @@ from recording_samples import make_tube, same
 import cathsim_dmc
 from cathsim_dmc import suite
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
+from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.forces import PEAK_NOTE
 from cathsim_dmc.pictures import curves, recorded
 from cathsim_dmc.pictures.anatomies import Picture
@@ -426,3 +427,10 @@ def test_contacts_without_force_are_drawn(pushed, recwarn):
     touching = dataclasses.replace(moment, force=np.zeros_like(moment.force))
     scene_figure(touching, views=("front",), fluoroscopy=False, pixels=200)
     assert not recwarn.list
+
+
+def test_a_record_keeps_the_options_of_its_task():
+    options = {"friction": 0.1, "max_steps": 2, "effects": [Effect()]}
+    env = suite.load("cathsim", "simple1_bca", task_kwargs=options)
+    episode = cathsim_dmc.record(env, "push", seed=1)
+    assert episode.meta["task_kwargs"] == {"friction": 0.1, "max_steps": 2}

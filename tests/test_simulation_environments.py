@@ -1,14 +1,19 @@
+import types
+
 import numpy as np
 import pytest
 import torch
 from conftest import twin
 from dm_env.specs import BoundedArray
+from tensordict import TensorDict
 from torchrl.data import Bounded
 from torchrl.envs import DMControlEnv, check_env_specs
 
 from cathsim_dmc import suite
 from cathsim_dmc.agents import evaluate, make_config, make_env, train
 from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.agents.policies import TrainedPolicy
+from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.torchrl import BatchedEnv
 from cathsim_dmc.tasks import rehearsal
 from cathsim_dmc.tasks.rollout import Rollout
@@ -90,3 +95,25 @@ def test_a_task_trains_and_evaluates(tmp_path):
     outcome = evaluate(tmp_path, episodes=2, num_threads=1, out_dir=tmp_path)
     assert outcome.task == TASK
     assert [episode.length for episode in outcome.episodes] == [8, 8]
+
+
+def test_images_of_different_sizes_are_refused_by_name():
+    with pytest.raises(
+        ValueError, match=r"endoluminal 128 x 128, image 64 x 64 pixels"
+    ):
+        environments.make_env(
+            "type1_bca",
+            observation=["image", "endoluminal"],
+            task_kwargs={"fluoroscopy": {"size": 64}},
+        )
+
+
+def test_a_policy_of_images_names_those_of_another_size():
+    policy = object.__new__(TrainedPolicy)
+    policy.name, policy.task, policy.task_kwargs = "looks", "type1_bca", {}
+    policy.network = types.SimpleNamespace(in_keys=[environments.PIXELS])
+    policy.shapes = types.SimpleNamespace(pixels=(1, 48, 48))
+    for shape, words in (((1, 47, 47), "47 x 47 pixels in 1 ch"), (None, "no image")):
+        seen = {} if shape is None else {environments.PIXELS: torch.zeros(1, *shape)}
+        with pytest.raises(ValueError, match=f"48 x 48 pixels in 1 .* gives {words}"):
+            policy._answer(TensorDict(seen, [1]))

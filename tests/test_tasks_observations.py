@@ -11,9 +11,11 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import observations, route
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.observation_kind import Entry, ObservationTable, Sizes
 
 SIZE = 64
 
@@ -222,3 +224,38 @@ def test_an_objective_without_a_route_cannot_show_one():
 def test_options_are_json():
     text = '{"fluoroscopy": {"view": [5, 0], "biplane": "LAO45", "size": 32}}'
     assert NavigationConfig(**json.loads(text)).fluoroscopy.planes == 2
+
+
+def test_entries_that_networks_cannot_read_are_refused():
+    def near(frame):
+        return {}
+
+    table = ObservationTable()
+    with pytest.raises(ValueError, match="entries action, info .*environments use"):
+        table.row(Entry("info", 1, "", ""), Entry("action", 1, "", ""))(near)
+    for entry in (
+        Entry("near", (), "m", ""),
+        Entry("dim", (3,), "", "", dtype=np.uint8),
+    ):
+        with pytest.raises(ValueError, match=f"entry '{entry.key}'.*must be"):
+            entry.spec(Sizes())
+    spec = {"near": Entry("near", 1, "m", "").spec(Sizes())}
+    table.check({"near": np.zeros((2, 1))}, spec)
+    with pytest.raises(ValueError, match="'near' .* is of bool, .* declares float64"):
+        table.check({"near": np.zeros((2, 1), bool)}, spec)
+
+
+def test_biplane_sees_the_vessel_move_whatever_else_is_observed():
+    planes = {"view": (60, 0), "biplane": (-30, 0)}
+    seen = []
+    for names in (["biplane"], ["biplane", "image"]):
+        task = suite.make_task(
+            "type1_lcca", vessel={"motion": True}, observation=names, fluoroscopy=planes
+        )
+        batch = BatchSimulation(task, 1, num_threads=1)
+        batch.reset()
+        for _ in range(4):
+            step = batch.step(np.ones((1, batch.num_actions)))
+        seen.append(step.observation)
+    for key, value in seen[0].items():
+        np.testing.assert_array_equal(seen[1][key], value)

@@ -13,6 +13,8 @@ from conftest import twin
 from dm_control import mjcf
 
 from cathsim_dmc import suite
+from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.physics.effects import Effect, Layout, World
 from cathsim_dmc.physics.stepper import Stepper
@@ -474,3 +476,40 @@ def test_an_interrupted_step_can_be_put_back(task, monkeypatch):
         batch.snapshot()
     batch.restore(snapshot)
     np.testing.assert_array_equal(batch.step(action).distance, expected)
+
+
+def test_an_anatomy_of_the_same_name_is_another_one(monkeypatch):
+    def environment(shrunk):
+        made = suite.make_task("simple1_bca")
+        if shrunk:
+            made.scene.anatomy.__dict__["digest"] = "0" * 8
+        return suite.environment(made)
+
+    one, other = environment(False), environment(True)
+    one.reset()
+    one.restore(one.snapshot())
+    other.reset()
+    with pytest.raises(ValueError, match="of another task: its anatomies"):
+        other.restore(one.snapshot())
+
+
+def test_the_digest_of_an_anatomy_is_that_of_its_lumen():
+    tree = suite.load_anatomy("simple1").tree
+    (name, vessel), *_ = tree.vessels.items()
+    line = dataclasses.replace(vessel.centreline, radii=0.99 * vessel.centreline.radii)
+    wide = dataclasses.replace(vessel, centreline=line)
+    narrow = VesselTree({**tree.vessels, name: wide})
+    same = [Anatomy.from_tree(each).digest for each in (tree, tree, narrow)]
+    assert same[0] == same[1] != same[2]
+
+
+@pytest.mark.parametrize("value", [[1.0], np.zeros(3)])
+def test_a_state_that_cannot_be_kept_is_refused(value):
+    class Odd(Effect):
+        state = ("numbers",)
+        numbers = value
+
+    environment = suite.environment(suite.make_task("simple1_bca", effects=[Odd()]))
+    environment.reset()
+    with pytest.raises(TypeError, match="'numbers' of Odd is .*each of the 1 simul"):
+        environment.snapshot()

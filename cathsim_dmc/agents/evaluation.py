@@ -70,8 +70,9 @@ def evaluate(
         protocol: Name of the conditions in `protocols.PROTOCOLS`.
         name: Name of the policy for the reports.
         observation: Name or names of observations; None takes the policy's own.
-        task_kwargs: Further options of the task; None takes those that the policy was
-            trained with. A device among them is played in all episodes.
+        task_kwargs: Options of the task, in place of those that the policy was trained
+            with, which None takes; `policies.task_and_options` has both together, as
+            the command line does. A device among them is played in all episodes.
         num_threads: Number of threads of the simulation; None takes one per core.
         simulation_device: Where the simulations run: "cpu", or "cuda" for MuJoCo Warp
             on a GPU, "cuda:1" on the second one (docs/gpu.md); the policy acts on the

@@ -167,6 +167,7 @@ def submit(
     task: PolicysTask = None,
     episodes: int | None = None,
     threads: Threads = None,
+    modules: Modules = (),
 ) -> int:
     """Play a policy under the varied protocol and write a file for the leaderboard.
 

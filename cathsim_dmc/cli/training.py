@@ -94,7 +94,7 @@ def command(arguments: list[str]) -> Any:
         result = agents.train(config, run.out, progress=not run.quiet, **how)
         if result.interrupted:
             again = ["cathsim", "train", config.task, "--out", str(run.out), "--resume"]
-            for module in config.modules:
+            for module in config.modules or ():
                 again += ["--import", module]
             print(
                 f"interrupted after {result.frames} of {config.total_frames} frames, "

@@ -95,6 +95,7 @@ class Report:
     def table(self):
         """A `rich.table.Table` of the checks."""
         from rich.table import Table
+        from rich.text import Text
 
         table = Table("check", title=self.title)
         table.add_column("measured", justify="right")
@@ -104,6 +105,6 @@ class Report:
         for check in self.checks:
             value = f"{check.value:.3g} {check.unit}".rstrip()
             bound = f"{check.bound} {check.unit}".rstrip()
-            kept = "[green]pass[/]" if check.passed else "[bold red]FAIL[/]"
+            kept = Text("pass", "green") if check.passed else Text("FAIL", "bold red")
             table.add_row(check.name, value, bound, kept, check.note)
         return table
