@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cathsim_dmc import cli, policies
-from cathsim_dmc.agents import make_config
+from cathsim_dmc.agents import make_config, training
 from cathsim_dmc.agents.learners import LEARNERS
 from cathsim_dmc.agents.pretrained import pretrained_names
 from cathsim_dmc.entities.devices import DEVICES
@@ -135,3 +135,27 @@ def test_scripts_and_targets_exist():
             assert name in targets, code
         elif kind == "python":
             assert (ROOT / name).is_file(), code
+
+
+class Begun(Exception):
+    """A training has its settings, and its first policy where one is named."""
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        line
+        for line in COMMANDS
+        if " train " in line and " DIR" not in line and "--resume" not in line
+    ],
+)
+def test_a_training_of_the_page_begins(line, cathsim, monkeypatch, tmp_path):
+    def begin(*args):
+        raise Begun
+
+    place = "make_collector" if "--initial-policy" in line else "_environment"
+    monkeypatch.setattr(training, place, begin)
+    monkeypatch.setattr(training, "check_usable", lambda config: None)  # of GPUs
+    words = [word.replace("RUN", str(tmp_path / "run")) for word in shlex.split(line)]
+    with pytest.raises(Begun):
+        cathsim(*words[1:])
