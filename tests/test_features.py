@@ -137,7 +137,7 @@ def test_scripts_and_targets_exist():
             assert (ROOT / name).is_file(), code
 
 
-class Begun(Exception):
+class BegunError(Exception):
     """A training has its settings, and its first policy where one is named."""
 
 
@@ -151,11 +151,11 @@ class Begun(Exception):
 )
 def test_a_training_of_the_page_begins(line, cathsim, monkeypatch, tmp_path):
     def begin(*args):
-        raise Begun
+        raise BegunError
 
     place = "make_collector" if "--initial-policy" in line else "_environment"
     monkeypatch.setattr(training, place, begin)
     monkeypatch.setattr(training, "check_usable", lambda config: None)  # of GPUs
     words = [word.replace("RUN", str(tmp_path / "run")) for word in shlex.split(line)]
-    with pytest.raises(Begun):
+    with pytest.raises(BegunError):
         cathsim(*words[1:])
