@@ -33,8 +33,8 @@ _CLEAR_OF_LUMEN = 5.5e-3  # m
 _NEAR_INLET = 0.015  # m
 # Within this way of the plane of the inlet, m, the sheath holds the device.
 _MOUTH = 2e-3
-# Tilts of the sheath that are tried where the straight one crosses a vessel; the first 40
-# arches of the set "test" need 17.5 degrees at most.
+# Tilts of the sheath that are tried where the straight one crosses a vessel; the first
+# 40 arches of the set "test" need 17.5 degrees at most.
 _TILT_STEP, _LARGEST_TILT = np.radians(2.5), np.radians(30.0)
 _AZIMUTH_STEP = np.radians(15.0)
 
