@@ -43,6 +43,13 @@ PARITY_TASKS: dict[str, dict[str, Any]] = {
     "femoral_type1_lcca": {},
     "arch_lcca": {"pool": 2},
     "type1_lcca_pair": {},
+    "type1_lcca living": {"vessel": "living"},
+}
+# Task and options of what stands behind the observation in `SPEED`.
+SCENES: dict[str, tuple[str, dict[str, Any]]] = {
+    "": ("type1_lcca", {}),
+    "pair": ("type1_lcca_pair", {}),
+    "living": ("type1_lcca", {"vessel": "living"}),
 }
 # Observation, worlds and actions, the most important ones first.
 SPEED = (
@@ -52,6 +59,7 @@ SPEED = (
     ("route", 4096, "random"), ("internal", 1024, "push"),
     ("internal", 16384, "push"), ("image", 4096, "push"), ("route", 4096, "push"),
     ("internal, pair", 4096, "random"), ("internal, pair", 4096, "push"),
+    ("internal, living", 4096, "random"), ("internal, living", 4096, "push"),
 )  # fmt: skip
 ON_THE_CPU = 1024  # simulations on all cores
 # Hundreds of worlds, a few steps of each: an update needs no more frames.
@@ -146,9 +154,9 @@ def speed(
 ) -> dict[str, Any]:
     """Control steps per second of the physics alone, and end to end in TorchRL."""
     began = time.perf_counter()
-    seen, _, pair = observation.partition(", ")
-    task = "type1_lcca_pair" if pair else "type1_lcca"
-    env = BatchedEnv(task, worlds, observation=seen, device=device)
+    seen, _, scene = observation.partition(", ")
+    task, options = SCENES[scene]
+    env = BatchedEnv(task, worlds, observation=seen, task_kwargs=options, device=device)
     state = env.reset()
     built = time.perf_counter() - began
     chosen = actions(policy, 8, env.simulation)
