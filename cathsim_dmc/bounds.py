@@ -385,8 +385,10 @@ def as_json(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     return plain, objects
 
 
-def _as_mapping(value: Any) -> dict[str, Any]:
-    """An option that is a dataclass, as the mapping that makes it again."""
+def _as_mapping(value: Any) -> Any:
+    """An option that is a dataclass, as the mapping that makes it again; numpy's."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         raise TypeError
     return dataclasses.asdict(

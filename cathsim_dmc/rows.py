@@ -46,12 +46,19 @@ def of_each(
     groups: Iterable[tuple[Any, np.ndarray]], act: Callable[[Any, np.ndarray], Any]
 ) -> None:
     """Calls a function with each object of `alike` and its rows, shared out."""
-    for item, own in groups:
-        each(len(own), _on(act, item, own))
+    held = list(groups)
+    total = sum(len(own) for _, own in held)
+    if total < MANY or len(held) == 1:
+        for item, own in held:
+            each(len(own), functools.partial(_of, act, item, own))
+        return
+    cores = os.cpu_count() or 1
+    # The results raise what the calls have raised.
+    list(_pool(os.getpid(), cores).map(lambda one: act(*one), held))
 
 
-def _on(act: Callable, item: Any, own: np.ndarray) -> Callable[[slice], Any]:
-    return lambda part: act(item, own[part])
+def _of(act: Callable, item: Any, own: np.ndarray, part: slice) -> Any:
+    return act(item, own[part])
 
 
 def copy(target: np.ndarray, source: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cathsim_dmc.anatomy import centreline
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 
 
@@ -145,3 +146,14 @@ def test_one_point_is_projected_as_one_of_many():
             assert found.distance.shape == shape[:-1]
             for one, other in zip(found, many, strict=True):
                 assert one.item() == other[row]
+
+
+def test_the_last_point_of_a_chunk_is_projected_as_alone(monkeypatch):
+    line = helix()
+    monkeypatch.setattr(centreline, "_CHUNK_ELEMENTS", 4 * (len(line.points) - 1))
+    points = line.points[:13] + np.random.RandomState(1).normal(0, 3e-3, (13, 3))
+    for count in (4, 5, 13):
+        many = line.project_rows(points[:count])
+        alone = line.project_rows(points[count - 1])
+        for one, other in zip(alone, many, strict=True):
+            assert one.item() == other[-1]

@@ -398,7 +398,7 @@ def test_an_action_of_another_shape_is_refused(given):
 @pytest.mark.parametrize(
     ("task", "when", "message"),
     [
-        ("type1_lcca_pair", "model_fields", "of coaxial devices.*friction"),
+        ("type1_lcca_pair", "model_fields", "of coaxial devices, a field.*friction"),
         ("type1_lcca", "step_fields", "in act.*restart"),
     ],
 )

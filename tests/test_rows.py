@@ -2,6 +2,7 @@
 
 import os
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -28,6 +29,24 @@ def test_each_row_has_its_turn_once(count):
     assert (turns == 1).all()
     alone = names == {threading.get_ident()}
     assert alone == (count < 512)
+
+
+@pytest.mark.parametrize("count", [40, 4099])
+def test_groups_are_shared_out_when_they_are_many(count):
+    """Each of them is of few."""
+    items = [object() for _ in range(20)]
+    chosen = [items[row % 20] for row in range(count)]
+    turns, names = np.zeros(count, int), set()
+
+    def act(item, own):
+        assert all(chosen[row] is item for row in own)
+        turns[own] += 1
+        names.add(threading.get_ident())
+        time.sleep(1e-3)
+
+    rows.of_each(rows.alike(chosen), act)
+    assert (turns == 1).all()
+    assert (len(names) > 1) == (count > 40)
 
 
 def test_an_error_in_a_part_is_raised():

@@ -114,20 +114,18 @@ class TrainedPolicy(FunctionPolicy):
 
     def reset(self, view: View, which: np.ndarray) -> None:
         """Refuse simulations of a device with other motors, as ValueError."""
-        own = f"{self.shapes.actions} numbers"
-        _require(self, "has actions of", own, str(view.num_actions))
+        _require(self, "has actions of", self.shapes.actions, view.num_actions)
 
     def _answer(self, observation: TensorDictBase) -> TensorDictBase:
         # In training its critic may have read numbers that it does not.
         if environments.VECTOR in self.network.in_keys:
             vector = observation.get(environments.VECTOR, None)
             size = 0 if vector is None else vector.shape[-1]
-            _require(self, "reads", f"{self.shapes.vector} numbers", str(size))
+            _require(self, "reads", self.shapes.vector, size)
         if environments.PIXELS in self.network.in_keys:
             pixels = observation.get(environments.PIXELS, None)
-            seen = () if pixels is None else tuple(pixels.shape[-3:])
-            own, given = _image(self.shapes.pixels), _image(seen)
-            _require(self, "reads images of", own, given)
+            seen = None if pixels is None else tuple(pixels.shape[-3:])
+            _require(self, "reads images of", self.shapes.pixels, seen)
         return self.network(observation)
 
 
@@ -137,22 +135,16 @@ def require_actions(policy: Policy, task: str, options: Mapping[str, Any]) -> No
     Making the task, by which the size is known otherwise, takes seconds.
     """
     if policy.num_actions is not None and task in suite.TASKS:
-        given = str(suite.num_actions(task, **options))
-        _require(policy, "has actions of", f"{policy.num_actions} numbers", given)
+        given = suite.num_actions(task, **options)
+        _require(policy, "has actions of", policy.num_actions, given)
 
 
-def _image(shape: tuple[int, ...] | None) -> str:
-    """A shape (channels, height, width) in words."""
-    if not shape:
-        return "no image"
-    channels, height, width = shape
-    return f"{width} x {height} pixels in {channels} channels"
-
-
-def _require(policy: Policy, what: str, own: str, given: str) -> None:
-    if own.removesuffix(" numbers") != given:
+def _require(policy: Policy, what: str, own: Any, given: Any) -> None:
+    """ValueError unless a size, or a shape (channels, height, width), is that given."""
+    if own != given:
+        kind = " numbers" if isinstance(own, int) else " as (channels, height, width)"
         raise ValueError(
-            f"{policy.name} {what} {own}, the task gives {given}: play it with "
+            f"{policy.name} {what} {own}{kind}, the task gives {given}: play it with "
             "the device and the options that it was trained with, "
             f"{policy.task} with {policy.task_kwargs}"
         )

@@ -148,13 +148,14 @@ class Centreline:
     def project_rows(self, points: ArrayLike) -> Projection:
         """As `project`, of one point bit for bit as of one among many.
 
-        A matrix product of one row is rounded in another way.
+        A matrix product of one row is rounded in another way, so none is left alone.
         """
         points = as_points(points)
-        if points.size != points.shape[-1]:
-            return self.project(points)
-        found = self.project(np.repeat(points.reshape(1, -1), 2, axis=0))
-        return Projection._make(each[0].reshape(points.shape[:-1]) for each in found)
+        flat = points.reshape(-1, 3)
+        found = self.project(np.concatenate([flat, flat[-1:]]))
+        return Projection._make(
+            each[: len(flat)].reshape(points.shape[:-1]) for each in found
+        )
 
     def project(self, points: ArrayLike) -> Projection:
         """Nearest point of the polyline to each of `points` (..., 3), metres."""

@@ -253,6 +253,6 @@ def _check_fields(own: Sequence[Effect], devices: Effect, coaxial: bool) -> None
                 when = "of coaxial devices"
                 instead = "take friction, devices, lumen_friction and randomisation"
             raise ValueError(
-                f"{type(effect).__name__} writes {', '.join(lost)} {when}, which the "
-                f"devices write over in every control step; {instead}"
+                f"{type(effect).__name__} writes {', '.join(lost)} {when}, a field "
+                f"that the devices write in every control step; {instead}"
             )

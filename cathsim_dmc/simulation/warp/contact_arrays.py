@@ -83,12 +83,16 @@ class Motion(NamedTuple):
     subtree_com: Any
 
 
+# Numbers of a contact in `Found`.
+ROW = 8
+
+
 class Found(NamedTuple):
     """Contacts of all threads, before they are counted.
 
     Attributes:
         number: (T,) contacts of a thread.
-        rows: (T, MOST, 8) of each the distance m, the place (3) m, the direction (3)
+        rows: (T, MOST, ROW) of each the distance m, the place (3) m, the direction (3)
             from the link into the wall, and 1 where it shares its spring, else 0.
     """
 

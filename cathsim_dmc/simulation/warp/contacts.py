@@ -12,6 +12,7 @@ from cathsim_dmc.collision.fields import Registered, registered
 from cathsim_dmc.laws.planes import MOST
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.simulation.warp.contact_arrays import (
+    ROW,
     Contacts,
     Fields,
     Found,
@@ -127,7 +128,7 @@ class WallContacts:
         threads = self.num_worlds * self._host.dims.size
         found = Found(
             device.constant(np.zeros(threads, np.int32)),
-            device.constant(np.zeros((threads, MOST, 7))),
+            device.constant(np.zeros((threads, MOST, ROW))),
         )
         self._overflow = device.constant(np.zeros(self.num_worlds, np.int32))
         self._scene = Scene(self._links, self._walls, fields, motion, found)

@@ -168,7 +168,7 @@ class PassiveForces:
             there = type(given)._make(device.constant(np.array(each)) for each in given)
             law = add_drag if effect.adapter == "blood" else add_springs
             self._laws.append((law, given, there))
-            self._still &= type(effect) is not Flow
+            self._still &= not isinstance(effect, Flow)
 
     def bind(self, model: Any, data: Any, host: mujoco.MjModel) -> None:
         """Takes the arrays of Warp's model and data, which must not be replaced."""
