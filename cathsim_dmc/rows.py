@@ -54,7 +54,8 @@ def of_each(
         return
     cores = os.cpu_count() or 1
     # The results raise what the calls have raised.
-    list(_pool(os.getpid(), cores).map(lambda one: act(*one), held))
+    items, own = zip(*held, strict=True)
+    list(_pool(os.getpid(), cores).map(act, items, own))
 
 
 def _of(act: Callable, item: Any, own: np.ndarray, part: slice) -> Any:

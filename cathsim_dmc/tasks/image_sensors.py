@@ -13,7 +13,8 @@ from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.observation_kind import BIPLANE, FLUOROSCOPY
 
-_OF_IMAGES = ("image", "sequential", "biplane", "biplane_retry")
+_BIPLANE = ("biplane", "biplane_retry")
+_OF_IMAGES = ("image", "sequential", *_BIPLANE)
 _SHOWING = (*_OF_IMAGES, "segmentation")  # the vessel, too
 
 
@@ -79,9 +80,9 @@ class ImageSensors:
         """
         planes = [self.planes[index] for index in rows]
         own = [shadow.of(rows) for shadow in shadows]
-        if self._wants(*_SHOWING):
+        if self._wants(_SHOWING):
             planes = list(map(around, planes, rows.tolist()))
-        if self._wants(*_OF_IMAGES):
+        if self._wants(_OF_IMAGES):
             noise = None
             if random_states is not None and self._noise:
                 noise = [random_states[index] for index in rows]
@@ -92,7 +93,7 @@ class ImageSensors:
                 else:
                     last_one = self.images[f"past_{age - 1}"]
                     self.images[f"past_{age}"] = array_rows.copied(last_one)
-            if self._wants("biplane", "biplane_retry"):
+            if self._wants(_BIPLANE):
                 # The roadmaps show the vessel at rest.
                 resting = [self.planes[index] for index in rows]
                 marked = angiographs.pixels(resting, points[-1][rows, None])[:, :, 0]
@@ -103,11 +104,11 @@ class ImageSensors:
                     image, marked, handles[rows], rows, begins, last[rows],
                 )  # fmt: skip
                 for key, value in seen.items():
-                    if key != "place" or self._wants("biplane_retry"):
+                    if key != "place" or self._wants(("biplane_retry",)):
                         self.hold(f"biplane_{key}", value, rows)
-        if self._wants("segmentation"):
+        if self._wants(("segmentation",)):
             self.hold("masks", angiographs.masks(planes, own), rows)
-        if self._wants("tracking_2d"):
+        if self._wants(("tracking_2d",)):
             line, devices, goal = points
             seen = self._chain.tracked(line[rows]), devices[rows], goal[rows, None]
             pixels = angiographs.pixels(planes, np.concatenate(seen, axis=-2))
@@ -123,7 +124,7 @@ class ImageSensors:
         else:
             self.images[name][rows] = image
 
-    def _wants(self, *names: str) -> bool:
+    def _wants(self, names: Sequence[str]) -> bool:
         return any(name in self._names for name in names)
 
 
