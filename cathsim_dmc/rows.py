@@ -54,7 +54,7 @@ def of_each(
         return
     cores = os.cpu_count() or 1
     # The results raise what the calls have raised.
-    items, own = zip(*held, strict=True)
+    items, own = [one for one, _ in held], [part for _, part in held]
     list(_pool(os.getpid(), cores).map(act, items, own))
 
 
