@@ -378,6 +378,8 @@ def as_json(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Options as they are read from JSON, and those that are objects, as they are."""
     plain, objects = dict[str, Any](), dict[str, Any]()
     for name, value in given.items():
+        if isinstance(value, np.generic | np.ndarray):
+            value = value.tolist()  # noqa: PLW2901
         try:
             plain[name] = json.loads(json.dumps(value, default=_as_mapping))
         except (TypeError, ValueError):
@@ -385,10 +387,8 @@ def as_json(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     return plain, objects
 
 
-def _as_mapping(value: Any) -> Any:
-    """An option that is a dataclass, as the mapping that makes it again; numpy's."""
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
+def _as_mapping(value: Any) -> dict[str, Any]:
+    """An option that is a dataclass, as the mapping that makes it again."""
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         raise TypeError
     return dataclasses.asdict(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import twin
 
-from cathsim_dmc import suite
+from cathsim_dmc import bounds, suite
 from cathsim_dmc.agents.protocols import VARIED_RANGES
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.physics.vessel import VesselOptions
@@ -247,3 +247,8 @@ def test_objects_among_the_options_are_named(tmp_path):
     assert not files._whole and "object" in files._options["effects"][0]
     files = error_files.ErrorFiles(tmp_path, "simple1_bca", {"rotation": True})
     assert files._whole and files._options == {"rotation": True}
+
+
+def test_numbers_of_numpy_are_options():
+    given = {"max_steps": np.int64(3), "goal": np.array([1.0, 2.0, 3.0])}
+    assert bounds.as_json(given) == ({"max_steps": 3, "goal": [1.0, 2.0, 3.0]}, {})
