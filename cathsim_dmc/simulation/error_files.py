@@ -5,6 +5,7 @@
 
 import contextlib
 import dataclasses
+import json
 import logging
 import os
 import uuid
@@ -124,7 +125,7 @@ class ErrorFiles:
         """Takes the name and options of the task, which make it again."""
         self.folder, self._task = Path(folder), task
         self._options, objects = bounds.as_json(options or {})
-        self._options |= {name: repr(value) for name, value in objects.items()}
+        self._options |= json.loads(json.dumps(objects, default=repr))
         self._whole = not objects
 
     def before(self, rollout: Rollout) -> Snapshot:
