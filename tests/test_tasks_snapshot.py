@@ -200,7 +200,7 @@ DERIVED = {
     "ImageSensors": {"planes", "thirds"},
     "BiplaneSight": {"_machines"},
     "Moving": {"_motions", "_surfaces", "_alike", "inlets"},
-    "Flow": {"_circulations", "_murray", "_alike"},
+    "Flow": {"_circulations", "_alike"},
     "Wall": {"_fields", "_places"},
     # Scratch, and views of the model.
     "SingleDevice": {"_steering", "_held", "_sheathed", "_hinged"},

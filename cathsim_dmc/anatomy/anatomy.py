@@ -1,6 +1,5 @@
 """The anatomy as the simulator sees it, lumen, inlet and goals: metres, frame LPS."""
 
-import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -107,16 +106,7 @@ class Anatomy:
     @cached_property
     def digest(self) -> str:
         """Eight hexadecimal digits that tell its lumen from others."""
-        digest, scan = hashlib.sha256(), self.scan
-        for name, vessel in self.tree.vessels.items():
-            line = vessel.centreline
-            numbers = *line.points.ravel(), *line.radii, vessel.ostium
-            digest.update(f"{name} {vessel.parent}".encode())
-            digest.update(np.round(1e9 * np.array(numbers)).astype(np.int64).tobytes())
-        if scan is not None:
-            vertices = np.round(1e9 * scan.vertices).astype(np.int64)
-            digest.update(vertices.tobytes() + scan.faces.astype(np.int64).tobytes())
-        return digest.hexdigest()[:8]
+        return field_cache.shipped_name(self.scan or self.tree, self.ends)[:8]
 
     @cached_property
     def surface(self) -> Surface:
@@ -128,7 +118,14 @@ class Anatomy:
     @cached_property
     def circulation(self) -> Circulation:
         """Distribution of the inflow among the vessels."""
-        return Circulation.of(self.tree, murray=self.scan is not None)
+        if self.scan is not None:
+            return self.murray_circulation
+        return Circulation.of(self.tree)
+
+    @cached_property
+    def murray_circulation(self) -> Circulation:
+        """Distribution of the inflow by Murray's law among all vessels."""
+        return Circulation.of(self.tree, murray=True)
 
     @cached_property
     def motion(self) -> Motion:

@@ -85,19 +85,15 @@ class Flow(StillBlood):
         radii = world.model.geom_size[world.index.geoms, 0]
         self._link_radii = np.tile(radii, (world.num_simulations, 1))
         self._circulations: dict[int, Circulation] = {}
-        self._murray: dict[int, tuple[Anatomy, Circulation]] = {}
         self._alike: list[tuple[Circulation, np.ndarray]] | None = None
         self._wave_speed = np.ones(world.num_simulations)
         self.radius = np.zeros(self._link_radii.shape)
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Fills the vessels of an anatomy."""
-        self._circulations[index], self._alike = anatomy.circulation, None
-        if self._options is not None and self._options.split == "murray":
-            if id(anatomy) not in self._murray:
-                made = Circulation.of(anatomy.tree, True)
-                self._murray[id(anatomy)] = anatomy, made
-            self._circulations[index] = self._murray[id(anatomy)][1]
+        murray = self._options is not None and self._options.split == "murray"
+        blood = anatomy.murray_circulation if murray else anatomy.circulation
+        self._circulations[index], self._alike = blood, None
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Draws rate, peak and phase of the heart, and pulse wave velocity."""

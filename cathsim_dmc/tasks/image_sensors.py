@@ -104,11 +104,11 @@ class ImageSensors:
                     image, marked, handles[rows], rows, begins, last[rows],
                 )  # fmt: skip
                 for key, value in seen.items():
-                    if key != "place" or self._wants(("biplane_retry",)):
+                    if key != "place" or "biplane_retry" in self._names:
                         self.hold(f"biplane_{key}", value, rows)
-        if self._wants(("segmentation",)):
+        if "segmentation" in self._names:
             self.hold("masks", angiographs.masks(planes, own), rows)
-        if self._wants(("tracking_2d",)):
+        if "tracking_2d" in self._names:
             line, devices, goal = points
             seen = self._chain.tracked(line[rows]), devices[rows], goal[rows, None]
             pixels = angiographs.pixels(planes, np.concatenate(seen, axis=-2))

@@ -44,6 +44,7 @@ class Navigation(composer.Task):
 
     Attributes:
         config: Options.
+        options: What `suite.make_task` was given; empty for a task made without it.
         num_actions: A, entries of an action.
         rollout: The course of the episode; there once an environment has compiled the
             model, as is

@@ -225,13 +225,14 @@ class Rollout(Restorable):
             )
         self._open[:] = True
         self._previous_action, self._action = self._action, action
-        if self._config.effects:  # which may write into what they get
+        own = self._config.effects
+        if own:  # which may write into what they get
             action = action.copy()
         for effect in self.effects:
-            if effect is self._devices and self._config.effects:
+            if own and effect is self._devices:
                 action = np.clip(action, -1.0, 1.0)
             action = effect.act(action, self.readings)
-            if effect is not self._devices:
+            if own and effect is not self._devices:
                 check_action(effect, action, self._action.shape)
         self._stepper.begin(action)
 

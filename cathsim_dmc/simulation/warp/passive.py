@@ -153,8 +153,8 @@ class PassiveForces:
             NotImplementedError: if there is a law that is not simulated on Warp.
         """
         self._device, self._places, self._count = device, places, count
-        self._laws: list[tuple[Any, Any, Any]] = []
-        self._still = True
+        # With each whether its parameters change within an episode.
+        self._laws: list[tuple[Any, Any, Any, bool]] = []
         for effect in effects:
             if effect.adapter not in ("blood", "springs"):
                 has_law = effect.law is not None or effect.adapter is not None
@@ -167,8 +167,8 @@ class PassiveForces:
             given = effect.world.parameters
             there = type(given)._make(device.constant(np.array(each)) for each in given)
             law = add_drag if effect.adapter == "blood" else add_springs
-            self._laws.append((law, given, there))
-            self._still &= not isinstance(effect, Flow)
+            changes = law is add_springs or isinstance(effect, Flow)
+            self._laws.append((law, given, there, changes))
 
     def bind(self, model: Any, data: Any, host: mujoco.MjModel) -> None:
         """Takes the arrays of Warp's model and data, which must not be replaced."""
@@ -202,7 +202,7 @@ class PassiveForces:
             ]
         )
         self._calls = [
-            (law, Given(there, arrays, memory)) for law, _, there in self._laws
+            (law, Given(there, arrays, memory)) for law, _, there, _ in self._laws
         ]
 
     def write(self, whole: bool) -> None:
@@ -211,8 +211,8 @@ class PassiveForces:
         Args:
             whole: Whether those have changed that stay the same in an episode, too.
         """
-        for law, given, there in self._laws:
-            if not whole and law is add_drag and self._still:
+        for _, given, there, changes in self._laws:
+            if not (whole or changes):
                 continue
             for values, array in zip(given, there, strict=True):
                 self._device.write(array, values)
