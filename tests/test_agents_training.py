@@ -124,6 +124,32 @@ def test_what_a_critic_cannot_read_is_refused(tmp_path, observation, critic):
         run(config, tmp_path)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [small_ppo, small_sac])
+def test_a_compiled_loss_has_the_same_gradients(tmp_path, make):
+    weights, figures = [], []
+    for compiled in (False, True):
+        out = tmp_path / str(compiled)
+        run(make(total_frames=1_024, torch_compile=compiled), out)
+        weights.append(Checkpoint.open(out).policy_state())
+        figures.append(without_clocks(read_metrics(out / "metrics.csv"))[-1])
+    torch.testing.assert_close(*weights, rtol=1e-3, atol=1e-5)
+    assert figures[1] == pytest.approx(figures[0], rel=1e-3, abs=1e-5, nan_ok=True)
+    # Either goes on from the other.
+    run(make(total_frames=1_280), tmp_path / "True", resume=True)
+
+
+def test_a_compiled_loss_needs_a_compiler(tmp_path, monkeypatch):
+    def missing(*args):
+        raise RuntimeError("No working C++ compiler found")
+
+    monkeypatch.setattr(torch, "compile", missing)
+    said = "torch_compile=True needs a C\\+\\+ compiler .*; leave it out: No working"
+    with pytest.raises(ConfigError, match=said):
+        run(small_ppo(torch_compile=True), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("make", [small_ppo, small_sac])
 def test_same_seed_same_run(tmp_path, make):
     config = make(total_frames=1_024)

@@ -187,7 +187,10 @@ TRAINING = {
     "collector": word(),
     "collectors": whole(1),
 }
-CRITIC = {"critic_observation": st.sampled_from(["", 1, [], [1], {}, 1.5, (), True])}
+CRITIC = {
+    "critic_observation": st.sampled_from(["", 1, [], [1], {}, 1.5, (), True]),
+    "torch_compile": st.sampled_from(["", 1, [], 0, None, "yes", 1.5]),
+}
 PPO = CRITIC | {
     "steps_per_update": whole(1),
     "minibatch_size": whole(1),

@@ -1,17 +1,21 @@
 """MuJoCo Warp on the CPU against `mujoco.batch`, with the same laws and actions."""
 
+import gc
 import importlib.util
 import sys
+import weakref
 
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 # isort: off
 # torchrl goes before dm_control.
 from cathsim_dmc import agents
 from cathsim_dmc.agents.contact_log import ContactLog
 from cathsim_dmc.simulation import environments
+from cathsim_dmc.simulation.torchrl import BatchedEnv
 
 # isort: on
 from cathsim_dmc import suite
@@ -201,6 +205,30 @@ def test_parameters_of_contacts_are_mixed_as_in_mujoco():
     assert dims == {0: links.dims[0, 0], 1: links.dims[0, 1]}
     assert links.mix[0, 0] == 0.25
     assert links.priorities.tolist() == [[0, 1]]
+
+
+@pytest.mark.slow
+@needs_warp
+def test_a_device_gives_its_memory_back():
+    """At once: what the collector frees may end the capture of another graph."""
+    env = BatchedEnv("type1_lcca", 1, device="warp:cpu")
+    stepper = env.simulation.stepper
+    kept, closed = env.rand_step(env.reset()), []
+    for _ in range(2):
+        worlds = weakref.ref(stepper._worlds)
+        state = stepper.states()
+        gc.disable()
+        try:
+            stepper.close()
+            closed.append(worlds() is None)
+        finally:
+            gc.enable()
+        after = env.step(kept)
+        stepper.set_states(np.arange(1), state)
+        torch.testing.assert_close(env.step(kept)["next"], after["next"])
+    assert closed == [True, True]
+    env.close()
+    assert stepper._worlds is None
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import abc
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -83,6 +83,10 @@ class Learner(abc.ABC):
             chosen = [*self._policy_normalisers, *chosen]
         for module in chosen:
             module(batch)
+
+    def compiled(self, loss: nn.Module) -> Callable[[TensorDictBase], TensorDictBase]:
+        """A loss, compiled by torch where the settings say so."""
+        return torch.compile(loss) if self.config.torch_compile else loss
 
     def descend(self, loss: torch.Tensor, max_norm: float = math.inf) -> torch.Tensor:
         """Take a gradient step, with a gradient of `max_norm` at most; its norm."""

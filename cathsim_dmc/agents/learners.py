@@ -1,5 +1,6 @@
 """The algorithms by name: a new one is two classes and a line here."""
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -59,14 +60,21 @@ def check_usable(config: TrainingConfig) -> None:
     """Refuses settings that cannot be used here.
 
     Raises:
-        ConfigError: modules, device, logger or collectors cannot; says what can.
+        ConfigError: modules, device, compiler, logger or collectors cannot; says what
+            can.
         DatasetError: there are no demonstrations where they must be.
     """
     if config.modules:
         suite.known(config.task, config.modules)
     text = f"torch_device={config.torch_device!r} cannot be used here, 'cpu' always can"
     with files.refused(ConfigError, text, (RuntimeError, AssertionError)):
-        torch.zeros(1, device=config.torch_device)
+        one = torch.zeros(1, device=config.torch_device)
+    if getattr(config, "torch_compile", False):
+        text = "torch_compile=True needs a C++ compiler for torch; leave it out"
+        with files.refused(ConfigError, text, RuntimeError), warnings.catch_warnings():
+            # Torch warns of what it imports itself.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            torch.compile(torch.neg)(one)
     loggers.require(config.logger)
     shown = getattr(config, "demonstrations", None)
     if shown or config.algorithm == "bc":

@@ -154,6 +154,7 @@ class PPO(Learner):
             # gradient step.
             functional=False,
         )
+        self.losses = self.compiled(self.loss)
         self.advantage = GAE(
             gamma=config.gamma, lmbda=config.gae_lambda, value_network=None
         )
@@ -226,7 +227,7 @@ class PPO(Learner):
         return float(1.0 - left / target.var().clamp_min(1e-12))
 
     def _step(self, minibatch: TensorDictBase) -> dict[str, torch.Tensor]:
-        losses = self.loss(minibatch)
+        losses = self.losses(minibatch)
         loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
         norm = self.descend(loss, self.config.max_grad_norm)
         return {**{name: losses[name].detach() for name in _TERMS}, "grad_norm": norm}

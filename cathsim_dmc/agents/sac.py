@@ -113,6 +113,7 @@ class SAC(Learner):
             target_entropy=-float(shapes.actions) if target is None else target,
         )
         self.loss.make_value_estimator(gamma=config.gamma)
+        self.losses = self.compiled(self.loss)
         self.targets = SoftUpdate(self.loss, tau=config.tau)
         self.optimiser = torch.optim.Adam(
             [p for p in self.loss.parameters() if p.requires_grad],
@@ -152,7 +153,7 @@ class SAC(Learner):
         sample = self._sample(self.config.batch_size).to(self.device)
         self.normalise(sample)
         self.normalise(sample["next"])
-        losses = self.loss(sample)
+        losses = self.losses(sample)
         # Each term has gradients for its own parameters only, so one sum serves.
         loss = losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]
         self.descend(loss)

@@ -240,6 +240,9 @@ class BatchSimulation:
                 "the batch after the fork, or start processes by spawn"
             )
 
+    def close(self) -> None:
+        """Lets the memory of a GPU go, where one simulates."""
+
     def contacts(self) -> forces.Contacts:
         """Contacts with the wall in the last physics step, arrays (N, K, ...)."""
         return forces.Contacts.from_sensor(self.stepper.last_contacts)

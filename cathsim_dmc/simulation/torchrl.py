@@ -110,6 +110,11 @@ class BatchedEnv(EnvBase):
         """
         return self.reset(snapshot=snapshot)
 
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Lets the memory of a GPU go."""
+        self.simulation.close()
+        super().close(raise_if_closed=raise_if_closed)
+
     def record_errors(self, folder: str | Path) -> None:
         """Writes physics errors to a folder from now on, see `error_files`.
 

@@ -7,8 +7,11 @@ for the GPU and launches it on Warp's stream, so that a captured CUDA graph has 
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import gc
 import importlib
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -48,18 +51,41 @@ class Device:
             bounds.refuse("device", name, f"one of this machine: {', '.join(names)}")
         self.name, self.is_cuda = alias, alias != "cpu"
 
+    def active(self) -> Any:
+        """A context in which it is the device of Warp and of numba-cuda."""
+        return self._warp.ScopedDevice(self.name)
+
+    @contextlib.contextmanager
+    def captured(self) -> Iterator[Any]:
+        """Captures what is launched as a CUDA graph, `graph` of what is given.
+
+        Nothing is freed meanwhile: CUDA ends a capture in which memory is.
+        """
+        collects = gc.isenabled()
+        gc.collect()
+        gc.disable()
+        try:
+            with self.active(), _cuda().defer_cleanup():
+                with self._warp.ScopedCapture() as capture:
+                    yield capture
+        finally:
+            if collects:
+                gc.enable()
+
     def constant(self, values: np.ndarray) -> Any:
         """A copy of an array on the device, for thread functions."""
         values = np.ascontiguousarray(values)
         if not self.is_cuda:
             return values.copy()
-        return _cuda().to_device(values)
+        with self.active():
+            return _cuda().to_device(values)
 
     def view(self, array: Any) -> Any:
         """Warp's array as thread functions take it, without a copy."""
         if not self.is_cuda:
             return array.numpy()
-        return _cuda().as_cuda_array(array)
+        with self.active():
+            return _cuda().as_cuda_array(array)
 
     def zeros(self, size: int) -> Any:
         """Warp's array of whole numbers, all 0."""
@@ -72,13 +98,17 @@ class Device:
     def write(self, array: Any, values: np.ndarray) -> None:
         """Writes into what `constant` returned."""
         if self.is_cuda:
-            array.copy_to_device(np.ascontiguousarray(values, array.dtype))
+            with self.active():
+                array.copy_to_device(np.ascontiguousarray(values, array.dtype))
         else:
             array[...] = values
 
     def host(self, array: Any) -> np.ndarray:
         """What `constant` returned, on the host, a copy."""
-        return array.copy_to_host() if self.is_cuda else array.copy()
+        if not self.is_cuda:
+            return array.copy()
+        with self.active():
+            return array.copy_to_host()
 
     def launch(self, function: Any, count: int, scratch: Scratch, given: Any) -> None:
         """Runs `function(thread, scratch, given)` in many threads.
@@ -98,7 +128,8 @@ class Device:
         stream = _cuda().external_stream(self._warp.get_stream(self.name).cuda_stream)
         # Few threads are spread over all processors of the GPU.
         block = _THREADS if count > _MANY else 32
-        kernel[(count + block - 1) // block, block, stream](count, given)
+        with self.active():
+            kernel[(count + block - 1) // block, block, stream](count, given)
 
 
 def _cuda() -> Any:

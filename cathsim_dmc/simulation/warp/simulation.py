@@ -52,3 +52,7 @@ class WarpSimulation(BatchSimulation):
     def _made_stepper(self, num_simulations: int, num_threads: int) -> WarpStepper:
         task, model = self.task, self._model
         return WarpStepper(task, model, num_simulations, self._device, num_threads)
+
+    def close(self) -> None:
+        """Lets the memory of the device go; the next step takes it anew."""
+        self.stepper.close()

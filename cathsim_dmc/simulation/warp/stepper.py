@@ -178,6 +178,7 @@ class WarpStepper(Stepper):
     def run(self) -> None:
         """Does the physics steps of a control step on the device."""
         if self._worlds is None or not self.contacts.is_bound:
+            self.close()
             laws = self.contacts, self._passive
             self._worlds = Worlds(
                 self._device, self._model, self._own, laws, self.substeps
@@ -196,6 +197,12 @@ class WarpStepper(Stepper):
         self._stale = False
         self._on_device[:] = True
         self._note(totals.diverged != 0, worlds.overflowed())
+
+    def close(self) -> None:
+        """Lets the memory of the device go; the next step takes it anew."""
+        if self._worlds is not None:
+            self._worlds.close()
+            self._worlds = None
 
     def _note(self, diverged: np.ndarray, lost: np.ndarray) -> None:
         """Counts worlds that diverged, put back to where they began, and overflows."""

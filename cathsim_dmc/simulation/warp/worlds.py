@@ -65,7 +65,7 @@ class Worlds:
         prepared.opt.jacobian = kind.value
         wall = model.sensor("wall_contacts")
         start, size = int(wall.adr[0]), int(wall.dim[0])
-        with self._warp.ScopedDevice(device.name):
+        with device.active():
             self.model = self._mjwarp.put_model(prepared)
             self.model.opt.contact_sensor_maxmatch = max(size // 14, CONTACTS)
             self.model.opt.warn_overflow = 0  # counted instead
@@ -87,6 +87,12 @@ class Worlds:
         self._staged: dict[str, Any] = {}
         self._graph: Any = None
         self.seconds: dict[str, float] = {}
+
+    def close(self) -> None:
+        """Lets its memory go, which the callbacks of its own model hold otherwise."""
+        self.model.callback.contactfilter = self.model.callback.passive = None
+        self._graph = None
+        self._staged.clear()
 
     def _act(self, model: Any, data: Any) -> None:
         """What mujoco_warp calls at the end of its own passive forces."""
@@ -172,7 +178,7 @@ class Worlds:
         """Does the physics steps of a control step."""
         self._reduction.begin()
         self._contacts.begin()
-        with self._warp.ScopedDevice(self._device.name):
+        with self._device.active():
             if not self._device.is_cuda:
                 self._steps()
                 return
@@ -190,8 +196,10 @@ class Worlds:
         option, without = self.model.opt, mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         kept, option.run_rne_postconstraint = option.disableflags, last
         option.disableflags = kept if last else kept | without
-        self._mjwarp.step(self.model, self.data)
-        option.disableflags = kept
+        try:
+            self._mjwarp.step(self.model, self.data)
+        finally:
+            option.disableflags = kept
         self._reduction.add()
 
     def _captured(self) -> Any:
@@ -200,7 +208,8 @@ class Worlds:
         for last in (False, True):  # compiles what is not compiled yet
             self._step(last)
         self._reduction.end()
-        with self._warp.ScopedCapture() as capture:
+        self.wait()
+        with self._device.captured() as capture:
             self._steps()
         for name, array in kept.items():
             self._warp.copy(getattr(self.data, name), array)
@@ -244,7 +253,15 @@ class Worlds:
             out: Gets them.
             chosen: (N,) bool.
         """
-        np.copyto(out, self.data.sensordata.numpy(), where=chosen[:, None])
+        staged = self._stage("sensordata", self.data.sensordata)
+        self._warp.copy(staged, self.data.sensordata)
+        self.wait()
+        there = staged.numpy()
+
+        def convert(own: slice) -> None:
+            np.copyto(out[own], there[own], where=chosen[own, None])
+
+        rows.each(len(out), convert)
 
     def overflowed(self) -> np.ndarray:
         """(N,) whether a world had too many contacts or rows in the control step."""
