@@ -1,9 +1,13 @@
 """Scans that cannot be used: each refused in its own words, with nothing written."""
 
 import json
+from pathlib import Path
 
 import numpy as np
+import pytest
 from synthetic_scans import marched, write_obj, y_tree
+
+from cathsim_dmc.validation.checks import Report
 
 
 def scans(vertices, faces):
@@ -54,3 +58,50 @@ def test_bad_scans_are_told_apart_and_leave_nothing(tmp_path, monkeypatch, caths
         assert sorted(folder.iterdir()) == before, "something was written"
     assert len(set(said.values())) == len(said) == 10, said
     assert not list((tmp_path / "cache" / "cathsim_dmc").glob("**/*"))
+
+
+@pytest.mark.parametrize("more", [(), ("--out", "./type1")])
+def test_an_import_is_not_called_as_a_phantom_is(tmp_path, monkeypatch, cathsim, more):
+    """Tasks would take the phantom, and its picture would replace the patient's."""
+    monkeypatch.chdir(tmp_path)
+    write_obj(tmp_path / "type1.obj", *marched(y_tree(), 4e-3))
+    code, _, err = cathsim("phantom", "import", "type1.obj", *more)
+    assert code == 2 and "as a phantom is" in err and "(--out), such as" in err
+    assert not (tmp_path / "type1").exists()
+    (tmp_path / "simple1").mkdir()
+    measured = Report("wall", [], {"simple1": {"measures": {}}})
+    monkeypatch.setattr(
+        "cathsim_dmc.validation.wall.validate_anatomy", lambda anatomy: measured
+    )
+    assert cathsim("phantom", "check", "simple1", "--json")[0] == 0
+    assert not list((tmp_path / "simple1").iterdir())
+
+
+def test_a_folder_of_images_is_told_from_a_folder_in_the_way(
+    tmp_path, monkeypatch, cathsim
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dicom").mkdir()
+    code, _, err = cathsim("phantom", "import", "dicom")
+    assert code == 2 and "dicom is a directory; give one file" in err
+    write_obj(tmp_path / "dicom.obj", *marched(y_tree(), 4e-3))
+    code, _, err = cathsim("phantom", "import", "dicom.obj")
+    assert code == 2 and "dicom exists and is no anatomy" in err
+
+
+def test_an_option_given_again_adds_its_values(tmp_path, monkeypatch, cathsim):
+    """Only the last counted: of a lumen of two labels one was imported."""
+    seen = {}
+
+    def imported(mesh, curves, **options):
+        seen.update(options, curves=curves)
+        raise ValueError("seen")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("cathsim_dmc.cli.phantoms.import_scan", imported)
+    words = "--label 52 54 --label 55 --rename a=b --rename c=d e=f"
+    words += " --centreline x.csv --centreline y.csv"
+    assert cathsim("phantom", "import", "scan.nii", *words.split())[0] == 2
+    assert seen["labels"] == (52, 54, 55)
+    assert seen["rename"] == {"a": "b", "c": "d", "e": "f"}
+    assert seen["curves"] == (Path("x.csv"), Path("y.csv"))

@@ -1,5 +1,6 @@
 """Files of other programs: VTK's surfaces and centrelines, label maps, and images."""
 
+import struct
 import zlib
 
 import numpy as np
@@ -147,6 +148,26 @@ def test_label_maps_of_itk_lie_where_they_were_saved(tmp_path, kind):
     assert len(faces) > 100 and "label 1" in why
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_an_image_of_itk_that_is_cut_off_is_refused(tmp_path, packed):
+    """What is missing would have any values."""
+    pytest.importorskip("vtkmodules")
+    path = meta(tmp_path / "map.mha", ball(), packed=packed)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match="read as MHA: it is damaged or cut off"):
+        label_surface(path)
+
+
+def test_labels_of_few_voxels_are_refused(tmp_path):
+    nrrd = pytest.importorskip("nrrd")
+    voxels = ball()
+    voxels[2, 2, 2] = 9
+    header = {"space": "left-posterior-superior", "space directions": np.eye(3)}
+    nrrd.write(str(tmp_path / "map.nrrd"), voxels, header)
+    with pytest.raises(ValueError, match=r"label 9 of .* has 1 voxels, .*\(--label\)"):
+        label_surface(tmp_path / "map.nrrd", (9,))
+
+
 def test_a_header_names_no_file_elsewhere(tmp_path):
     nrrd = pytest.importorskip("nrrd")
     path = tmp_path / "map.nhdr"
@@ -184,3 +205,49 @@ def test_images_are_told_from_label_maps(tmp_path, image, words):
     labels[2:20:3] = 7
     nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), path)
     assert "label 300" in label_surface(path, (300,)).notes[0]
+
+
+def polygons(path, points, rows, order="<"):
+    """A binary PLY file of polygons, with a colour behind each."""
+    kind = "little" if order == "<" else "big"
+    head = [
+        "ply",
+        f"format binary_{kind}_endian 1.0",
+        f"element vertex {len(points)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        f"element face {len(rows)}",
+        "property list uchar int vertex_indices",
+        "property uchar red",
+        "end_header\n",
+    ]
+    corners = (struct.pack(f"{order}B{len(row)}iB", len(row), *row, 7) for row in rows)
+    data = np.asarray(points, f"{order}f8").tobytes() + b"".join(corners)
+    path.write_bytes("\n".join(head).encode() + data)
+    return path
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_polygons_of_a_binary_ply_differ_in_their_corners(tmp_path, order):
+    """As Blender writes them: quads along a vessel, and one polygon for each cap."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 9)[:-1]
+    ring = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    points = np.concatenate([ring + (0.0, 0.0, z) for z in range(4)])
+    sides = [
+        (8 * z + k, 8 * z + (k + 1) % 8, 8 * z + 8 + (k + 1) % 8, 8 * z + 8 + k)
+        for z in range(3)
+        for k in range(8)
+    ]
+    rows = [range(7, -1, -1), *sides[:9], sides[9][:3], *sides[10:], range(24, 32)]
+    rows.append((sides[9][0], *sides[9][2:]))
+    path = polygons(tmp_path / "lumen.ply", points, rows, order)
+    vertices, faces = read_triangles(path)
+    assert len(faces) == 2 * 24 + 2 * 6
+    corners = vertices[faces]
+    volume = np.linalg.det(corners).sum() / 6.0
+    assert volume == pytest.approx(3.0 * 8.0 * np.sin(np.pi / 4) / 2.0)
+    whole = path.read_bytes()
+    path.write_bytes(whole + b"\n")
+    assert len(read_triangles(path)[1]) == len(faces)
+    path.write_bytes(whole[:-20])
+    with pytest.raises(ValueError, match="it ends early, 2 of 27 rows are missing"):
+        read_triangles(path)

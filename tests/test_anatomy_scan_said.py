@@ -6,14 +6,14 @@ import re
 import numpy as np
 import pytest
 import trimesh
-from synthetic_scans import marched, write_obj, y_tree
+from synthetic_scans import marched, write_markup, write_obj, y_tree
 from test_anatomy_scan_files import ball, poly_data, written
 
 from cathsim_dmc.anatomy.scan import topology
-from cathsim_dmc.anatomy.scan.curves import read_curve
+from cathsim_dmc.anatomy.scan.curves import read_curve, read_curves
 from cathsim_dmc.anatomy.scan.labels import label_surface
 from cathsim_dmc.anatomy.scan.lumen import guess_units, read_lumen
-from cathsim_dmc.anatomy.scan.mesh import read_triangles, stated_frame
+from cathsim_dmc.anatomy.scan.mesh import read_triangles, stated_frame, stem
 from cathsim_dmc.anatomy.scan.repair import mend
 
 SIZE = 12e-3  # m, of the ball of `ball`
@@ -224,10 +224,76 @@ def test_whole_files_that_look_cut_off_are_read(y_mesh, tmp_path):
     assert len(read_triangles(solid)[1]) == len(faces)
 
 
+def test_white_space_of_an_obj_may_be_any(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    path = write_obj(tmp_path / "lumen.obj", vertices, faces)
+    text = path.read_text()
+    for changed in (text.replace(" ", "\t"), text.replace("\n", "\n  ")):
+        path.write_text(changed.rstrip(" "))
+        assert len(read_triangles(path)[1]) == len(faces)
+
+
+def test_corners_of_an_obj_are_counted_back_from_where_they_stand(y_mesh, tmp_path):
+    """Two objects, each with its points and then its triangles."""
+    vertices, faces = y_mesh
+    lines = []
+    for points in (vertices, vertices + (90.0, 0.0, 0.0)):
+        lines += [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in points]
+        lines += [f"f {a}/1 {b}/1 {c}/1" for a, b, c in faces - len(vertices)]
+    path = tmp_path / "lumen.obj"
+    path.write_text("\n".join(lines) + "\n")
+    points, triangles = read_triangles(path)
+    both = np.concatenate([vertices[faces], vertices[faces] + (90.0, 0.0, 0.0)])
+    np.testing.assert_allclose(points[triangles], both, atol=1e-4)
+    path.write_text("\n".join(lines).replace(" -1/", " 0/"))
+    with pytest.raises(ValueError, match="names point 0; OBJ counts from 1"):
+        read_triangles(path)
+
+
+def test_points_of_no_triangle_do_not_count_for_the_size(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    far = np.append(vertices, [[0.0, 0.0, 9000.0]], axis=0)
+    trimesh.Trimesh(far, faces, process=False).export(tmp_path / "far.ply")
+    assert read_lumen(tmp_path / "far.ply").units == "mm"
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.export(tmp_path / "lumen.ply", encoding="ascii")
+    text = (tmp_path / "lumen.ply").read_text().rstrip()
+    for corner in (len(vertices), -1):
+        (tmp_path / "bad.ply").write_text(f"{text[: text.rindex(' ')]} {corner}\n")
+        with pytest.raises(ValueError, match="bad.ply has triangles that name points"):
+            read_lumen(tmp_path / "bad.ply")
+
+
+def test_bytes_behind_an_stl_are_no_triangles(y_mesh, tmp_path):
+    path = tmp_path / "lumen.stl"
+    trimesh.Trimesh(*y_mesh, process=False).export(path)
+    path.write_bytes(path.read_bytes() + b"\r\n")
+    assert len(read_triangles(path)[1]) == len(y_mesh[1])
+    # Of text, what is empty has no last line.
+    path.write_bytes(b"solid lumen\n" + b"\n" * 9000)
+    with pytest.raises(ValueError, match="it ends early, without 'endsolid'"):
+        read_triangles(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [
+        ("lumen.stl", "lumen"),
+        ("patient.v2.STL", "patient.v2"),
+        ("a/labels.nii.gz", "labels"),
+        ("ct.1.seg.nrrd", "ct.1"),
+        (".lumen.stl", ".lumen"),
+    ],
+)
+def test_only_the_ending_of_a_name_is_left_out(name, wanted):
+    assert stem(name) == wanted
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
         ("a.stl", b"<!DOCTYPE html>\n<html></html>\n" * 9, "content is no STL"),
+        ("0.stl", b"\0" * 999, "name it after its format"),
         ("b.stl", b"v 1 2 3\nv 4 5 6\nv 7 8 9\nf 1 2 3\n" * 9, "begins with 'v 1 2 3"),
         ("c.vtu", b"<VTKFile>", "extract its surface first"),
         ("d.stl.gz", b"\x1f\x8b", "unpack it first"),
@@ -327,6 +393,22 @@ def test_tables_that_do_not_say_are_refused(tmp_path, text, words):
     (tmp_path / "lcca.csv").write_text(text)
     with pytest.raises(ValueError, match=words):
         read_curve(tmp_path / "lcca.csv")
+
+
+@pytest.mark.parametrize("name", ["Centerline curve.mrk.json", "頸動脈.mrk.json"])
+def test_a_file_that_names_no_vessel_is_refused(tmp_path, name):
+    path = write_markup(tmp_path / name, WAY)
+    with pytest.raises(ValueError, match="is not called after a vessel; rename the"):
+        read_curves([path], "mm", "LPS", None)
+
+
+def test_points_of_a_curve_that_are_not_placed_are_left_out(tmp_path):
+    path = write_markup(tmp_path / "lcca.mrk.json", WAY)
+    markup = json.loads(path.read_text())
+    place = {"position": [0.0, 0.0, 0.0], "positionStatus": "undefined"}
+    markup["markups"][0]["controlPoints"].insert(1, place)
+    path.write_text(json.dumps(markup))
+    np.testing.assert_allclose(read_curve(path), 1e-3 * WAY)
 
 
 @pytest.mark.slow

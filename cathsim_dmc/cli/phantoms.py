@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,6 +14,7 @@ from cathsim_dmc.anatomy import phantoms as shipped
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.scan.importer import import_scan
+from cathsim_dmc.anatomy.scan.mesh import stem
 from cathsim_dmc.anatomy.scan.places import describe
 from cathsim_dmc.anatomy.tree_file import read_tree
 from cathsim_dmc.cli.options import (
@@ -27,6 +29,10 @@ from cathsim_dmc.entities import devices
 from cathsim_dmc.pictures.anatomies import anatomy_figure
 
 phantoms = SubcommandApp()
+# Values of an option that takes several, and may be given again.
+_Paths = Annotated[tuple[tuple[Path, ...], ...], conf.UseAppendAction]
+_Numbers = Annotated[tuple[tuple[int, ...], ...], conf.UseAppendAction]
+_Words = Annotated[tuple[tuple[str, ...], ...], conf.UseAppendAction]
 _FIRST = ("lcca", "bca")  # goals that are tried first
 _FILE, _PICTURE = "anatomy.npz", "check.png"  # of an anatomy: itself, three views
 
@@ -36,15 +42,15 @@ def import_phantom(
     mesh: Annotated[Path, conf.Positional],
     /,
     out: Path | None = None,
-    centreline: tuple[Path, ...] = (),
+    centreline: _Paths = (),
     name: str | None = None,
     units: Literal["mm", "cm", "m", "um", "inch"] | None = None,
     frame: Literal["LPS", "RAS"] | None = None,
     axes: str | None = None,
-    label: tuple[int, ...] = (),
+    label: _Numbers = (),
     inlet: tuple[float, float, float] | None = None,
     heart: tuple[float, float, float] | None = None,
-    rename: tuple[str, ...] = (),
+    rename: _Words = (),
     device: str | None = None,
 ) -> int:
     """Turn the surface of a lumen into an anatomy.
@@ -74,21 +80,24 @@ def import_phantom(
     """
     bore = None if device is None else devices.get(device, "--device")
     if out is None:
-        out = Path(mesh.name.split(".")[0])
-        if out.exists() and not (out / _FILE).is_file():
+        out = Path(stem(mesh))
+        # What is no file is told by the import.
+        if mesh.is_file() and out.exists() and not (out / _FILE).is_file():
             raise ValueError(
                 f"{out} exists and is no anatomy; give a directory (--out)"
             )
-    changes = [text.partition("=") for text in rename]
+    wishes = tuple(chain.from_iterable(rename))
+    changes = [text.partition("=") for text in wishes]
     for old, _, new in changes:
         if not (old and new):
             raise ValueError(
-                f"rename is {rename}; give computed=wanted, e.g. branch_1=lra"
+                f"rename is {wishes}; give computed=wanted, e.g. branch_1=lra"
             )
-    files.require_place(out)  # now: the import would be lost
+    _require_place(out)  # now: the import would be lost
     notes: list[str] = []
     anatomy = import_scan(
-        mesh, centreline, units=units, mesh_frame=frame, axes=axes, labels=label,
+        mesh, tuple(chain.from_iterable(centreline)), units=units, mesh_frame=frame,
+        axes=axes, labels=tuple(chain.from_iterable(label)),
         name=name or out.name, inlet=inlet, heart=heart, progress=say, notes=notes,
         rename={old: new for old, _, new in changes}, device=bore,
     )  # fmt: skip
@@ -100,6 +109,16 @@ def import_phantom(
     print_json({**where, **describe(anatomy, *radius), "next": commands})
     say("\n  ".join(("next:", *commands)))
     return 0
+
+
+def _require_place(out: Path) -> None:
+    """An error if no anatomy can be written there, or a task would take another."""
+    if str(out) in shipped.PHANTOMS:
+        raise ValueError(
+            f"the directory would be called {str(out)!r}, as a phantom is, which tasks "
+            f"would take instead; give another one (--out), such as patients/{out}"
+        )
+    files.require_place(out)
 
 
 def _save(anatomy: Anatomy, out: Path) -> None:
@@ -141,7 +160,7 @@ def build(
         out: Directory of the anatomy.
         access: Inlet of the file that the device enters by; the first if left out.
     """
-    files.require_place(out)
+    _require_place(out)
     anatomy = read_tree(tree).build(access)
     _save(anatomy, out)
     print(f"{anatomy.name}: goals {', '.join(anatomy.goals)}: {out}")
@@ -184,7 +203,7 @@ def generate(
     if needs[kind] != "seed" and (neck or variant != "normal"):
         wrong = "--neck is given" if neck else f"--variant is {variant!r}"
         raise ValueError(f"{wrong}, which I, II and III take alone")
-    files.require_place(out)
+    _require_place(out)
     if seed is not None:
         bounds.seed("seed", seed)
         anatomy = arch.build_seed(
@@ -222,7 +241,7 @@ def check(
     from cathsim_dmc.tasks.anatomies import load_anatomy
     from cathsim_dmc.validation.wall import validate_anatomy
 
-    if figure is None and Path(phantom).is_dir():
+    if figure is None and phantom not in shipped.PHANTOMS and Path(phantom).is_dir():
         figure = Path(phantom) / _PICTURE
     if figure is not None:
         require_png(figure, later=True)

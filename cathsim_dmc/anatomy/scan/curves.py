@@ -38,6 +38,11 @@ def read_curves(
     for path in paths:
         found = read_file(path, units, frame)
         stem = vessel_name(path)
+        if not stem:
+            raise ValueError(
+                f"{path} is not called after a vessel; rename the file, in the letters "
+                "a to z and digits, such as centreline-lcca.mrk.json."
+            )
         for number, points in enumerate(found, 1):
             name = stem if len(found) == 1 else f"{stem}_{number}"
             if name in curves or name in (ROOT, TRUNK):
@@ -136,7 +141,12 @@ def inside_part(name: str, curve: np.ndarray, measure: SurfaceDepth) -> np.ndarr
 
 def _markup(text: str) -> np.ndarray:
     markup = max(json.loads(text)["markups"], key=lambda m: len(m["controlPoints"]))
-    points = np.array([p["position"] for p in markup["controlPoints"]], dtype=float)
+    placed = [
+        point["position"]
+        for point in markup["controlPoints"]
+        if point.get("positionStatus", "defined") == "defined"
+    ]
+    points = np.array(placed, dtype=float).reshape(-1, 3)
     units = markup.get("coordinateUnits", "mm")
     system = str(markup.get("coordinateSystem", "LPS"))
     frame = _FRAMES.get(system, system)

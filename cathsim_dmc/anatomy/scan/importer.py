@@ -23,6 +23,7 @@ from cathsim_dmc.anatomy.scan.ends import free_ends
 from cathsim_dmc.anatomy.scan.extract import listed
 from cathsim_dmc.anatomy.scan.left_out import left_out, said
 from cathsim_dmc.anatomy.scan.lumen import Lumen, read_lumen
+from cathsim_dmc.anatomy.scan.mesh import stem
 from cathsim_dmc.anatomy.scan.naming import ROOT, TRUNK, VESSEL_NAME, Naming
 from cathsim_dmc.anatomy.scan.places import (
     flat_ends,
@@ -128,7 +129,7 @@ def import_scan(
     curves = read_curves(centreline_paths, lumen.units, lumen.frame, axes)
     wishes = _Wishes(given, curves, changes, device, axes)
     parts, bore = _grown(lumen, frame, wishes, told)
-    anatomy = _anatomy(name or Path(mesh_path).name.split(".")[0], parts, bore, told)
+    anatomy = _anatomy(name or stem(mesh_path), parts, bore, told)
     told.say(
         f"done in {time.monotonic() - started:.0f} s, "
         f"goals {', '.join(anatomy.goals) or 'none'}"

@@ -108,12 +108,17 @@ def label_surface(
     (box,) = find_objects(mask.astype(np.uint8))
     low = [rows.start for rows in box]
     part = gaussian_filter(np.pad(mask[box], _PAD).astype(np.float32), BLUR)
+    called = ", ".join(f"{k} {names.get(k, '')}".strip() for k in chosen)
+    if not part.max() > 0.5:
+        raise ValueError(
+            f"label {called} of {path} has {int(mask.sum()):,} voxels, too few or too "
+            "thin for a surface; choose another one (--label), or make voxels finer."
+        )
     points, faces, _, _ = marching_cubes(part, 0.5)
     vertices = (points + low - _PAD) @ matrix.T + origin
     if np.linalg.det(matrix) > 0.0:
         faces = faces[:, ::-1]
     size = " x ".join(f"{x * 1e3:.2g}" for x in np.linalg.norm(matrix, axis=0))
-    called = ", ".join(f"{k} {names.get(k, '')}".strip() for k in chosen)
     taken = f"label {called} of {path.name}: {int(mask.sum()):,} voxels of {size} mm"
     taken += f"; {_source(units, said)}" + ("" if frame else "; frame is the file's")
     notes = (taken, frame) if frame else (taken,)
@@ -258,7 +263,7 @@ def _nrrd(path: Path) -> _Voxels:
 
 
 def _meta(path: Path) -> _Voxels:
-    from vtkmodules import vtkIOImage
+    from vtkmodules import vtkCommonCore, vtkIOImage
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     lines = path.read_bytes()[:_HEADER].decode("latin-1").splitlines()
@@ -282,10 +287,18 @@ def _meta(path: Path) -> _Voxels:
     _require_few([int(size) for size in entries.get("DimSize", [])])
     reader = vtkIOImage.vtkMetaImageReader()
     reader.SetFileName(str(path))
+    # Voxels that a file lacks have any values. VTK tells of them by an event alone, and
+    # of that only with its warnings on.
+    vtkCommonCore.vtkObject.GlobalWarningDisplayOn()
+    failed: list[str] = []
+    told = vtkCommonCore.vtkCommand.ErrorEvent
+    reader.AddObserver(told, lambda _, event: failed.append(event))
     reader.Update()
     image = reader.GetOutput()
-    if reader.GetErrorCode() or not image.GetNumberOfPoints():
-        raise ValueError("it is damaged, or no MetaImage")
+    if failed or reader.GetErrorCode() or not image.GetNumberOfPoints():
+        raise ValueError(
+            "it is damaged or cut off, no MetaImage, or lacks the file of its voxels"
+        )
     data = vtk_to_numpy(image.GetPointData().GetScalars())
     voxels = data.reshape(image.GetDimensions()[::-1]).transpose()
     matrix = 1e-3 * turn.reshape(3, 3).T * spacing

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc import extras
-from cathsim_dmc.anatomy.scan import vtk_files
+from cathsim_dmc.anatomy.scan import ply_files, vtk_files
 
 LABEL_MAPS = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 # What to do with files of other kinds.
@@ -22,6 +22,8 @@ _OTHERS = {
 # Endings, and the least bytes that a triangle takes where no header counts them.
 FORMATS = {"obj": 35, "stl": 50, "ply": 12, "vtp": 12, "vtk": 12}
 _STL_TEXT = 100  # seven lines
+_BEHIND = 4096  # bytes that may follow the last triangle of a binary STL
+_SAID = 300  # characters of what a reader says, at most
 _COMMENTS = 4096  # bytes at the start of a file with its frame, or at its end
 MOST = 4_000_000  # triangles; reading more takes gigabytes
 
@@ -48,7 +50,7 @@ def parsed(path: Path, kind: str, read: Callable[[Path], Any], extra: str) -> An
             f"{path} needs {error.name}: {extras.adding(extra)}."
         ) from error
     except Exception as error:  # readers raise whatever their format leads to
-        said = re.sub(r"\s+", " ", str(error)).strip()[:150] or type(error).__name__
+        said = re.sub(r"\s+", " ", str(error)).strip()[:_SAID] or type(error).__name__
         raise ValueError(
             f"{path} cannot be read as {kind.upper()}: {said}. Export it again."
         ) from error
@@ -84,8 +86,17 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     if len(faces) < 4:
         raise ValueError(
             f"{path} has {len(faces)} triangles; give a triangle mesh of the lumen "
-            "(points and volumes are none, and lines are centrelines: --centreline)."
+            "(points and volumes are none, and lines are centrelines: --centreline), "
+            "named after its format."
         )
+    # Points of no triangle are dropped: they would count for the size.
+    used, corners = np.unique(faces, return_inverse=True)
+    if used[0] < 0 or used[-1] >= len(vertices):
+        raise ValueError(
+            f"{path} has triangles that name points which it does not have; export it "
+            "again."
+        )
+    vertices, faces = vertices[used], corners.reshape(-1, 3)
     bad = int((~np.isfinite(vertices).all(axis=1)).sum())
     if bad:
         raise ValueError(
@@ -167,7 +178,7 @@ def _require_ply_end(data: bytes) -> None:
 
 
 def _require_stl_end(path: Path) -> None:
-    last = _tail(path).strip(b"\0 \r\n\t").splitlines()[-1].strip()
+    last = re.split(rb"[\r\n]", _tail(path).strip(b"\0 \r\n\t"))[-1].strip()
     if not last.lower().startswith(b"endsolid"):
         raise ValueError(
             f"it ends early, without 'endsolid', in {last[:40].decode('latin-1')!r}"
@@ -196,6 +207,8 @@ def _announced(path: Path) -> int:
         return size // _STL_TEXT
     if b"\0" in head and held < whole <= MOST:
         raise ValueError(f"it ends early, after {held:,} of {whole:,} triangles")
+    if whole and 0 < size - 84 - 50 * whole <= _BEHIND:
+        return whole
     if held > MOST:
         return held
     raise ValueError(
@@ -210,7 +223,43 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     kind = path.suffix.lower().lstrip(".")
     # From bytes and without a resolver: nothing beside the file is opened.
     options = {"skip_materials": True} if kind == "obj" else {}
-    data = io.BytesIO(path.read_bytes())
-    mesh = trimesh.load_mesh(data, file_type=kind, process=False, **options)
+    data = path.read_bytes()
+    if kind == "obj":
+        data = _plain_obj(data)
+    elif kind == "stl":  # of text it is all
+        data = data[: 84 + 50 * int.from_bytes(data[80:84], "little")]
+    elif re.search(rb"(?m)^format binary", data[:_COMMENTS]):
+        return ply_files.triangles(data)
+    stream = io.BytesIO(data)
+    mesh = trimesh.load_mesh(stream, file_type=kind, process=False, **options)
     faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
     return np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3), faces
+
+
+def _plain_obj(data: bytes) -> bytes:
+    """An OBJ file with single blanks, whose corners are counted from its first point.
+
+    The reader knows no other white space. It takes corners that are counted back from
+    the last point so far as counted from the end of the file, and a corner 0 as 1.
+    """
+    if b"\t" in data or b"\n " in data:
+        data = re.sub(rb"(?m)^ +", b"", data.replace(b"\t", b" "))
+    if not re.search(rb"(?m)^f (?:.* )?(?:-|0+(?!\d))", data):
+        return data
+    lines, points = data.splitlines(), 0
+    for row, line in enumerate(lines):
+        points += line.startswith(b"v ")
+        if line.startswith(b"f "):
+            named = [int(corner.partition(b"/")[0]) for corner in line.split()[1:]]
+            counted = [k if k >= 0 else points + 1 + k for k in named]
+            if min(counted) < 1:
+                raise ValueError(
+                    f"a triangle names point {min(counted)}; OBJ counts from 1"
+                )
+            lines[row] = b"f " + b" ".join(b"%d" % k for k in counted)
+    return b"\n".join(lines)
+
+
+def stem(path: str | Path) -> str:
+    """Name of a file without its ending, such as .stl, .nii.gz or .seg.nrrd."""
+    return re.sub(r"(?i)(?<=.)(\.nii|\.seg)?\.[^.]+$", "", Path(path).name)
