@@ -25,6 +25,10 @@ Packages (`help(cathsim_dmc.suite)`), imported when they are first used:
     pictures     figures, films and readouts of forces
     analysis     force statistics, heatmaps, intervals
     validation   physics against closed forms
+    physics      effects on a simulation, drives, readings, forces
+    bridge       policies that drive a robot
+    play         cannulation by hand
+    gym          registers the tasks with Gymnasium
 
 The command `cathsim --help` does most of this without Python.
 """
@@ -44,9 +48,13 @@ _SUBMODULES = (
     "agents",
     "analysis",
     "anatomy",
+    "bridge",
     "entities",
+    "gym",
     "imaging",
+    "physics",
     "pictures",
+    "play",
     "policies",
     "recording",
     "simulation",

@@ -58,7 +58,8 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
         *tags: Tags of dm_control's suite, such as "easy".
 
     Raises:
-        ValueError: if the name is taken, or an option of the objective has the name of
+        ValueError: if the name is taken or has other signs than letters, digits and
+            _ : . -, or an option of the objective has the name of
             one that tasks have.
     """
     if not re.fullmatch(r"[\w:.-]+", bounds.text("name", name)):

@@ -154,14 +154,16 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     """A policy from its name, file, run or function.
 
     Args:
-        policy: Name in `POLICIES`, "pretrained:NAME", file of a pretrained policy,
-            directory of a run or of a checkpoint, Checkpoint, policy, or function as
-            for `FunctionPolicy`.
+        policy: Name in `POLICIES`, "pretrained:NAME", "hf:OWNER/NAME" of the hub, file
+            of a pretrained policy, directory of a run or of a checkpoint, Checkpoint,
+            policy, or function as for `FunctionPolicy`.
         seed: Seed of a named policy's own randomness.
 
     Raises:
         CheckpointError: there is none of that name, or it is damaged.
         TypeError: it is none of these.
+        ValueError: the hub has none of that name.
+        ModuleNotFoundError: the hub needs an extra that is not installed.
     """
     if isinstance(policy, Policy):
         return policy

@@ -76,9 +76,9 @@ def train(
 ) -> TrainingResult:
     """Train an agent, or continue a run from its newest checkpoint.
 
-    The directory receives config.json, metrics.csv and checkpoints/<frames>/ (SAC:
-    also replay/), and errors/ with the last physics errors. SIGINT or SIGTERM end the
-    run after the current batch with a checkpoint. After kill -9, `resume=True`
+    The directory receives config.json, metrics.csv and checkpoints/<frames>/ (SAC and
+    DAgger: also replay/), and errors/ with the last physics errors. SIGINT or SIGTERM
+    end the run after the current batch with a checkpoint. After kill -9, `resume=True`
     continues from the newest complete checkpoint: frames are counted from there, rows
     of metrics.csv beyond it are dropped, episodes that were running start anew. One
     process at a time trains there.

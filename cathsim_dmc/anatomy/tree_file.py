@@ -1,4 +1,4 @@
-"""Vessel trees in JSON; docs/anatomies.md, "Your own centrelines", has the format."""
+"""Vessel trees in JSON; docs/anatomy_files.md has the format."""
 
 import json
 import math

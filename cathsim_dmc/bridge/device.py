@@ -11,7 +11,7 @@ from cathsim_dmc.tasks.interface import action_table, observation_table
 
 HANDSHAKE = 5.0  # s, in which a driver says hello
 MOST_FRAMES = 50  # in one period; more are a flood
-# Proposed threshold of rupture, docs/limits.md.
+# Proposed threshold of rupture (arXiv 2604.20151).
 FORCE_LIMIT = 1.5  # N
 LIMITED = ("largest", "push")
 

@@ -177,6 +177,7 @@ class Driver:
         Raises:
             BridgeError: the device is gone or sends what is no state, or the action is
                 not finite or of another size.
+            ValueError: if the watchdog is not longer than a period of the device.
         """
         options = options or DriveOptions()
         if not self.welcome.get("lockstep"):
@@ -311,6 +312,12 @@ def drive(
 
     Returns:
         How it went.
+
+    Raises:
+        ValueError: if the address is none, or the watchdog is not longer than a period
+            of the device.
+        OSError: if no device answers there.
+        BridgeError: see `Driver.episode`.
     """
     options, link = options or DriveOptions(), connect(address)
     try:

@@ -77,6 +77,9 @@ def serve(
         For each episode "end", "reason" (why it was stopped, else None), "steps",
         "missed", "late", "force" (largest, N), and percentiles of "answer" (from a
         state to its action) and "tick" (by how much a period begins late), ms.
+
+    Raises:
+        ValueError: if the watchdog is not longer than a period of the device.
     """
     done: list[dict[str, Any]] = []
     log, options = log or Log(None), options or ServeOptions()

@@ -80,7 +80,8 @@ class Randomisation:
     A range is `(low, high)` of a uniform distribution, or a composer Variation.
 
     Attributes:
-        friction: Coulomb coefficient of device on wall.
+        friction: Coulomb coefficient of an uncoated device on the wall; a hydrophilic
+            one has its `friction_ratio` of it.
         stiffness: factor of EI and GJ; damping and steering torques follow, so that
             relaxation time and steering angles stay.
         loss: factor of the loss factor of the material.

@@ -35,7 +35,8 @@ class VesselReadings(NamedTuple):
         breath_phase: (N,), 0 to 1; 0 is the end of expiration.
         blood_velocity: (N, 3), at the head, m/s, world frame.
         indentation: (N,), of the wall under the deepest contact, m.
-        wall_work: (N,), done on the wall by pressing it in so far, J.
+        wall_work: (N,), ½ Σ f r of the contacts, the work that presses the wall in as
+            far as it is, J.
     """
 
     heart_phase: np.ndarray

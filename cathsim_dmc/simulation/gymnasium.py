@@ -71,8 +71,9 @@ class CathSimEnv(gymnasium.Env):
     """One simulation of a task.
 
     `reset(seed=s)` starts the same episode as the suite's `random=s`. The observation
-    is a dictionary, whatever it holds. `terminated` is success or, with
-    `info["physics_error"]`, divergence; `truncated` is the end of the time.
+    is a dictionary, whatever it holds. `terminated` is success, with
+    `info["physics_error"]` an error of physics, or `give_up`; `truncated` is the end
+    of the time.
 
     Attributes:
         environment: The composer environment.

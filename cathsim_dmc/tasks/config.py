@@ -77,12 +77,13 @@ class NavigationConfig:
         max_steps: Number of control steps until the episode is truncated.
         give_up: Whether an episode ends without success where the memory of attempts
             gives up, see `tasks.retry`: at a lumen too narrow for the device.
-        friction: Coulomb coefficient between device and wall.
+        friction: Coulomb coefficient between an uncoated device and the wall; a
+            hydrophilic one has its `friction_ratio` of it.
         shaft_link: Length of the longest link of the shaft, m.
         working_length: Simulated length of the device, m; None for what the goal needs.
             Observations have one shape whatever it is.
         sheath_clearance: Play of the device in the bore of the sheath all round, m;
-            None for a sheath that holds it on its axis (docs/physics.md).
+            None for a sheath that holds it on its axis (docs/sheath_and_drive.md).
         physics_timestep: Length of a physics step, s; it divides the control step.
         solver_tolerance: Relative improvement at which the solver of contacts stops;
             with 1e-8 devices at rest are steadier (docs/validation.md), for up to a

@@ -280,7 +280,7 @@ class Navigation(composer.Task):
         return float(self._current().outcome.reward[0])
 
     def get_discount(self, physics) -> float:
-        """0 at success or an error of physics, 1 otherwise; the time limit keeps 1."""
+        """0 at success, an error of physics or `give_up`; the time limit keeps 1."""
         del physics
         return 0.0 if self._current().terminated[0] else 1.0
 

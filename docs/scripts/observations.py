@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -42,8 +43,10 @@ env = suite.load("cathsim", "{TASK}", task_kwargs={{
   posterior, +z superior. Joints and links run from proximal to distal.
 - **Time.** Positions and velocities of joints are those at the end of the control step,
   wall forces its means, all other values those of its last physics step.
+- **Tip frame.** Its origin is the head, the distal end; z lies along the head, x and y
+  along the hinges of the last link.
 - **Length.** A task simulates what can leave the sheath (`working_length`, 0.14 to
-  0.32 m). Observations show a device of {COMMON_LENGTH:g} m, so their shapes depend
+  0.44 m). Observations show a device of {COMMON_LENGTH:g} m, so their shapes depend
   on the device and `shaft_link` alone: behind the simulated links the device is
   straight and moves with its base, its hinges are 0 and nothing touches it. Of a longer
   device they show the distal part.
@@ -55,7 +58,8 @@ COAXIAL = f"""
 ## Coaxial devices
 
 Tasks with the suffix `_wire` or `_pair` add these entries to `internal`, `tracking` and
-`route`, and the first two to `tracking_2d`. Shapes are those of `{PAIR_TASK}`:
+`route`, and the first two to `tracking_2d`. The first two are also an observation of
+their own, `drives`, and the others `devices`. Shapes are those of `{PAIR_TASK}`:
 
 {{table}}
 
@@ -64,6 +68,15 @@ on where the anatomy lies in the world. `route_retry` and `route_turns` are obse
 of their own; `route_turns` needs `route_retry`, whose attempt it belongs to:
 
 {{relative}}
+"""
+
+VESSEL = """
+## Living vessels
+
+`vessel` observes a vessel with flow, a compliant wall or motion, which the option
+`vessel` of a task makes ([living vessel](vessel.md)):
+
+{table}
 """
 
 FLUOROSCOPY = f"""
@@ -182,9 +195,9 @@ _OTHERS = (
 )
 
 
-def coaxial_table(*names: str) -> str:
-    """Entries of observations of coaxial devices, from the specs."""
-    specs = suite.make_task(PAIR_TASK, observation=names).observation_specs
+def other_table(task: str, *names: str, **options: Any) -> str:
+    """Entries of observations that other tasks have, from the specs."""
+    specs = suite.make_task(task, observation=names, **options).observation_specs
     rows = [_row("entry", "shape", "unit", "meaning"), _row(*["---"] * 4)]
     known = observations.entries(["route"])
     for entry in (one for one in observations.entries(names) if one not in known):
@@ -264,9 +277,11 @@ def options_table(kind: type, values: object, title: str) -> str:
 def page() -> str:
     """The whole page."""
     parts = [INTRODUCTION, entries_table() + "\n"]
-    coaxial = COAXIAL.replace("{table}", coaxial_table("drives", "devices"))
-    relative = coaxial_table("route_coaxial", "route_retry", "route_turns")
-    parts.append(coaxial.replace("{relative}", relative))
+    coaxial = COAXIAL.replace("{table}", other_table(PAIR_TASK, "drives", "devices"))
+    relative = ("route_coaxial", "route_retry", "route_turns")
+    parts.append(coaxial.replace("{relative}", other_table(PAIR_TASK, *relative)))
+    living = other_table(TASK, "vessel", vessel="living")
+    parts.append(VESSEL.replace("{table}", living))
     table = options_table(FluoroscopyOptions, FluoroscopyOptions(), "default")
     parts.append(FLUOROSCOPY.replace("{table}", table))
     parts.append(ENDOLUMINAL)
