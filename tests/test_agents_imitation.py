@@ -2,6 +2,7 @@
 
 import copy
 import shutil
+import types
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from cathsim_dmc.agents import (
     record_demonstrations,
     train,
 )
-from cathsim_dmc.agents.dagger import DAgger
+from cathsim_dmc.agents.dagger import DAgger, _Guided
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, load_transitions
 from cathsim_dmc.agents.imitation import BC
 from cathsim_dmc.agents.learners import LEARNERS
@@ -186,6 +187,33 @@ def test_dagger_learns_from_what_the_expert_would_do(tmp_path, monkeypatch):
     train(dagger(expert_share=0.5), tmp_path / "b", progress=False)
     apart = [(b["action"] != b[EXPERT_ACTION]).any(-1).float().mean() for b in batches]
     assert apart[0] == 0 and 0.2 < apart[1] < 0.8 and apart[1] < apart[2]
+
+
+def test_the_expert_is_told_the_last_action_of_the_present_episode(
+    shapes, tmp_path, monkeypatch
+):
+    told, begun = [], []
+
+    class Asked:
+        def __init__(self, view, lead):
+            self.reset = lambda fresh: begun.append(fresh.tolist())
+
+        def act(self, last):
+            told.append(last.tolist())
+            return np.full(last.shape, 0.5)
+
+    monkeypatch.setattr("cathsim_dmc.agents.dagger.Teacher", Asked)
+    view = types.SimpleNamespace(num_simulations=2, num_actions=shapes.actions)
+    guided = _Guided(DAgger(dagger(expert_share=1.0), shapes, tmp_path), view)
+    for steps in ([0, 0], [1, 0]):  # the second one begins anew
+        state = {"observation_vector": torch.zeros(2, shapes.vector)}
+        state["step_count"] = torch.tensor(steps)[:, None]
+        guided(TensorDict(state, [2]))
+    assert begun == [[True, True], [False, True]]
+    given = [
+        [[value] * shapes.actions for value in pair] for pair in ([0, 0], [0.5, 0])
+    ]
+    assert told == given
 
 
 @pytest.mark.parametrize("withdrawn, weight", [(0, 1), (1, 5), (20, 4), (80, 1)])

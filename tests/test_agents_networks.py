@@ -16,6 +16,7 @@ from cathsim_dmc.agents.normalisation import (
     ObservationNormaliser,
 )
 from cathsim_dmc.agents.ppo import PPO
+from cathsim_dmc.agents.sac import SAC
 from cathsim_dmc.simulation.environments import VECTOR
 
 
@@ -173,6 +174,15 @@ def test_truncation_bootstraps_and_termination_does_not(tmp_path):
             torch.testing.assert_close(
                 batch["advantage"][env, step, 0], advantage, rtol=1e-4, atol=1e-5
             )
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, -2.0), (-0.5, -0.5)])
+def test_sac_steers_to_an_entropy_of_minus_the_number_of_actions(
+    tmp_path, given, expected
+):
+    config = SACConfig(hidden=(8,), target_entropy=given)
+    learner = SAC(config, NetworkShapes(3, None, 2), tmp_path)
+    assert float(learner.loss.target_entropy) == expected
 
 
 def test_correlated_noise_lasts_and_is_shared_and_stays_standard_normal():

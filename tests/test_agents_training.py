@@ -1,13 +1,14 @@
 import os
 import shutil
 import signal
+import types
 
 import pytest
 import synthetic_env
 import torch
 from tensordict import TensorDict
 
-from cathsim_dmc.agents import ConfigError, evaluate, make_config, train
+from cathsim_dmc.agents import ConfigError, collection, evaluate, make_config, train
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.sac import SAC
@@ -55,6 +56,14 @@ def test_ppo_learns_to_reach(tmp_path):
     assert rewards[-1] > rewards[1] + 15
 
 
+def test_an_annealed_learning_rate_falls_in_a_line_to_nothing(tmp_path):
+    config = small_ppo(anneal=True, num_envs=8, total_frames=1_024, epochs=1)
+    sizes = dict.fromkeys(("steps_per_update", "metrics_frames"), 256)
+    run(config.replace(**sizes), tmp_path)
+    rates = [row["learning_rate"] for row in read_metrics(tmp_path / "metrics.csv")]
+    assert rates == pytest.approx([1e-3, 0.75e-3, 0.5e-3, 0.25e-3])
+
+
 def test_sac_learns_the_best_action_of_each_state(tmp_path):
     torch.manual_seed(0)
     config = small_sac(
@@ -83,6 +92,20 @@ def test_sac_learns_the_best_action_of_each_state(tmp_path):
     asked = TensorDict({"observation_vector": torch.tensor([[-0.6], [0.6]])}, [2])
     chosen = learner.policy(asked)["action"].flatten()
     torch.testing.assert_close(chosen, torch.tensor([-0.5, 0.5]), atol=0.15, rtol=0)
+
+
+def test_random_actions_fill_whole_batches_also_in_a_run_that_is_resumed(monkeypatch):
+    def begun(env, policy, **options):
+        return options["frames_per_batch"], options["init_random_frames"]
+
+    monkeypatch.setattr(collection, "Collector", begun)
+    config = small_sac(num_envs=8, steps_per_env=4, random_frames=100)
+    learner = types.SimpleNamespace(
+        random_frames=100, policy=None, device=torch.device("cpu")
+    )
+    for seen, left in ((0, 128), (64, 64), (96, 32), (128, None)):
+        found = collection.make_collector(config, learner, None, None, seen)
+        assert found == (32, left)
 
 
 SMALL_IMAGES = {

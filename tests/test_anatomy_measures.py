@@ -78,6 +78,26 @@ def test_bends_and_angles_of_a_half_ring():
     assert found["plane_deg"] == pytest.approx(90, abs=0.5)
 
 
+def test_a_branch_that_leans_back_and_upstream_is_measured_along_its_own_lumen():
+    """It is narrowest past its ostium; what lies in the aorta does not count."""
+    way = np.array([-0.2, 0.3, 1.0])
+    way /= np.linalg.norm(way)
+    line = np.array([40e-3, 0.0, 40e-3]) + np.linspace(0, 80e-3, 81)[:, None] * way
+    radii = np.full(81, 3e-3)
+    radii[:5], radii[60:] = 1e-3, 2e-3
+    aorta = half_ring()
+    depth = aorta.project(line)
+    ostium = float(np.interp(0.0, depth.distance - depth.radius, np.arange(81) * 1e-3))
+    lcca = Vessel("lcca", Centreline(line, radii), "aorta", ostium)
+    tree = VesselTree({"aorta": Vessel("aorta", aorta), "lcca": lcca})
+    found = measures.measure(tree)["branches"]["lcca"]
+    assert found["take_off_deg"] == pytest.approx(math.degrees(math.atan(0.2)), abs=0.1)
+    assert found["lean_deg"] == pytest.approx(math.degrees(math.atan(0.3)), abs=0.1)
+    assert found["out_of_plane_mm"] == pytest.approx(40 * way[1], abs=0.1)
+    assert found["narrowest_mm"] == 4.0 and found["diameter_mm"] == 6.0
+    assert found["length_mm"] == pytest.approx(80 - 1e3 * ostium, abs=0.01)
+
+
 def test_tilt_of_the_root_is_seen():
     tree = VesselTree({"aorta": Vessel("aorta", half_ring(tilt=-0.3))})
     found = measures.measure(tree)

@@ -14,6 +14,7 @@ from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.contact import CONTACT_SOLIMP
+from cathsim_dmc.laws import contact, motion, moving_contact, places, planes, wall
 
 RADIUS, DEVICE, HALF = 5e-3, 0.8e-3, 3.5e-3
 
@@ -290,6 +291,50 @@ def test_an_impact_is_met_a_physics_step_ahead(tube):
         mujoco.mj_step(model, data)
         depth.append(-data.contact.dist.min(initial=0.0))
     assert max(depth) < 0.2e-3
+
+
+@pytest.mark.parametrize("lever", [0.0, 20e-3])
+def test_an_end_that_swings_at_the_wall_is_met_a_physics_step_ahead(tube, lever):
+    """It turns about its own middle, or about a body that it is an arm of."""
+    arm = f'<geom type="capsule" pos="0 0 {lever}" size="{DEVICE} {HALF}" mass="1e-3" '
+    arm += 'contype="0" conaffinity="1" solref="0.008 1"/>'
+    hub = '<geom size="1e-3" mass="2e-3" contype="0" conaffinity="0"/>'
+    body = f'<body><freejoint/>{hub}<body pos="0 0 0">{arm}</body></body>'
+    model, data = compiled(carrier(tube) + body)
+    data.qpos[:3] = RADIUS - DEVICE - 0.8e-3, 0.0, 20e-3
+    data.qvel[4] = 0.4 / (lever + HALF)
+    depth = []
+    for _ in range(8):
+        mujoco.mj_step(model, data)
+        depth.append(-data.contact.dist.min(initial=0.0))
+    assert max(depth) < 0.4e-3  # more than 1.2 mm if its turn is left out
+
+
+def test_strain_along_a_tube_changes_nothing_where_a_link_touches_it(tube):
+    """The end of a link that leans on the wall, whatever its length is at rest."""
+    still, lean = (0.0, 0.0, 0.0), 0.05
+    axis = (np.sin(lean), 0.0, np.cos(lean))
+    centre = (RADIUS - DEVICE - HALF * axis[0] + 0.03e-3, 0.0, 30e-3)
+    capsule = places.Capsule(centre, axis, HALF, (True, True))
+    walls = wall.Wall(False, tube.arrays, np.zeros(1))
+    law = contact.contact_law(walls, DEVICE, 0.0, CONTACT_SOLIMP[0], 0.008)
+    sweep = contact.sweep_of(capsule, law, still, still)
+    found = np.zeros((2, planes.MOST, contact.CONTACT))
+    samples, rows = np.empty(65), np.empty((planes.PLANES, 4))
+    scratch = contact.Scratch(samples, rows)
+    count = contact.contacts(walls, capsule, law, sweep, scratch, found[0])
+    values = np.zeros((2, 2, 2, motion.VALUES))
+    values[..., 2] = 0.05 * np.array([-0.1, 0.1])  # of the way along z
+    lattice = np.concatenate([[-0.1] * 3, [0.2], [2.0] * 3, values.ravel()])
+    course = motion.Course(1.0, *[0.0] * 8)
+    moved = moving_contact.MovingScratch(
+        samples, rows, np.empty((motion.VALUES, 4)), np.empty(motion.WARP)
+    )
+    assert count == moving_contact.moving_contacts(
+        walls, capsule, law, sweep, (lattice, course), moved, found[1]
+    )
+    assert count > 0 and found[0, 0, 4] == pytest.approx(HALF)
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-7)
 
 
 def rolling(field):

@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 from dm_control import mjcf
+from scipy.linalg import eigh
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, AngiographyArena
-from cathsim_dmc.entities.armature import LARGEST
+from cathsim_dmc.entities.armature import FREE_END, LARGEST, hinge_armatures
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.chain import (
     CARRIAGE_MASS,
@@ -19,6 +20,7 @@ from cathsim_dmc.entities.chain import (
     TIMESTEP,
     TORSION_ARMATURE,
 )
+from cathsim_dmc.entities.coaxial import carried_mass
 from cathsim_dmc.laws import coaxial
 
 STEERABLE = ("steerable_5f", "steerable_4f")
@@ -267,3 +269,32 @@ def test_isotropic_section_has_the_shear_modulus_of_its_material():
     section = devices.Section.isotropic(3.0, 0.5)
     # GJ = E / 2(1+ν) · 2I
     assert section.torsional_stiffness == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("name", ["steerable_5f", "wire_035_glide"])
+def test_axial_stiffness_is_that_of_a_solid_rod_that_bends_alike(name):
+    """EI = E π r⁴ / 4 and EA = E π r²."""
+    device = devices.get(name)
+    square = np.pi * device.outer_radius**2
+    modulus = 4 * device.shaft.bending_stiffness / (square * device.outer_radius**2)
+    assert device.axial_stiffness == pytest.approx(modulus * square)
+
+
+@pytest.mark.parametrize("name", devices.DEVICES)
+def test_the_armature_slows_the_first_mode_of_a_free_end_as_it_says(name):
+    """Of a chain of hinges that is held at 120 mm, moved by masses in blood."""
+    device = devices.get(name)
+    lengths = devices.Discretisation().link_lengths(device)
+    nodes = np.append(np.cumsum(lengths[::-1])[::-1], 0.0)  # from the end, m
+    middles = (nodes[:-1] + nodes[1:]) / 2
+    tip, shaft = device.tip.bending_stiffness, device.shaft.bending_stiffness
+    bent = np.minimum(middles, device.tip_length) / tip
+    bent += np.maximum(middles - device.tip_length, 0.0) / shaft
+    compliance, hinges = -np.diff(bent), nodes[1:-1]
+    free = hinges < FREE_END
+    arms = np.maximum(hinges[free] - middles[:, None], 0.0)
+    masses = (device.linear_density + carried_mass([device])) * lengths
+    inertia = arms.T @ (masses[:, None] * arms)
+    square = eigh(np.diag(1 / compliance[free]), inertia, eigvals_only=True)[0]
+    expected = np.minimum(LARGEST, 0.21 / (square * compliance))
+    np.testing.assert_allclose(hinge_armatures(device, lengths), expected, rtol=0.03)

@@ -10,9 +10,9 @@ from scipy.integrate import quad
 from cathsim_dmc.entities import devices, stack_memory
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.catheter import Catheter
-from cathsim_dmc.entities.coaxial import Stack
+from cathsim_dmc.entities.coaxial import Stack, weight_density
 from cathsim_dmc.entities.torsion import rods_of
-from cathsim_dmc.laws import coaxial, coaxial_forces, torsion
+from cathsim_dmc.laws import coaxial, coaxial_forces, sliding, torsion
 from cathsim_dmc.laws.coaxial import Posture
 from cathsim_dmc.laws.coaxial_forces import Lumen
 from cathsim_dmc.laws.torsion import STICKING
@@ -191,6 +191,19 @@ def test_links_have_the_outermost_devices_outside(pair):
     assert links.mass.sum() == pytest.approx(total)
 
 
+@pytest.mark.parametrize("gaps", [(0.0, 0.0245), (0.0245, 0.0)])
+def test_links_weigh_in_blood_what_those_devices_do_that_are_there(pair, gaps):
+    weights = np.array([weight_density(device) for device in pair.devices])
+    whole = pair.links(pair.overlap([0.0, 0.0]), 0.06)
+    assert not whole.buoyancy.any()
+    gravity = weights.sum() * LENGTHS / whole.mass  # as buoyancy reduces it for all
+    overlap = pair.overlap(gaps)
+    links = pair.links(overlap, 0.06)
+    np.testing.assert_allclose(
+        gravity * links.mass * (1 - links.buoyancy), weights @ overlap.present * LENGTHS
+    )
+
+
 def pressed(stack, overlap, bends, turns):
     """Pressure of devices without axial forces of the joints."""
     tables, axial, devices = stack.tables, np.zeros(turns.shape), len(turns)
@@ -285,6 +298,69 @@ def test_devices_press_on_each_other_where_they_bend_against_each_other(pair):
     assert pressed(pair, apart, bent, still).max() == 0.0
 
 
+def plain(pair):
+    """The pair without shapes and softer tips, on equal links."""
+    own = [dataclasses.replace(d, tip_shape=(), tip=d.shaft) for d in pair.devices]
+    return Stack(own, np.full(20, 7e-3))
+
+
+def test_a_wire_rubs_in_a_bend_as_a_rope_on_a_capstan(pair):
+    """In an arc a wire bears EI κ²/2 beside what pushes it past all friction."""
+    alike, angle, end, coefficient = plain(pair), 0.05, 0.3, 0.2
+    overlap, joints = alike.overlap([0.0, 0.0]), len(alike.spans)
+    posture = Posture(
+        np.zeros(2), np.full(joints, angle * np.exp(0.4j)), np.zeros((2, joints))
+    )
+    lumen = Lumen(np.array([end, 0.0]), np.ones(1), coefficient, 1.0)
+    force, drag = np.empty((1, joints)), np.empty(1)
+    coaxial_forces.pressure(
+        alike.tables, overlap, posture, np.zeros((2, joints)), lumen,
+        stack_memory.scratch(alike.tables), force, drag,
+    )  # fmt: skip
+    stiffness = alike.devices[0].shaft.bending_stiffness
+    borne = end + stiffness * (angle / 7e-3) ** 2 / 2
+    grown = (1 + coefficient * angle) ** np.arange(joints + 1.0)
+    np.testing.assert_allclose(force[0, ::-1], borne * grown[:-1] * angle)
+    np.testing.assert_allclose(drag, borne * (grown[-1] - 1))
+
+
+def test_the_wall_rubs_on_the_joints_as_on_the_links_around_them():
+    """Those at the base bear half of the first link; the sheath bears the rest."""
+    rng = np.random.default_rng(3)
+    outermost, force = rng.uniform(size=(2, 6)), rng.uniform(size=6)
+    arms, torque = np.array([0.4e-3, 0.8e-3]), np.empty((2, 5))
+    coaxial_forces.wall_friction(arms, outermost, force, 0.3, torque)
+    borne = outermost * force
+    borne[:, 0] /= 2
+    np.testing.assert_allclose(torque.sum(axis=1), 0.3 * arms * borne.sum(axis=1))
+
+
+def test_the_lumen_holds_back_a_wire_that_turns_by_the_radius_of_the_wire(pair):
+    """Turned on and on in an arc, it twists until its base bears all friction."""
+    alike, coefficient = plain(pair), 0.2
+    tables, rods = alike.tables, rods_of(alike.devices, alike.nodes)
+    devices = sliding.Devices(
+        tables, rods, alike.arms, alike.sections, coefficient, 0.04, torque=1.0
+    )
+    count = len(alike.spans)
+    loads = sliding.Loads(
+        np.array([0.5, 0.0]), np.zeros(count + 1), 0.0, 0.0, stiffness=1.0, loss=1.0
+    )
+    hinges = np.zeros((count, 2))
+    hinges[np.arange(count), 1 - np.arange(count) % 2] = 0.05  # about y
+    state = sliding.State(
+        np.zeros(2), hinges.ravel(), np.zeros((2, count + 2)), np.zeros(1),
+        np.zeros(1), np.zeros(2), np.zeros((2, count)),
+    )  # fmt: skip
+    memory, chain = stack_memory.settling(tables), stack_memory.chain(tables)
+    for _ in range(40):
+        sliding.settle(devices, loads, state, memory, chain)
+    borne = rods.stiffness[0, 0] * (state.angles[0, 0] - state.angles[0, 1])
+    held = coefficient * alike.devices[0].outer_radius * memory.pressure.sum()
+    assert borne == pytest.approx(held, rel=1e-3) and held > 0.0
+    assert state.angles[0, -1] > 1.0 and not state.angles[1].any()
+
+
 def test_devices_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"wire_035_glide.*0.889 mm.*0.533 mm"):
         stack(["wire_035_glide", "microcatheter_021"])
@@ -328,6 +404,19 @@ def test_a_load_at_the_end_winds_the_device_by_its_compliance(rod):
     assert lag[-1] == pytest.approx(0.35, rel=1e-3)
     reached = step * (1 + np.argmax(np.array(lag) >= (1 - np.exp(-1)) * lag[-1]))
     assert reached == pytest.approx(0.4, abs=2 * step)
+
+
+@pytest.mark.parametrize("gaps", [(0.0, 0.0237), (0.05, 0.0)])
+def test_nodes_bear_the_loads_of_the_joints(pair, gaps):
+    """They do the same work at any rotation of the nodes, the bases held."""
+    rng = np.random.default_rng(5)
+    joints, gaps = len(pair.spans), np.array(gaps)
+    angles, loads = rng.normal(size=(2, joints + 2)), rng.normal(size=(3, 2, joints))
+    angles[:, 0] = 0.0
+    borne = np.empty((3, 2, joints + 1))
+    torsion.at_nodes(loads, gaps, pair.nodes, borne)
+    work = (loads * at_joints(angles, gaps, pair.nodes)).sum(axis=(1, 2))
+    np.testing.assert_allclose((borne * angles[:, 1:]).sum(axis=(1, 2)), work)
 
 
 def test_friction_winds_the_device_up_until_it_gives(rod):

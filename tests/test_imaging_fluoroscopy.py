@@ -8,9 +8,11 @@ from test_imaging_device import RADIUS, curve
 from test_imaging_thickness import ball
 
 from cathsim_dmc.imaging import angiograph, detector, materials
+from cathsim_dmc.imaging.angiograph import Deviation
 from cathsim_dmc.imaging.carm import CArm
 from cathsim_dmc.imaging.device import Shadow, device_attenuation
-from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
+from cathsim_dmc.imaging.fluoroscopy import MASK_SHARE, Fluoroscope
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 
 
 @pytest.fixture(scope="module")
@@ -173,3 +175,32 @@ def test_biplane_stacks_two_views(vessel, frames):
     one = [Shadow(frames[4:5], RADIUS)]
     single = angiograph.images(machines[:1], one, [state])
     assert (noisy[4] == single[0]).all()
+
+
+def test_quanta_are_those_of_the_pixel_and_the_kerma_of_the_machine(vessel):
+    """30174 a mm² and µGy; a zoom of 2 shows a quarter of the detector on a pixel."""
+    options = FluoroscopyOptions(kerma=40e-9, size=64, magnification=2.0)
+    machine = angiograph.Angiograph(vessel, options)
+    (usual,), (other,) = map(machine.planes, (Deviation(), Deviation(0, 0, 1.1, 0.5)))
+    pixel = 1e3 * usual.carm.detector_size / 64 / 2.0
+    assert usual.quanta == pytest.approx(30174 * 0.04 * pixel**2)
+    assert other.quanta == pytest.approx(0.5 * usual.quanta)
+    assert other.gain == pytest.approx(1.1 * usual.gain)
+    assert other.vessel is usual.vessel
+
+
+@pytest.mark.parametrize("shift", [-0.4, -0.2, 0.2, 0.4])
+def test_a_thin_device_shows_on_a_pixel_that_sees_enough_of_it(shift):
+    """It stands across the edge of two columns, by a share of its radius off it."""
+    arm = CArm(resolution=(32, 32))
+    pixel = arm.pitch * arm.source_isocentre / arm.source_detector
+    radius = 0.2 * pixel
+    scope = Fluoroscope(arm, np.zeros((32, 32)), np.zeros((32, 32), bool))
+    line = np.zeros((2, 3))
+    line[:, 0], line[:, 2] = shift * radius, (-8 * pixel, 8 * pixel)
+    row = scope.device_mask([Shadow(line, radius)])[16]
+    # Chords of a round rod make half an ellipse; share of it on the left of the edge.
+    left = (np.arccos(shift) - shift * np.sqrt(1 - shift**2)) / np.pi
+    shown = np.array([left, 1 - left]) * np.pi / 4 >= MASK_SHARE
+    np.testing.assert_array_equal(np.flatnonzero(row), 15 + np.flatnonzero(shown))
+    assert shown.tolist() == [shift < 0.3, shift > -0.3]

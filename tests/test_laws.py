@@ -9,7 +9,16 @@ import pytest
 
 import cathsim_dmc
 from cathsim_dmc.entities import device_stack, stack_memory
-from cathsim_dmc.laws import blood, compliance, drive, hinges, sliding, springs
+from cathsim_dmc.laws import (
+    blood,
+    compliance,
+    drive,
+    hinges,
+    motion,
+    sheath,
+    sliding,
+    springs,
+)
 from cathsim_dmc.laws.device import Contact, Device
 from cathsim_dmc.laws.parameters import Array, shapes, total
 
@@ -131,6 +140,33 @@ def test_drag_on_a_link_reaches_all_before_it():
     np.testing.assert_allclose(device.qfrc_passive[5::6], torques)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_drag_on_a_link_that_moves_and_turns_has_any_direction(seed):
+    """It is that of the velocity at the link across its axis, and along it."""
+    random = np.random.default_rng(seed)
+    place, pole, spin, speed, flow, carried = random.normal(size=(6, 3))
+    axes, _ = np.linalg.qr(random.normal(size=(3, 3)))
+    device = links(
+        1,
+        xipos=place[None],
+        subtree_com=pole[None],
+        xmat=axes.reshape(1, 9),
+        cvel=np.concatenate([spin, speed])[None],
+    )
+    given = {"peak": 0.7, "rate": 1.3, "phase": 0.1, "delay": np.array([0.05])}
+    given |= {"friction": np.array([0.4]), "space_velocity": carried[None]}
+    own = flowing(1, flow, **given)
+    blood.drag(own, 0.15, device)
+    velocity = 0.7 * blood.beat(1.3 * (0.15 - 0.05) + 0.1) * flow + carried
+    velocity -= speed + np.cross(spin, place - pole)
+    along = (velocity @ axes[:, 2]) * axes[:, 2]
+    across = velocity - along
+    force = blood.cross_drag(own, np.linalg.norm(across), 8e-4, 0.01) * across
+    force += 0.4 * 0.01 * along
+    np.testing.assert_allclose(device.qfrc_passive[:3], force)
+    np.testing.assert_allclose(device.qfrc_passive[3:], np.cross(place - pole, force))
+
+
 def test_springs_are_torques_of_the_isotropic_energy():
     joints = 5
     rest, compliance = RNG.uniform(-0.2, 0.2, joints), RNG.uniform(50, 200, joints)
@@ -171,9 +207,65 @@ def test_steered_commands_are_turned_back_by_the_twist():
     assert math.atan2(*turned[0, 1::-1]) == pytest.approx(-bends.twists[-2])
 
 
-def test_a_servo_holds_its_place_and_slips_at_its_limit():
-    ones, way = np.ones(1), np.empty((1, 1))
-    servos = drive.Servos(
+def test_a_joint_in_the_sheath_keeps_its_relaxation_time_and_loses_its_shape():
+    """Far out, at the mouth, half of its rod beyond in the sheath, and far in."""
+    count = 4
+    joints = sheath.Joints(
+        *(np.arange(8).reshape(4, 2) for _ in range(3)),
+        place=np.array([0.05, 0.0, -2e-3, -0.05]),
+        behind=np.full(count, 3e-3),
+        ahead=np.full(count, 4e-3),
+        distal=np.full(count, 0.7),
+    )
+    free = sheath.Hinges(*RNG.uniform(1.0, 2.0, (3, count, 2)))
+    hinges, out = sheath.Hinges(*np.zeros((3, 2 * count))), np.empty(count)
+    sheath.hold(joints, 0.0, free, hinges, out)
+    np.testing.assert_allclose(out, [1.0, 0.7, 0.35, 0.0], atol=1e-12)
+    kept = np.maximum(out, sheath.LEAST)[:, None]
+    for found, one in zip(hinges[:2], free[:2], strict=True):
+        np.testing.assert_allclose(found.reshape(-1, 2), one / kept)
+    np.testing.assert_allclose(hinges.rest.reshape(-1, 2), free.rest * out[:, None])
+
+
+def strained():
+    """What `motion.warp` finds where space is strained, and the gradient (3, 3)."""
+    there = RNG.normal(scale=0.1, size=motion.WARP)
+    there[3:12] += np.eye(3).ravel()
+    return there, there[3:12].reshape(3, 3)
+
+
+def test_blood_and_wall_are_carried_by_space():
+    there, gradient = strained()
+    flow, normal = RNG.normal(size=3), np.array([0.6, 0.0, 0.8])
+    found, scale = motion.carried(there, flow)
+    assert scale == pytest.approx(np.linalg.det(gradient))
+    np.testing.assert_allclose(found, scale * np.linalg.solve(gradient, flow))
+    velocity = np.linalg.solve(gradient, there[16:19]) - there[19] * normal
+    np.testing.assert_allclose(motion.wall_velocity(there, normal), velocity)
+
+
+def test_a_plane_of_a_wall_that_moves_is_tangent_to_it_in_space():
+    """The clearance at rest, as long as it is in space, and the growth there."""
+    there, gradient = strained()
+    normal, planes = np.array([0.6, 0.0, 0.8]), np.zeros((1, 4))
+    planes[0] = *normal, 0.7
+    motion.planes_in_space(there, planes, 1)
+    stretch = np.linalg.norm(normal @ gradient)
+
+    def clearance(way):
+        value = (0.7 + normal @ gradient @ way) / stretch
+        return value + there[12] + there[13:16] @ way
+
+    slope = np.array([clearance(each) - clearance(-each) for each in np.eye(3)]) / 2
+    size = np.linalg.norm(slope)
+    expected = [*(slope / size), clearance(np.zeros(3)) / size]
+    np.testing.assert_allclose(planes[0], expected)
+
+
+def servo():
+    """One servo, whose platform moves by 0.02 m/s at full command."""
+    ones = np.ones(1)
+    return drive.Servos(
         *(np.zeros(1, int) for _ in range(3)),
         gain=2.0 * ones,
         stiffness=100.0 * ones,
@@ -182,6 +274,10 @@ def test_a_servo_holds_its_place_and_slips_at_its_limit():
         reach=1e-3 * ones,
         rise=ones,
     )
+
+
+def test_a_servo_holds_its_place_and_slips_at_its_limit():
+    ones, way, servos = np.ones(1), np.empty((1, 1)), servo()
     state = drive.State(np.array([[0.01]]), np.zeros((1, 1)), np.array([[0.6]]))
     told = drive.Told(np.array([[0.012]]), np.zeros((1, 1)))
 
@@ -197,6 +293,16 @@ def test_a_servo_holds_its_place_and_slips_at_its_limit():
     # Of it, 0.7 N had been borne for the load, which falls to 0.5 N.
     assert follow(1.0, 0.5) == pytest.approx((0.009, 0.005, (100 * 0.008 + 0.6) / 2))
     assert way[0, 0] == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize(("command", "speed"), [(0.6, 0.0), (0.0, 0.6), (-0.2, -0.6)])
+def test_a_platform_in_motion_makes_up_for_a_load_slowly(command, speed):
+    """Whether it is told to move, or has been."""
+    ones, way = np.ones((1, 1)), np.empty((1, 1))
+    told = drive.Told(0.0 * ones, 0.0 * ones)
+    state = drive.State(0.0 * ones, 2.0 / 100.0 * speed * ones, 0.0 * ones)
+    drive.follow(servo(), state, command * ones, 0.9 * ones, told, way)
+    assert 2.0 * state.act[0, 0] == pytest.approx(1.1 - 0.6)
 
 
 def test_a_shared_spring_is_halved_and_a_stiff_wall_stays_rigid():
@@ -216,6 +322,20 @@ def test_a_shared_spring_is_halved_and_a_stiff_wall_stays_rigid():
     expected = compliance.reference(stiffness, 25.0, soft)
     np.testing.assert_allclose(solref[1], expected)
     np.testing.assert_array_equal(solimp, [rigid.solimp, soft.solimp])
+
+
+def test_an_artery_has_its_thickness_and_support_weighs_by_powers():
+    for radius, thickness in ((0.015, 1.5e-3), (0.004, 0.6e-3)):
+        own, same = (
+            compliance.stiffness(radius, compliance.Material(0.45e6, each, 1.0))
+            for each in (math.nan, thickness)
+        )
+        assert own == pytest.approx(same)
+    free, between, held = (
+        compliance.stiffness(0.01, compliance.Material(0.45e6, 1e-3, support))
+        for support in (0.0, 0.25, 1.0)
+    )
+    assert between == pytest.approx(free**0.75 * held**0.25)
 
 
 def test_devices_settle_where_nothing_turns_them():

@@ -131,6 +131,10 @@ def test_fluoroscopy_shows_the_vessel_where_it_is():
     vessel_now = step.observation["segmentation"][..., 1] > 0
     plane = task.rollout.case().angiograph.planes()[0]
     there = plane.around(task.rollout.moving.surface(0))
+    # As links and contacts, it is where it was as the last physics step began.
+    physics = environment.physics
+    (time,) = task.rollout.moving.times
+    assert time == pytest.approx(physics.data.time - physics.model.opt.timestep)
     np.testing.assert_array_equal(vessel_now, there.vessel_mask)
     assert (vessel_now != plane.vessel_mask).mean() > 0.02
 

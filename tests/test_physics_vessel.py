@@ -152,6 +152,8 @@ def test_what_is_drawn_and_shown_of_the_heart(living):
     step = batch.step(np.zeros((6, 21)))
     shown = step.info()["heart_phase"]
     np.testing.assert_allclose(shown, (phase + 0.04 * rate) % 1.0, atol=1e-12)
+    observed = step.observation["heart_phase"] @ [1j, 1.0]
+    np.testing.assert_allclose(observed, np.exp(2j * np.pi * shown))
     assert set(step.info()) == set(living.info_types)
 
 

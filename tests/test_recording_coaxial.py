@@ -55,6 +55,14 @@ def test_links_look_like_the_outermost_device_there(recorded):
     assert coaxial.gaps[-1, 1] < coaxial.gaps[0, 1]
 
 
+def test_a_link_looks_like_what_is_outermost_in_its_middle():
+    line, turns = np.zeros((2, 5, 3)), np.zeros((2, 2))
+    line[..., 2] = np.arange(5) * 10e-3
+    ends = np.array([[0.1, 0.086], [0.1, 0.084]])  # 14 and 16 mm of wire stand out
+    record = CoaxialRecord(("wire", "catheter"), np.ones(2), ends, turns, turns)
+    assert record.outermost(line).tolist() == [[1, 1, 1, 0], [1, 1, 0, 0]]
+
+
 def test_the_rerun_file_has_both(recorded, tmp_path):
     from rerun.chunk import RrdReader
 

@@ -13,7 +13,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.agents import evaluate, make_config, make_env, train
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.policies import TrainedPolicy
-from cathsim_dmc.simulation import environments
+from cathsim_dmc.simulation import environments, episodes
 from cathsim_dmc.simulation.torchrl import BatchedEnv
 from cathsim_dmc.tasks import rehearsal
 from cathsim_dmc.tasks.rollout import Rollout
@@ -117,3 +117,29 @@ def test_a_policy_of_images_names_those_of_another_size():
         seen = {} if shape is None else {environments.PIXELS: torch.zeros(1, *shape)}
         with pytest.raises(ValueError, match=rf"\(1, 48, 48\) as .* gives {words}"):
             policy._answer(TensorDict(seen, [1]))
+
+
+def test_episodes_that_are_ended_early_begin_anew_while_others_go_on():
+    """The first by who looks on, the second by itself; the third ends all."""
+    ends, begun, reset = iter([[0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 1]]), [], []
+
+    def step(action=None):
+        ended = np.zeros(3, bool) if action is None else np.array(next(ends), bool)
+        none = np.zeros(3, bool)
+        return types.SimpleNamespace(observation={}, terminated=ended, truncated=none)
+
+    def restart(indices=None):
+        reset.append(None if indices is None else indices.tolist())
+        return step()
+
+    simulation = types.SimpleNamespace(num_simulations=3, step=step, reset=restart)
+    played = []
+    for turn in episodes.play(
+        simulation, lambda observation: np.zeros((3, 1)), lambda m: begun.append([*m])
+    ):
+        played.append(turn.running.tolist())
+        if len(played) == 2:
+            turn.running[0] = False
+    assert reset == [None, [0], [1]]
+    assert begun == [[True] * 3, [True, False, False], [False, True, False]]
+    assert played[2:] == [[False, True, True], *[[False, False, True]] * 2]

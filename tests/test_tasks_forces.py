@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from cathsim_dmc.physics import forces
+from cathsim_dmc.physics import forces, forces_loops
 
 
 def test_overflow_is_told():
@@ -29,6 +29,18 @@ def test_sums_peaks_and_means(magnitude):
     np.testing.assert_allclose(wall.mean_max, magnitude.max(-1).mean(-1))
     assert (wall.peak_sum >= wall.sum).all()
     assert (wall.peak_max >= wall.max).all() and (wall.sum >= wall.max - 1e-12).all()
+
+
+@given(arrays.arrays(float, (3, 4, 2), elements=st.floats(0.0, 1.0)))
+def test_the_work_on_the_wall_is_that_of_springs(drawn):
+    """½ f r of each contact; one that only keeps a link near the wall does none."""
+    force, way = drawn[..., 0], 1e-3 * (drawn[..., 1] - 0.2)
+    rows = np.zeros((*force.shape, forces.CONTACT_SIZE))
+    rows[..., 0], rows[..., 1], rows[..., 4] = 4, force, -way
+    deepest, work = forces_loops.pressed(rows.reshape(3, -1), forces.CONTACT_SIZE)
+    depth = np.maximum(way, 0.0)
+    np.testing.assert_allclose(work, 0.5 * (force * depth).sum(axis=1), atol=1e-15)
+    np.testing.assert_array_equal(deepest, depth.max(axis=1))
 
 
 @pytest.mark.parametrize("step", [0, 4])

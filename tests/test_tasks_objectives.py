@@ -221,6 +221,35 @@ def test_terms_are_what_their_names_say(anatomy):
     assert terms == pytest.approx(expected)
 
 
+def test_a_shifted_goal_stays_in_its_branch_and_may_be_passed(anatomy):
+    task = cannulation(anatomy, "lcca", farthest_shift=8e-3)
+    moved = task.shifted(np.array([-1.0, 0.0, 1.0]))
+    places = task.branch.project(moved.goal).arc_length
+    middle = task.branch.project(task.goal).arc_length
+    np.testing.assert_allclose(places, [task.ostium, middle, task.branch.length])
+    for past in (-5e-3, 5e-3):
+        head = task.route.at(task.goal_arc_length + past).position
+        assert task.path_distance(head) == pytest.approx(5e-3)
+
+
+def test_the_path_ratio_is_the_way_of_the_head_over_that_to_the_goal(
+    shared_environment,
+):
+    """In every episode anew."""
+    environment = shared_environment("simple1_bca")
+    task, push = environment.task, np.zeros(21)
+    push[-1] = 1.0
+    for _ in range(2):
+        environment.reset()
+        heads = [task.readings.head]
+        for _ in range(10):
+            environment.step(push)
+            heads.append(task.readings.head)
+        way = np.linalg.norm(np.diff(heads, axis=0), axis=-1).sum()
+        shortest = task.objective.path_distance(heads[0])
+        assert task.info()["path_ratio"] == pytest.approx(way / shortest)
+
+
 # Start.
 
 

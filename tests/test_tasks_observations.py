@@ -11,11 +11,13 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import observations, route
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.observation_kind import Entry, ObservationTable, Sizes
+from cathsim_dmc.tasks.tracking_noise import TrackingNoise
 
 SIZE = 64
 
@@ -243,6 +245,38 @@ def test_entries_that_networks_cannot_read_are_refused():
     table.check({"near": np.zeros((2, 1))}, spec)
     with pytest.raises(ValueError, match="'near' .* is of bool, .* declares float64"):
         table.check({"near": np.zeros((2, 1), bool)}, spec)
+
+
+def test_the_base_bears_what_pushes_and_turns_the_device():
+    task = suite.make_task("simple1_bca", rotation=True, observation="force")
+    environment = suite.environment(task)
+    environment.reset()
+    data, base = environment.physics.data.ptr, task.rollout.index.links.start
+    axis = task.scene.placement.direction
+    for push, turn in ((0.1, 2e-4), (-0.1, -1e-4)):
+        data.xfrc_applied[base] = np.append(-push * axis, -turn * axis)
+        for _ in range(20):
+            observation = environment.step(np.zeros(22)).observation
+        np.testing.assert_allclose(observation["push_force"], [push, turn], rtol=1e-3)
+
+
+def test_the_head_errs_as_the_last_of_the_points_that_are_tracked():
+    """Those of simulations that are not seen anew keep their errors."""
+    random = np.random.default_rng(0)
+    line, ends = random.normal(size=(3, 40, 3)), random.normal(size=(3, 2, 8, 3))
+    state, devices = (
+        kind(**dict.fromkeys(kind._fields)) for kind in (Readings, CoaxialReadings)
+    )
+    state = state._replace(centreline=line, head=line[:, -1])
+    devices = devices._replace(points=ends)
+    noise, states = TrackingNoise(1e-3), [np.random.RandomState(n) for n in range(3)]
+    seen, lines = noise.seen(state, devices, states, np.arange(3))
+    np.testing.assert_array_equal(seen.head, seen.centreline[:, -1])
+    for found, true in ((seen.centreline, line), (lines.points, ends)):
+        assert (found - true).std() == pytest.approx(1e-3, rel=0.15)
+    after, _ = noise.seen(state, devices, states, np.array([1]))
+    changed = (after.centreline != seen.centreline).any(axis=(1, 2))
+    assert changed.tolist() == [False, True, False]
 
 
 def test_biplane_sees_the_vessel_move_whatever_else_is_observed():

@@ -49,6 +49,16 @@ def test_what_goes_deep_in_the_last_physics_step_is_seen():
     assert depth > 1e-3 and doubt
 
 
+def test_the_way_of_a_link_that_swings_is_that_of_its_end():
+    batch = BatchSimulation(suite.make_task("simple1_bca"), 1, num_threads=1)
+    batch.reset()
+    chain = batch.task.scene.catheter
+    batch.batch.qvel[:, batch.rollout.index.dofs.stop - 1] = 20.0
+    way, _ = batch.stepper._way(np.zeros(1), np.zeros(1), forces.DEEPEST)
+    timestep = batch.task.physics_timestep
+    assert way[0] == pytest.approx(20.0 * timestep * chain.link_lengths[-1], rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("task", "options", "limit"),
     [
@@ -95,6 +105,12 @@ def test_shorter_steps_are_equal_in_both_paths(task, options, limit, monkeypatch
             np.testing.assert_array_equal(batch.batch.qpos[index], data.qpos)
             assert [*own.wall_force] == [each[index] for each in step.wall_force]
             assert own.readings.push_force == step.readings.push_force[index]
+            np.testing.assert_array_equal(
+                batch.contacts().force[index], own.contacts(environment.physics).force
+            )
+            stepper = own.rollout._stepper
+            rows = batch.stepper.contact_rows[index]
+            np.testing.assert_array_equal(rows, stepper.contact_rows[0])
     assert 0 < len(refined) < 20 and missed
     timestep = batch.task.physics_timestep
     for index in range(2):

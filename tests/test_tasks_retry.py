@@ -12,10 +12,10 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.tree_file import read_tree
 from cathsim_dmc.physics.readings import part
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import retry
+from cathsim_dmc.tasks import progress, retry, take_offs
 from cathsim_dmc.tasks.objectives import Cannulation
 from cathsim_dmc.tasks.retry import COAXIAL, SINGLE, Memory
-from cathsim_dmc.tasks.route import Place, Route
+from cathsim_dmc.tasks.route import Place, Route, locate
 
 SHORT = retry.RetrySettings(patience=5)
 
@@ -121,6 +121,22 @@ def test_later_attempts_give_a_shaft_more_slack():
     assert memory.retracting[0]  # beside a close take-off
 
 
+def test_each_retry_withdraws_farther_up_to_the_fourth():
+    """15, 22.5, 30 and 37.5 mm, and again from the first."""
+    memory = begun([0.1] * 5, [0.08] * 5, attempts=np.arange(5))
+    memory = memory._replace(stale=np.full(5, SINGLE.patience))
+    ways = 0.08 - goes_on(memory, 0.1, 0.08).turn
+    np.testing.assert_allclose(ways, 1e-3 * np.array([15, 22.5, 30, 37.5, 15]))
+
+
+def test_pushes_are_counted_anew_where_nothing_is_left_to_withdraw():
+    memory, attempts = begun([0.1], [1e-3]), []
+    for _ in range(6):
+        memory = goes_on(memory, 0.1, 1e-3, push=1.0)
+        attempts.append(int(memory.attempts[0]))
+    assert attempts == [0, 0, 1, 1, 1, 2] and SINGLE.push_patience == 2
+
+
 def test_a_head_that_has_strayed_is_withdrawn_all_the_way():
     memory = begun([0.1], [0.05], lost=[COAXIAL.lost_patience])
     memory = goes_on(memory, 0.1, 0.05, excess=1.0, settings=COAXIAL)
@@ -187,6 +203,24 @@ def test_past_a_close_take_off_a_withdrawal_ends_in_the_middle_of_the_branch():
     stays = begun([0.24], [0.15], ostium=[0.22], stale=[COAXIAL.patience])
     stays = goes_on(stays, 0.24, 0.15, excess=middle, settings=COAXIAL)
     assert stays.retracting[0] and stays.attempts[0] == 1
+
+
+def test_a_head_stays_where_it_was_on_the_route_as_long_as_a_tube_reaches_it():
+    """A route that turns back from a narrow vessel into a wide one beside it."""
+    x, y = np.arange(51) * 1e-3, np.arange(1, 15) * 1e-3
+    there = np.stack([x, 0 * x], axis=1)
+    across = np.stack([0 * y + x[-1], y], axis=1)
+    back = np.stack([x[::-1], 0 * x + 15e-3], axis=1)
+    flat = np.concatenate([there, across, back])
+    points = np.column_stack([flat, np.zeros(len(flat))])
+    radii = np.repeat([5e-3, 12e-3], [len(there) + len(across), len(back)])
+    route = Route(points, radii, np.arange(len(points)) * 1e-3)
+    for side, expected in ((4e-3, 20e-3), (6e-3, 95e-3)):
+        head = np.array([[20e-3, side, 0.0]])
+        place = locate(route, head, np.array([20e-3]))
+        assert place.arc_length == pytest.approx(expected)
+    assert place.excess == pytest.approx((15 - 6 - 12) / 12)
+    assert locate(route, head, np.array([np.nan])).arc_length == place.arc_length
 
 
 # In tasks.
@@ -265,6 +299,24 @@ def narrow(tmp_path_factory):
     return read_tree(path).build("ascending")
 
 
+def test_a_lumen_that_is_too_narrow_is_seen_a_centimetre_ahead(monkeypatch):
+    monkeypatch.setattr(progress, "_ROOM", 9.0)
+    task = suite.make_task("simple1_bca", observation=["route", "route_retry"])
+    simulation = BatchSimulation(task, 1, seeds=0, num_threads=1)
+    simulation.reset()
+    rollout, route = simulation.rollout, Route.of(task.objective)
+    least = 9.0 * task.scene.catheter.device.outer_radius
+    tight = route.arc_length[route.radii < least][0]
+    assert 0.03 < tight < route.arc_length[-1]
+    one, first = np.arange(1), np.zeros(1, int)
+    for before in (11.5e-3, 8.5e-3):
+        place = np.atleast_1d(tight - before)
+        there = rollout.resting._replace(head=route.at(place))
+        rollout.progress.see(one, False, first, there, {})
+        assert rollout.memory.arc_length == pytest.approx(place, abs=1e-3)
+        assert rollout.memory.given_up.tolist() == [before < 10e-3]
+
+
 @pytest.mark.slow
 def test_an_episode_ends_gently_before_a_lumen_that_is_too_narrow(narrow):
     options = {"anatomy": narrow, "goal": "lcca", "random": 3, "give_up": True}
@@ -289,6 +341,22 @@ def test_the_expert_alone_needs_no_memory_in_the_task():
     for index in range(2):
         assert not part(memory, index).attempts
     assert not any(name.startswith("progress") for name in simulation.snapshot().arrays)
+
+
+@pytest.mark.parametrize(
+    ("places", "followed", "last"),
+    [
+        ([0.1], (0.1, False), np.inf),
+        ([0.1, 0.125, 0.15, 0.19], (0.15, True), np.inf),
+        ([0.1, 0.14, 0.16], (0.1, False), 0.16),
+    ],
+)
+def test_take_offs_close_to_the_one_before_follow_the_first(
+    monkeypatch, places, followed, last
+):
+    monkeypatch.setattr(take_offs, "take_offs", lambda route: places)
+    assert take_offs.followed(None) == followed
+    assert take_offs.last_apart(None) == last
 
 
 @pytest.mark.parametrize(

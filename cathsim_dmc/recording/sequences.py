@@ -19,7 +19,6 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.imaging.carm import CArm
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
-from cathsim_dmc.imaging.materials import MARKER_LENGTH
 from cathsim_dmc.imaging.options import DETECTOR_SIZE
 from cathsim_dmc.imaging.thickness import surface_thickness
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
@@ -167,11 +166,10 @@ def ostia(anatomy: Anatomy) -> np.ndarray:
 
 def ends(shadow: Shadow) -> np.ndarray:
     """Distal end of a device and where its marker begins (..., 2, 3), m."""
-    length = MARKER_LENGTH if shadow.mu is None else shadow.marker_length
     back = shadow.points[..., ::-1, :]
     found = np.empty((*back.shape[:-2], 2, 3))
     for row in np.ndindex(back.shape[:-2]):
-        found[row] = along(back[row], np.array([0.0, length]))
+        found[row] = along(back[row], np.array([0.0, shadow.marker_length]))
     return found
 
 
