@@ -202,3 +202,9 @@ def test_two_hundred_arches_are_valid_and_distributed_as_the_tables():
     mean, deviation = sampler.ASCENDING_LENGTH
     assert mean < np.mean(lengths) < mean + 0.4 * deviation
     assert np.std(lengths) == pytest.approx(deviation, rel=0.25)
+
+
+def test_a_goal_lies_in_every_artery_of_a_neck_whatever_is_drawn():
+    """The first neck of this seed has a vertebral artery along the subclavian one."""
+    anatomy = arch.build_seed(arch.ArchSeed(25, "II", "normal", True))
+    assert {"rva", "lva"} <= anatomy.goals.keys()

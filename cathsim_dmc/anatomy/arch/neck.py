@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cathsim_dmc.anatomy.arch.draws import Random, normal
+from cathsim_dmc.anatomy.builder import GOAL_DEPTH
 from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.curves import check_septa, ostium_of
 
@@ -100,7 +101,7 @@ def sample_neck(
 
     Raises:
         ValueError: if the arch has no BCA, or the arteries run into each other in each
-            attempt.
+            attempt, or one never leaves its parent far enough for its goal.
     """
     if not {"bca", "lcca", "lsa"} <= tree.vessels.keys():
         raise ValueError(
@@ -110,13 +111,23 @@ def sample_neck(
     while True:
         courses = _drawn(random_state, tree)
         try:
-            check_septa(with_courses(tree, courses))
+            grown = with_courses(tree, courses)
+            check_septa(grown)
+            _check_depths(grown)
         except ValueError:
             attempts -= 1
             if not attempts:
                 raise
         else:
             return courses
+
+
+def _check_depths(tree: VesselTree) -> None:
+    """ValueError if a branch runs beside its parent so long that no goal is in it."""
+    for name, vessel in tree.vessels.items():
+        past = vessel.centreline.length - vessel.ostium
+        if vessel.parent is not None and past < GOAL_DEPTH:
+            raise ValueError(f"{name} ends {1e3 * past:.1f} mm past its ostium")
 
 
 def _drawn(source: Random, tree: VesselTree) -> tuple[Course, ...]:
