@@ -119,8 +119,11 @@ def test_list_as_json(cathsim):
 
 def test_generated_phantom_can_be_navigated(cathsim, tmp_path):
     directory = tmp_path / "arch"
+    directory.mkdir()
+    (directory / "check.png").write_bytes(b"of another one")
     code, out, err = cathsim("phantom", "generate", "type2", "--out", directory)
     assert code == 0, err
+    assert not (directory / "check.png").exists()
     assert str(directory) in out and "bca" in out
     kwargs = {"anatomy": str(directory), "goal": "lcca", "random": 1}
     environment = suite.load("cathsim", "navigate", task_kwargs=kwargs)

@@ -123,6 +123,7 @@ def _require_place(out: Path) -> None:
 
 def _save(anatomy: Anatomy, out: Path) -> None:
     with told_of_replaced([out / _FILE]):
+        (out / _PICTURE).unlink(missing_ok=True)  # of what was there before
         anatomy.save(out)
 
 
