@@ -18,6 +18,7 @@ _PARTIAL = ".partial"
 # What a file may unpack to: bytes, or times its size. Positions and forces shrink to a
 # third or less, and zeros, which a file of zeros could hold for ever, to a thousandth.
 _UNPACKED, _RATIO = 2**28, 100
+_BLOCK = 2**20  # bytes
 _HEADER_1 = np.lib.format.read_array_header_1_0
 _HEADER_2 = np.lib.format.read_array_header_2_0
 
@@ -225,6 +226,20 @@ def write_text(path: str | os.PathLike[str], text: str) -> Path:
 def write_json(path: str | os.PathLike[str], values: Any) -> Path:
     """Write values as JSON atomically, see `atomic_path`; return its path."""
     return write_text(path, json.dumps(values, indent=2) + "\n")
+
+
+def fill(path: str | os.PathLike[str], size: int) -> None:
+    """Write so many random bytes, which no file system compresses.
+
+    It comes before a writer that a full disk ends without an error, as it does HDF5.
+
+    Raises:
+        OSError: the disk is full, or a quota.
+    """
+    block = os.urandom(min(size, _BLOCK))
+    with open(path, "wb") as file:
+        for start in range(0, size, _BLOCK):
+            file.write(block[: size - start])
 
 
 def _temporary(path: Path) -> Path:

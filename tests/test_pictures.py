@@ -193,6 +193,16 @@ def test_without_an_encoder_no_work_is_lost(pushed, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_film_that_its_encoder_cuts_short_is_refused(pushed, tmp_path, small_disk):
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra video")
+    env, episode = pushed
+    (tmp_path / "film.mp4").write_bytes(b"older")
+    surface, short = env.task.scene.anatomy.surface, r"0 of \d+ pictures.*film\.mp4"
+    with small_disk(10_000), pytest.raises(OSError, match=short):
+        animate(episode, surface, tmp_path / "film.mp4", frames=4, width=320)
+    assert [one.read_bytes() for one in tmp_path.iterdir()] == [b"older"]
+
+
 def test_the_fluoroscopy_of_a_state_shows_where_the_head_is(pushed):
     env, _ = pushed
     options = {"size": 96, "contrast": False}

@@ -12,6 +12,7 @@ from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.thickness import surface_thickness
 from cathsim_dmc.recording import coco, image_set, sequences
 from cathsim_dmc.recording.image_set import ImageSetOptions
+from cathsim_dmc.tasks.step import Step
 
 OPTIONS = ImageSetOptions(
     sequences=2, frames=2, views=2, stride=4, size=128, anatomies=(1, 0, 0)
@@ -99,6 +100,26 @@ def test_the_same_seed_gives_the_same_bytes(arch, states, path, tmp_path):
     again = sequences.simulate(arch, "bca", "glide_in_berenstein", OPTIONS, [1])
     for name, values in states.columns.items():
         np.testing.assert_array_equal(values, again.columns[name])
+
+
+def test_a_full_disk_is_told_before_hdf5_meets_it(
+    arch, states, path, tmp_path, small_disk, monkeypatch
+):
+    def never(*_, **__):
+        raise AssertionError("HDF5 ends the process on a full disk")
+
+    monkeypatch.setattr(h5py, "File", never)
+    size = path.stat().st_size - 1
+    with small_disk(size), pytest.raises(OSError, match=r"too large.*/one\.h5"):
+        sequences.write(tmp_path / "one.h5", arch, states, OPTIONS, [2], name="one")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_device_whose_motions_all_fail_is_one_that_does_not_fit(arch, monkeypatch):
+    fails = property(lambda step: np.ones(len(step.errors), bool))
+    monkeypatch.setattr(Step, "physics_error", fails)
+    with pytest.raises(ValueError, match="fails in all .* glide"):
+        sequences.simulate(arch, "bca", "glide", OPTIONS, [1])
 
 
 def test_a_vessel_that_moves_takes_its_mask_and_its_ostia_along(arch):

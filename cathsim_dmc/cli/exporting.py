@@ -40,8 +40,9 @@ def export(
 
     Args:
         out: Directory to write, which must not exist. Of a task: scene.xml with the
-            start of an episode as a keyframe, and task.json. Of a policy: policy.onnx,
-            card.json, selftest.npz and selftest.py.
+            start of an episode as a keyframe, and task.json; a wall that yields or
+            moves is rigid there. Of a policy: policy.onnx, card.json, selftest.npz and
+            selftest.py.
         task: Task of the episode of a policy's self-test; by default its own.
         seed: Seed of the episode; by default 0, of a policy 1,000,000.
         wall: Pieces of a task's wall, see `cathsim phantom export --help`.

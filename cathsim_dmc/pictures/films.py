@@ -1,5 +1,7 @@
 """Files of films: their formats, and the encoder of MP4."""
 
+import contextlib
+import errno
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,6 +32,9 @@ def write_mp4(path: Path, pictures: Sequence[np.ndarray], tick: int, hold: int) 
         pictures: RGB pictures (rows, columns, 3) uint8 of one size, at least one.
         tick: Time that each is shown, ms.
         hold: Time that the last one is shown longer, ms.
+
+    Raises:
+        OSError: the film cannot be written, as on a full disk.
     """
     import imageio_ffmpeg
 
@@ -43,7 +48,22 @@ def write_mp4(path: Path, pictures: Sequence[np.ndarray], tick: int, hold: int) 
             output_params=["-crf", _RATE_FACTOR, "-f", "mp4"],
         )  # fmt: skip
         film.send(None)  # starts the encoder
-        for picture in [*pictures, *held]:
-            film.send(np.ascontiguousarray(picture[:rows, :columns]))
+        with contextlib.suppress(OSError):  # the encoder has ended before
+            for picture in [*pictures, *held]:
+                film.send(np.ascontiguousarray(picture[:rows, :columns]))
         film.close()
+        _require_whole(temporary, len(pictures) + len(held))
     return path
+
+
+def _require_whole(path: Path, count: int) -> None:
+    """Raise OSError unless a film has so many pictures; its encoder says nothing."""
+    import imageio_ffmpeg
+
+    try:
+        found, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    except RuntimeError:  # it lacks its end
+        found = 0
+    if found != count:
+        text = f"the encoder has written {found} of {count} pictures, as on a full disk"
+        raise OSError(errno.EIO, text)

@@ -14,6 +14,7 @@ import numpy as np
 from cathsim_dmc import bounds, extras, suite
 from cathsim_dmc.files import (
     atomic_directory,
+    fill,
     require_folder,
     require_room,
 )
@@ -83,11 +84,11 @@ def write(
 def _check_space(path: Path, buffers: Sequence[Any]) -> None:
     """Raises OSError unless the disk, or a quota, holds the arrays of episodes."""
     # Where HDF5 meets a full disk, it ends the process with a segmentation fault.
-    with open(path, "wb") as file:
-        for one in buffers:
-            arrays = *one.observations.values(), *one.infos.values(), one.actions
-            size = 2**18 + sum(array.nbytes for array in arrays) * 5 // 4  # with chunks
-            file.write(os.urandom(size))  # which no file system compresses
+    size = 0
+    for one in buffers:
+        arrays = *one.observations.values(), *one.infos.values(), one.actions
+        size += 2**18 + sum(array.nbytes for array in arrays) * 5 // 4  # with chunks
+    fill(path, size)
     path.unlink()
 
 

@@ -7,6 +7,7 @@ row of every array belongs to one frame.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -111,7 +112,7 @@ class States(NamedTuple):
 def simulate(
     anatomy: Anatomy, goal: str, kit: str, options: ImageSetOptions, seed: Sequence[int]
 ) -> States:
-    """Pushes and turns devices at random; ValueError if they do not fit."""
+    """Pushes and turns devices at random; ValueError if they do not fit, or fail."""
     from cathsim_dmc import suite
     from cathsim_dmc.simulation.batch import BatchSimulation
 
@@ -148,6 +149,8 @@ def simulate(
         if (moving := rollout.moving) is not None:
             every = map(moving.warp, range(count))
             warps.append([(course.copy(), time) for _, course, time in every])
+    if failed.all():
+        raise ValueError(f"the physics fails in all {count} motions of {kit}")
     columns = {name: np.stack([turn[name] for turn in turns]) for name in turns[0]}
     joined = [
         dataclasses.replace(same[0], points=np.stack([each.points for each in same]))
@@ -290,18 +293,33 @@ def write(
         "units": "m, N, N m, s, kg/m3, degrees, pixels; frame LPS",
     }
     columns: dict[str, h5py.Dataset] = {}
-    with files.atomic_path(path, ".h5") as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update(about)
-        every = frames_of(anatomy, states, options, seed)
-        for start, clip in zip(range(0, rows, count), every, strict=True):
-            for name, values in clip.items():
-                if name not in columns:
-                    pixels, shape = values.dtype == np.uint8, (rows, *values.shape[1:])
-                    kind = _TYPES.get(name, "u1" if pixels else "f4")
-                    packed = {"compression": "gzip", "compression_opts": 1}
-                    columns[name] = file.create_dataset(
-                        name, shape, kind, chunks=(1, *shape[1:]) if pixels else True,
-                        **(packed if name == "mask" else {}),
-                    )  # fmt: skip
-                columns[name][start : start + count] = values
+    every = frames_of(anatomy, states, options, seed)
+    first = next(every)
+    with files.atomic_path(path, ".h5") as temporary:
+        # Where HDF5 meets a full disk, it ends the process with a segmentation fault.
+        files.fill(temporary, _most_bytes(first, rows))
+        with h5py.File(temporary, "w") as file:
+            file.attrs.update(about)
+            clips = itertools.chain([first], every)
+            for start, clip in zip(range(0, rows, count), clips, strict=True):
+                for name, values in clip.items():
+                    if name not in columns:
+                        columns[name] = _column(file, name, values, rows)
+                    columns[name][start : start + count] = values
     return rows
+
+
+def _column(file: Any, name: str, values: np.ndarray, rows: int) -> Any:
+    """A new array of a file for rows such as `values`."""
+    pixels, shape = values.dtype == np.uint8, (rows, *values.shape[1:])
+    kind = _TYPES.get(name, "u1" if pixels else "f4")
+    packed = {"compression": "gzip", "compression_opts": 1} if name == "mask" else {}
+    chunks = (1, *shape[1:]) if pixels else True
+    return file.create_dataset(name, shape, kind, chunks=chunks, **packed)
+
+
+def _most_bytes(clip: dict[str, np.ndarray], rows: int) -> int:
+    """Bytes of a file of so many rows, of which a clip shows some, at most."""
+    held = sum(values.nbytes for name, values in clip.items() if name != "mask")
+    # A quarter more for masks, which shrink, and chunks; 2 KB for what lists a row.
+    return 2**20 + (held // len(clip["image"]) * 5 // 4 + 2**11) * rows

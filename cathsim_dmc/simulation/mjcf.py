@@ -46,7 +46,9 @@ def write_mjcf(
     the episode. `task.json` says the rest, see `describe`.
 
     Devices that slide in each other are one chain whose fields change in every control
-    step; the file has those of the start, and so their combined chain.
+    step; the file has those of the start, and so their combined chain. A wall that
+    yields or moves is rigid in the file, at rest, and its blood stands still; delays of
+    the action and effects of one's own are left out.
 
     Args:
         directory: Directory to write, which must not exist.
