@@ -14,6 +14,7 @@ from test_play_hands import by_hand  # noqa: F401
 
 from cathsim_dmc import agents
 from cathsim_dmc.agents import hub, sharing
+from cathsim_dmc.analysis.force_statistics import millinewtons
 
 huggingface_hub = pytest.importorskip("huggingface_hub", reason="needs the extra hub")
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -69,6 +70,10 @@ def test_a_policy_comes_back_as_it_went(local, cathsim):
     ]  # fmt: skip
     page = (snapshot / "README.md").read_text()
     assert "Success 100 % of 30 episodes" in page and "cathsim eval hf:me/lcca@" in page
+    forces = second.card["evaluation"]["summary"]["forces"]
+    shown = millinewtons(forces["mean_max"]["maximum"]["mean"])
+    assert f"max force {shown} mN" in page
+    assert shown != millinewtons(forces["max"]["maximum"]["mean"])
 
 
 @pytest.mark.parametrize("by", ["cathsim eval", "evaluate", "an earlier checkpoint"])

@@ -130,6 +130,15 @@ def test_a_clone_that_is_continued_learns_the_same(dataset, shapes, tmp_path):
         torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
+def test_no_loss_is_told_without_a_gradient_step(dataset, shapes, tmp_path):
+    config = small(
+        "bc", demonstrations=dataset, gradient_steps=1, steps_per_env=1, total_frames=4
+    )
+    clone, batch = BC(config, shapes, tmp_path), TensorDict({}, [2, 1])
+    assert clone.update(batch, 0.0)["loss"] > 0.0
+    assert "loss" not in clone.update(batch, 0.5)
+
+
 def test_a_clone_of_small_weights_errs_less_where_it_has_not_been(
     dataset, shapes, tmp_path
 ):

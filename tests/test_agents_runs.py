@@ -16,7 +16,7 @@ from test_agents_training import run, small_ppo, small_sac
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc import suite
-from cathsim_dmc.agents import Checkpoint, ConfigError, evaluate
+from cathsim_dmc.agents import Checkpoint, ConfigError, evaluate, pretrained
 from cathsim_dmc.agents.learners import make_config
 from cathsim_dmc.agents.networks import NetworkShapes, make_policy
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
@@ -164,6 +164,36 @@ def test_a_policy_that_observes_less_starts_a_training():
     for other in (("force", "route"), ("tracking", "route_retry")):
         with pytest.raises(ConfigError, match="does not fit .*observation: it has"):
             take_over(policy, config.replace(observation=other), shapes)
+
+
+def test_what_a_policy_of_images_observes_besides_may_grow(tmp_path):
+    """Networks read numbers that are new before the features of the images."""
+    config = make_config(
+        "ppo", hidden=(8,), cnn_features=4, convolutions=((2, 8, 8),),
+        observation=("image", "route", "route_retry"),
+    )  # fmt: skip
+    wider = NetworkShapes(7, (1, 16, 16), 2)
+    policy = make_policy(wider, config)
+
+    def started_from(observation, vector):
+        own = config.replace(observation=observation)
+        shapes = replace(wider, vector=vector)
+        source = make_policy(shapes, own)
+        card = {"task": own.task, "config": own.to_dict(), "shapes": shapes.to_dict()}
+        card |= {"task_kwargs": {}, "training": {}, "evaluation": {}}
+        weights = pretrained.write(tmp_path, "source", source.state_dict(), card)
+        take_over(policy, config.replace(initial_policy=str(weights)), wider)
+        return source
+
+    source = started_from(("image", "route"), 5)
+    images = {environments.PIXELS: torch.randint(256, (3, 1, 16, 16)).byte()}
+    seen, more = torch.randn(3, 5), torch.rand(3, 2)
+    expected = source(TensorDict({environments.VECTOR: seen, **images}, [3]))
+    both = {environments.VECTOR: torch.cat([seen, more], -1), **images}
+    torch.testing.assert_close(policy(TensorDict(both, [3]))["loc"], expected["loc"])
+    # Hidden layers come with numbers alone.
+    with pytest.raises(ConfigError, match=r"does not fit .*sizes: .*\(vector=0"):
+        started_from("image", 0)
 
 
 def test_a_start_that_fails_leaves_no_folder(tmp_path):

@@ -189,7 +189,9 @@ def test_same_seed_same_run(tmp_path, make):
 def test_resuming_continues_counters_rows_and_weights(tmp_path, make):
     first = run(make(total_frames=1_024), tmp_path)
     before = Checkpoint.open(tmp_path).learning_state()
-    assert run(make(total_frames=1_024), tmp_path, resume=True).frames == 1_024
+    again = run(make(total_frames=1_024), tmp_path, resume=True)
+    assert again.frames == 1_024
+    assert again.metrics == pytest.approx(first.metrics, rel=1e-6)
     assert Checkpoint.open(tmp_path).frames == 1_024
 
     second = run(make(total_frames=2_048), tmp_path, resume=True)

@@ -285,6 +285,16 @@ def test_torchrl_takes_the_id():
     assert rollout["image"].shape == (5, 128, 128, 1)
 
 
+def test_torchrl_takes_the_vector():
+    torchrl_envs = pytest.importorskip("torchrl.envs")
+    env = gymnasium.make_vec(TASK, 2, max_steps=3, autoreset_mode="Disabled")
+    rollout = torchrl_envs.GymWrapper(env).rollout(7, break_when_any_done=False)
+    ends = rollout["next", "truncated"][..., 0].nonzero()
+    assert ends.tolist() == [[0, 2], [0, 5], [1, 2], [1, 5]]
+    last = rollout["next", "position"][:, 2]
+    assert last.any() and (last != rollout["position"][:, 3]).any()
+
+
 def test_success_terminates():
     env = gymnasium.make(TASK, goal_radius=1.0)
     env.reset(seed=0)

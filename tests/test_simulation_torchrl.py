@@ -111,6 +111,13 @@ def test_an_action_of_half_precision(batched):
     assert torch.equal(reward(torch.bfloat16), reward(torch.float32))
 
 
+def test_an_action_of_a_network_that_learns(batched):
+    """A rollout does not turn gradients off."""
+    action = torch.zeros(ENVS, 21, requires_grad=True)
+    after = batched.step(batched.reset().set("action", action))
+    assert after["action"].requires_grad and not after["next", "reward"].requires_grad
+
+
 def test_success_is_terminated_in_torchrl():
     from cathsim_dmc.anatomy import phantoms
     from cathsim_dmc.anatomy.parts import Goal

@@ -77,7 +77,8 @@ class CloningLearner(Learner):
             rates: (steps,), learning rate of each step.
 
         Returns:
-            "loss", the mean, and "deviation", root mean square error at the end.
+            "loss", the mean, if there are steps, and "deviation", root mean square
+            error at the end.
         """
         losses = []
         for rate in rates.tolist():
@@ -87,8 +88,7 @@ class CloningLearner(Learner):
             loss = ((mean.tanh() - target).square() * self._weights(target)).mean()
             self.descend(loss)
             losses.append({"loss": loss.detach()})
-        figures = {"loss": 0.0, **means(losses)}
-        return {**figures, "deviation": self._set_deviation(sample(_SAMPLE))}
+        return {**means(losses), "deviation": self._set_deviation(sample(_SAMPLE))}
 
     def _weights(self, target: torch.Tensor) -> torch.Tensor:
         """Weights (n, 1) of the squared errors of the actions `target` (n, A)."""

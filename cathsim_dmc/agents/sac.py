@@ -14,6 +14,7 @@ from cathsim_dmc.agents.config import (
     TUNED_IMAGES,
     TUNED_TRAINING,
     ActorCriticConfig,
+    TrainingConfig,
     positive,
     require,
 )
@@ -86,6 +87,14 @@ class SACConfig(ActorCriticConfig):
         least += f" and num_envs * steps_per_env={self.frames_per_batch}"
         fits = most >= max(self.batch_size, self.frames_per_batch)
         require(fits, "replay_frames", most, least)
+
+    def changed_for_resume(self, other: TrainingConfig) -> dict[str, tuple]:
+        """Settings that a resumed run may not change; its dataset may have moved."""
+        changed = super().changed_for_resume(other)
+        paths = self.demonstrations, vars(other).get("demonstrations")
+        if None in paths and paths[0] != paths[1]:
+            changed["demonstrations"] = paths
+        return changed
 
 
 class SAC(Learner):

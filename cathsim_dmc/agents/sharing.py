@@ -127,7 +127,9 @@ def _summary(card: Mapping[str, Any]) -> str:
     summary = card["evaluation"].get("summary", {})
     if "success" not in summary:
         return f"{text} Not evaluated."
-    force = summary.get("max_force") or summary.get("forces", {}).get("max")
+    forces = summary.get("forces", {})
+    # As `EpisodeForces.max_force`.
+    force = summary.get("max_force") or forces.get("mean_max") or forces.get("max")
     rate = f"{100 * summary['success']:.0f} % of {summary['episodes']} episodes"
     with_force = ""
     if isinstance(force, Mapping) and "maximum" in force:

@@ -264,7 +264,7 @@ def take_over(
     known, wanted = map(_entries, seen)
     same = known == wanted
     pairs["sizes"] = source.shapes, shapes
-    if not same:  # the rest must agree
+    if not same and source.shapes.vector:  # the rest must agree
         pairs["sizes"] = replace(source.shapes, vector=0), replace(shapes, vector=0)
     pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
     if wanted[: len(known)] != known:
@@ -276,7 +276,8 @@ def take_over(
         )
     given, state = source.network.state_dict(), network.state_dict()
     if not same:
-        given = {key: _widened(key, given, state[key]) for key in given}
+        numbers = source.shapes.vector
+        given = {key: _widened(key, given, state[key], numbers) for key in given}
     (middle,) = (v for n, v in given.items() if n.endswith(("log_std", "log_std.bias")))
     if config.initial_std is not None:
         middle = torch.full_like(middle, config.initial_std).log()
@@ -292,17 +293,19 @@ def take_over(
 
 
 def _widened(
-    key: str, given: Mapping[str, torch.Tensor], own: torch.Tensor
+    key: str, given: Mapping[str, torch.Tensor], own: torch.Tensor, known: int
 ) -> torch.Tensor:
     """A tensor with places for the entries of `own` that its policy has not seen.
 
+    They come after the `known` numbers of the vector, before the features of images.
     Weights of these are 0; their statistics are those of a coin, which is 0 or 1.
     """
     old = given[key]
     if old.shape == own.shape:
         return old
-    wide, known = torch.zeros_like(own), old.shape[-1]
-    wide[..., :known] = old
+    wide, features = torch.zeros_like(own), old.shape[-1] - known
+    wide[..., :known] = old[..., :known]
+    wide[..., own.shape[-1] - features :] = old[..., known:]
     module, _, name = key.rpartition(".")
     count = given.get(f"{module}.count")
     if count is not None:

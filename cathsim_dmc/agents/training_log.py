@@ -47,7 +47,7 @@ class TrainingLog:
         frames: Number of frames so far, over all processes of the run.
         episodes: Number of finished episodes likewise.
         window: Figures of the last `EPISODE_WINDOW` of these.
-        row: Last row of metrics.csv that was written; empty before the first.
+        row: Last row of metrics.csv; empty before the first.
         bar: Shows the progress.
     """
 
@@ -64,12 +64,12 @@ class TrainingLog:
         config: TrainingConfig = learner.config
         self.frames, self.episodes = state["frames"], state["episodes"]
         self.window = deque(map(list, state["window"]), maxlen=EPISODE_WINDOW)
-        self.row: dict[str, float | None] = {}
         self._interval = config.metrics_frames
         self._path, self._columns = run / "metrics.csv", [*COLUMNS, *learner.metrics]
         # A killed run has rows beyond its checkpoint.
         rows = read_metrics(self._path)
         self._rows = [r for r in rows if (r["frames"] or 0) <= self.frames]
+        self.row = dict(self._rows[-1]) if self._rows else {}
         self._write()
         self._logger = FigureLogger(config.logger, run, self._rows)
         label, total = f"{config.algorithm} {config.task}", config.total_frames

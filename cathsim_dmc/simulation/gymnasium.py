@@ -177,6 +177,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
     (N, ...) with a mask "_name" (N,) each, as those of Gymnasium's `SyncVectorEnv`.
 
     Attributes:
+        autoreset_mode: When the next episode begins.
         simulation: The batch.
     """
 
@@ -209,8 +210,9 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         seed = task_kwargs.pop("random", None)
         modes = [mode.value for mode in AutoresetMode]
         mode = getattr(autoreset_mode, "value", autoreset_mode)
-        self._mode = AutoresetMode(bounds.choice("autoreset_mode", mode, modes))
-        self.metadata = {**CathSimEnv.metadata, "autoreset_mode": self._mode}
+        mode = bounds.choice("autoreset_mode", mode, modes)
+        self.autoreset_mode = AutoresetMode(mode)
+        self.metadata = {**CathSimEnv.metadata, "autoreset_mode": self.autoreset_mode}
         self.simulation = BatchSimulation(
             suite.make_task(task, **task_kwargs), num_envs, num_threads=num_threads
         )
@@ -264,7 +266,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         """
         _require_open(self.closed)
         waiting = self._ended
-        if waiting.any() and self._mode is AutoresetMode.DISABLED:
+        if waiting.any() and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gymnasium.error.ResetNeeded(
                 f"the episodes of {np.flatnonzero(waiting).tolist()} have ended; call "
                 'reset(options={"reset_mask": mask})'
@@ -278,7 +280,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         terminated, truncated = step.terminated & ~waiting, step.truncated & ~waiting
         reward = np.where(waiting, 0.0, step.outcome.reward)
         self._ended, final = terminated | truncated, {}
-        if self._mode is AutoresetMode.SAME_STEP and self._ended.any():
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
             waiting, self._ended = self._ended, np.zeros(self.num_envs, bool)
             final = _final(
                 _converted(step.observation, self._dtype), step.info(), waiting

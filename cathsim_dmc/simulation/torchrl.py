@@ -142,8 +142,9 @@ class BatchedEnv(EnvBase):
         return self._tensors(self.simulation.reset(chosen))
 
     def _step(self, tensordict: TensorDict) -> TensorDict:
-        # Numpy has no bfloat16.
-        step = self.simulation.step(tensordict["action"].cpu().double().numpy())
+        # Numpy has neither bfloat16 nor gradients.
+        action = tensordict["action"].detach().cpu().double()
+        step = self.simulation.step(action.numpy())
         result = self._tensors(step)
         result["reward"] = self._tensor(step.outcome.reward)[:, None]
         result["terminated"] = self._tensor(step.terminated)[:, None]
