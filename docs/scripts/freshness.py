@@ -39,13 +39,16 @@ def moved(parts: list[str], commit: str) -> list[str]:
 @functools.cache
 def _has_moved(part: str, commit: str) -> bool:
     for span in TABLE["equal"]:
-        inside = _is_before(span["first"], commit) and _is_before(commit, span["last"])
-        if part in span["parts"] and inside:
-            commit = span["last"]
+        first, last = span["first"], span["last"]
+        if part not in span["parts"]:
+            continue
+        if _is_before(first, commit) and _is_before(commit, last):
+            commit = last
     changed = figures.git("diff", "--quiet", commit, "--", *TABLE["parts"][part])
     return changed.returncode != 0
 
 
+@functools.cache
 def _is_before(first: str, last: str) -> bool:
     return not figures.git("merge-base", "--is-ancestor", first, last).returncode
 
