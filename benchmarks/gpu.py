@@ -98,7 +98,9 @@ class Report:
         if self._path is not None:
             files.write_json(self._path, self.found)
 
-    def attempt(self, part: str, measure: Callable, *given: Any, seconds: float):
+    def attempt(
+        self, part: str, measure: Callable, *given: Any, seconds: float
+    ) -> None:
         """Adds a row that is measured, if so many seconds are left for it."""
         if not self.has(seconds):
             return

@@ -300,8 +300,8 @@ class ActorCriticConfig(TrainingConfig):
             reads in place of the images that the policy reads (Pinto et al. 2018,
             "Asymmetric Actor Critic for Image-Based Robot Learning"); only the
             training needs them. None lets it read what the policy reads.
-        torch_compile: Whether torch compiles the loss and its gradient, which takes a
-            minute and a C++ compiler; gradient steps then take about half the time.
+        torch_compile: Whether torch compiles the loss and its gradient, for faster
+            gradient steps (docs/training.md); it needs a C++ compiler and a minute.
     """
 
     resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable | {"torch_compile"}
