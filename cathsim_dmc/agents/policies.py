@@ -154,9 +154,9 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     """A policy from its name, file, run or function.
 
     Args:
-        policy: Name in `POLICIES`, "pretrained:NAME", "hf:OWNER/NAME" of the hub, file
-            of a pretrained policy, directory of a run or of a checkpoint, Checkpoint,
-            policy, or function as for `FunctionPolicy`.
+        policy: Name in `POLICIES`, "pretrained:NAME", "hf:OWNER/NAME@COMMIT" of the
+            hub, file of a pretrained policy, directory of a run or of a checkpoint,
+            Checkpoint, policy, or function as for `FunctionPolicy`.
         seed: Seed of a named policy's own randomness.
 
     Raises:
