@@ -320,6 +320,18 @@ def test_many_triangles_are_decimated(tmp_path):
     assert lumen.surface.volume == pytest.approx(before, rel=5e-3)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_decimation_glues_nothing_together(seed):
+    """Where noise folds the surface, edges would have three or more triangles."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=10e-3)
+    noise = np.random.default_rng(seed).normal(size=(len(ball.vertices), 1))
+    vertices = ball.vertices * (1.0 + 0.1 * noise)
+    points, faces = decimated(vertices, ball.faces, 1500)
+    assert len(faces) <= 1500 and (edge_counts(faces)[1] == 2).all()
+    size = [np.linalg.norm(each, axis=1).mean() for each in (points, vertices)]
+    assert size[0] == pytest.approx(size[1], rel=0.04)
+
+
 def test_axes_turn_a_lying_scan(y_mesh, tmp_path):
     vertices, faces = y_mesh
     np.testing.assert_array_equal(upright("LPS"), np.eye(3))
