@@ -135,7 +135,7 @@ _made_table = functools.cache(_Table)
 
 
 def _get_table() -> _Table:
-    """The one table, also of threads that ask for it first at the same time."""
+    """The table of the process, also for threads that first ask at the same time."""
     with _LOCK:
         return _made_table()
 
@@ -151,6 +151,9 @@ def register(
 
     Returns:
         Values of `geom_user` of its carrier.
+
+    Raises:
+        MemoryError: if the table of the process is full.
     """
     from cathsim_dmc.collision.table import BORE, LUMEN, MARK, PART
 
@@ -158,11 +161,11 @@ def register(
     digest = (
         field.digest if whole else hashlib.sha256(bytes(field.arrays[0].data)).digest()
     )
-    if motion is not None:  # another motion of an equal wall has an entry of its own
+    if motion is not None:  # equal walls with different motions have own entries
         motion = np.ascontiguousarray(motion)
         digest = hashlib.sha256(digest + motion.tobytes()).digest()
     parts = [int.from_bytes(digest[3 * k : 3 * k + 3], "big") % PART for k in range(3)]
-    parts[0] = parts[0] or 1  # a key of 0 is none
+    parts[0] = parts[0] or 1  # a key of 0 marks a free slot
     (low, high), kind = field.box, LUMEN if whole else BORE
     known, key = _get_table(), _key(parts)
     with _LOCK:
@@ -176,10 +179,10 @@ class Registered(NamedTuple):
     """A wall in the table.
 
     Attributes:
-        is_bore: Whether it is a bore.
+        is_bore: Whether the wall is a bore.
         middle: (3,) m, centre of the carrier in the frame of the wall.
-        arrays: Of the field, or the line of the bore.
-        lattice: Of its motion; None for a wall at rest.
+        arrays: Arrays of the field, or the line of the bore.
+        lattice: Lattice of its motion; None for a wall at rest.
     """
 
     is_bore: bool

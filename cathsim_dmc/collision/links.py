@@ -1,4 +1,4 @@
-"""Links of devices in MuJoCo's structs, as the laws take them, compiled."""
+"""Links of devices in MuJoCo's structs, read for the laws; compiled."""
 
 import math
 
@@ -16,7 +16,7 @@ _CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 
 @inlined
 def seen_from(data, geom, place):
-    """A place (3) of the world in the frame of a geom, m."""
+    """Point (3) m of the world, in the frame of a geom."""
     centre = data_field(data, "geom_xpos")[geom]
     apart = (place[0] - centre[0], place[1] - centre[1], place[2] - centre[2])
     return into(data_field(data, "geom_xmat")[geom], apart)
@@ -42,7 +42,7 @@ def is_capsule(model, geom):
 
 @inlined
 def capsule_of(model, data, entry, geoms):
-    """A link in the frame of the field of a carrier.
+    """`Capsule` of a link, in the frame of a carrier's field.
 
     Args:
         model: Address of `mjModel`.
@@ -63,7 +63,7 @@ def capsule_of(model, data, entry, geoms):
 
 @inlined
 def is_finite(capsule):
-    """Whether the place and the axis of a capsule are numbers."""
+    """Whether the position and the axis of a capsule are finite."""
     local, axis = capsule.centre, capsule.axis
     return math.isfinite(local[0] + local[1] + local[2] + axis[0] + axis[1] + axis[2])
 
@@ -79,9 +79,9 @@ def law_of(model, wall, geom, margin):
 
 @compiled
 def _swept(model, data, geom):
-    """Ways of a geom's centre (3) m and turn (3) rad in a physics step, in the world.
+    """Displacement (3) m of a geom's centre and rotation (3) rad in a physics step.
 
-    They are those at the present velocity, from the motion of each degree of freedom.
+    World frame, at the present velocity, which is summed over the degrees of freedom.
     """
     body = model_field(model, "geom_bodyid")[geom]
     parents = model_field(model, "body_parentid")
@@ -121,7 +121,7 @@ def sweep(model, data, geoms, capsule, law):
 
 @compiled
 def is_in_box(model, data, geom, place):
-    """Whether a place (3) of the world is in the box of a geom; False for geom -1."""
+    """Whether a point (3) of the world is in the box of a geom; False for geom -1."""
     if geom < 0:
         return False
     x, y, z = seen_from(data, geom, place)

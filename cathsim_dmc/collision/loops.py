@@ -1,8 +1,8 @@
 """Capsules and spheres against walls at rest, in MuJoCo's collision table.
 
-The law is `laws.contact`. MuJoCo calls `of_link`, which reads the link and the
-wall from its structs and writes the contacts of the law where it takes them. `moving`
-has that of walls that move, which takes longer to compile.
+The law is `laws.contact`. MuJoCo calls `of_link`, which reads the link and the wall
+from MuJoCo's structs and writes the contacts into MuJoCo's buffer. `moving` has the
+function for walls that move, which takes longer to compile.
 """
 
 import numpy as np
@@ -45,7 +45,7 @@ _RAW = 80  # bytes of a contact for MuJoCo: distance, position and frame
 
 @inlined
 def write(model, data, geoms, law, found, count, raw):
-    """Writes contacts of a law where MuJoCo takes them; returns their number.
+    """Writes contacts into MuJoCo's buffer; returns their number.
 
     Args:
         model: Address of `mjModel`.
@@ -54,7 +54,7 @@ def write(model, data, geoms, law, found, count, raw):
         law: `laws.contact.Law`.
         found: (MOST, CONTACT), contacts in the frame of the wall.
         count: Number of contacts.
-        raw: Address of MuJoCo's contacts.
+        raw: Address of MuJoCo's buffer of contacts.
     """
     centre = data_field(data, "geom_xpos")[geoms[0]]
     turned = data_field(data, "geom_xmat")[geoms[0]]
@@ -76,10 +76,10 @@ def write(model, data, geoms, law, found, count, raw):
 
 @compiled
 def at_rest(model, data, raw, geoms, margin, entry):
-    """Number of contacts, written, of a link and a wall at rest."""
+    """Writes the contacts of a link with a wall at rest; returns their number."""
     wall = wall_of(entry)
     capsule = capsule_of(model, data, entry, geoms)
-    # What is no number has no place in a lattice; MuJoCo's checks of the state tell.
+    # A place that is not finite is in no cell; MuJoCo's checks report such a state.
     if not is_finite(capsule):
         return np.int32(0)
     law = law_of(model, wall, geoms[0], margin)
@@ -92,7 +92,7 @@ def at_rest(model, data, raw, geoms, margin, entry):
 
 @compiled
 def collide(model, data, raw, geoms, margin):
-    """Contacts of a capsule or a sphere with a box, which may carry a field."""
+    """Writes the contacts of a link with a box or a carrier; returns their number."""
     table, (link, box) = address_of(SYMBOL), geoms
     key = key_of(model, box)
     if key == 0:

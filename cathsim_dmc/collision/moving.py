@@ -39,13 +39,13 @@ from cathsim_dmc.laws.wall import clearance_along
 
 @compiled
 def in_motion(model, data, raw, geoms, margin, entry):
-    """Number of contacts, written, of a link and a wall that moves."""
+    """Writes the contacts of a link with a wall that moves; returns their number."""
     wall = wall_of(entry)
     capsule = capsule_of(model, data, entry, geoms)
     if not is_finite(capsule):
         return np.int32(0)
     layout = motion_of(model, data)
-    # The sheath rests, whatever moves past it.
+    # The sheath does not move: a link in it that is past the open end is free.
     centre = data_field(data, "geom_xpos")[geoms[0]]
     if is_in_box(model, data, word(layout + BORE), centre):
         if clearance_along(wall, capsule, 0.0) >= FREE:
@@ -65,7 +65,7 @@ def in_motion(model, data, raw, geoms, margin, entry):
 
 @compiled
 def collide_moving(model, data, raw, geoms, margin):
-    """As `loops.collide`, of fields that move in this simulation, too."""
+    """As `loops.collide`, also for fields that move in this simulation."""
     key = key_of(model, geoms[1])
     entry = entry_of(address_of(SYMBOL), key) if key != 0 else 0
     if entry == 0 or word(entry + MOTION_ENTRY) == 0 or motion_of(model, data) == 0:

@@ -120,7 +120,7 @@ def field(struct: str, name: str) -> tuple[int, Any, Any]:
             kind, offset = kind.fields[part][:2]
             place += offset
         known = operator.attrgetter(name)(owner)
-        if struct == "mjContact":  # which contains its arrays
+        if struct == "mjContact":  # contains its arrays, without pointers
             proved = known.ctypes.data == address + place
             proved &= known.strides[0] == layout(struct).itemsize
         else:
@@ -160,10 +160,9 @@ def _array_at(context, builder, kind, place, shape):
 def _reader(struct: str) -> Any:
     @_typed
     def read(_, address, name):
-        """A field of the struct at an address: a number, or an array.
+        """Field of the struct at an address, a number or an array, by a literal name.
 
-        An array (COUNT,) or (COUNT, n) owns nothing, and nothing checks its bounds. The
-        name is a literal.
+        An array (COUNT,) or (COUNT, n) is a view, and its bounds are not checked.
         """
         if not isinstance(name, types.StringLiteral):
             return None
@@ -171,7 +170,7 @@ def _reader(struct: str) -> Any:
         shape, inside = (), struct == "mjContact"
         if isinstance(known, np.ndarray):
             held, shape = known.dtype, known.shape[1:]
-            # Widths that a model chooses are not known here.
+            # The widths of user fields depend on the model.
             wide = () if name.literal_value.endswith("_user") else shape
             shape = shape or (1,) if inside else (COUNT, *wide)
         kind = from_dtype(held)
@@ -207,7 +206,7 @@ def _contact_at(data, number):
 
 
 def symbol(name: str, count: int) -> np.ndarray:
-    """Array (count,) of int64, zeros, whose address has a name for `address_of`."""
+    """Zeros (count,) of int64, whose address compiled code gets from `address_of`."""
     array = np.zeros(count, np.int64)
     llvm.add_symbol(name, array.ctypes.data)
     return array
@@ -215,7 +214,7 @@ def symbol(name: str, count: int) -> np.ndarray:
 
 @_intrinsic
 def address_of(_, name):
-    """Address (int64) of the array that `symbol` has given a name, a literal."""
+    """Address (int64) of the array of `symbol` with a name, a literal."""
     if not isinstance(name, types.StringLiteral):
         return None
 
@@ -270,7 +269,7 @@ longs = _array(types.int64)
 def stacked(_, rows, columns):
     """Scratch (rows, columns) of float64 on the stack of the calling function.
 
-    Both sizes are literals. It holds anything at first.
+    Both sizes are literals. The array is not initialised.
     """
     sizes = rows, columns
     if not all(isinstance(size, types.IntegerLiteral) for size in sizes):
@@ -288,7 +287,7 @@ def stacked(_, rows, columns):
 
 
 def _call(builder, values, result, variadic=False):
-    """Calls the function at the address that is the first value, on the others."""
+    """Calls the function at the address `values[0]` with the other values."""
     kinds = [value.type for value in values[1:]]
     kind = ir.FunctionType(result, kinds[:1] if variadic else kinds, var_arg=variadic)
     place = builder.inttoptr(values[0], kind.as_pointer())
@@ -330,14 +329,14 @@ def call_error(_, address, text, number):
 
 @register_jitable
 def call_before(table, model, data):
-    """Calls the callback whose address a table holds, if any; see `callbacks`."""
+    """Calls the callback whose address is at `table`, if any (`physics.dispatcher`)."""
     before = word(table)
     if before != 0:
         call_callback(before, model, data)
 
 
 class NotCompiledError(ValueError):
-    """What numba says of a function that it cannot compile, in one line."""
+    """A function cannot be compiled; the message is numba's, in one line."""
 
 
 class Callback:
@@ -348,7 +347,7 @@ class Callback:
 
     @functools.cached_property
     def made(self) -> CFunc:
-        """What numba has made of it."""
+        """The compiled function; raises NotCompiledError."""
         options = {"nopython": True, "error_model": "numpy"}
         kinds = sigutils.normalize_signature(self._signature)
         own = compiled_parts.PackageCompiler
@@ -364,7 +363,7 @@ class Callback:
 
     @property
     def address(self) -> int:
-        """Where it stands in memory."""
+        """Address of the compiled function."""
         return int(self.made.address or 0)
 
     @property
@@ -374,10 +373,10 @@ class Callback:
 
 
 def callback(signature: str, cache: bool = True) -> Callable[[Callable], Callback]:
-    """Compiles a function that C calls, once on each machine as `compiled` does.
+    """Decorator of a function that C calls, compiled once on each machine if cached.
 
     Args:
         signature: numba's, such as "void(int64, int64)"; a pointer is an int64.
-        cache: Whether it is kept on disk.
+        cache: Whether the compiled function is kept on disk.
     """
     return lambda function: Callback(function, signature, cache)

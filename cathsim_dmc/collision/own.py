@@ -1,4 +1,4 @@
-"""Recognition of the simulations that have effects of this package.
+"""Recognition of simulations with effects of this package.
 
 MuJoCo calls its callbacks for every model of a process. In a simulation with effects
 the last number of `userdata` is the label of its layout. A table of the process holds
@@ -33,7 +33,7 @@ LINK, LINKS, JOINTS, PLACES = range(72, 104, 8)
 WALL, BORE, MOTION = 104, 112, 120
 # 1 + offset of the parameters of a law that has raised an error, 0 for none.
 FAULT = 128
-# Place of the parameters of a compliant wall in `userdata`, -1 for none.
+# Offset of the parameters of a compliant wall in `userdata`, -1 for none.
 SHARING = 136
 WORDS, CAPACITY, SPAN = 18, 1 << 12, 1 << 52
 SYMBOL = "cathsim_layouts"
@@ -84,9 +84,9 @@ def motion_of(model, data):
 
 @compiled
 def sharing_of(model, data, geom):
-    """Place in `userdata` of which contacts of a link share a spring, MOST numbers.
+    """Offset in `userdata` of a link's MOST numbers of `laws.compliance.Sharing`.
 
-    -1 where no wall of the simulation is compliant, or the geom is no link.
+    -1 if the simulation has no compliant wall, or the geom is no link.
     """
     layout = layout_of(model, data)
     if layout == 0 or word(layout + SHARING) < 0:

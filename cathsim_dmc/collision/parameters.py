@@ -1,4 +1,4 @@
-"""Parameters of laws in memory, as the NamedTuples that compiled laws take."""
+"""Parameters of laws in `userdata`, as the NamedTuples that compiled laws take."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from numba.extending import intrinsic, overload
 
 from cathsim_dmc.laws.parameters import Array
 
-# Compiled code calls what this decorates without its first argument.
+# Compiled code calls intrinsics without their first argument.
 _intrinsic: Any = intrinsic
 
 
@@ -25,11 +25,11 @@ def call_law(_, address, model, data, layout, start):
 
 
 def unpacked(kind, row, links, joints):
-    """The parameters of a simulation, a NamedTuple of a class, of views.
+    """Parameters of a simulation: a NamedTuple of numbers and views.
 
     Args:
-        kind: The class, see `laws.parameters`.
-        row: (P or more,) float64, the numbers of its fields one after the other.
+        kind: Class of the NamedTuple, see `laws.parameters`.
+        row: (P or more,) float64, the values of its fields one after the other.
         links: Number of links.
         joints: Number of joints of two hinges.
     """

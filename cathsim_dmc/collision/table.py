@@ -14,21 +14,21 @@ from cathsim_dmc.compiled import inlined
 from cathsim_dmc.laws.field import FieldArrays
 from cathsim_dmc.laws.wall import Wall
 
-# Words in the head of the table: the functions that stood in MuJoCo's collision table,
-# and how an error is raised.
+# Byte offsets in the head of the table: the functions that this package has replaced in
+# MuJoCo's collision table, `mju_error` and its message.
 OF_CAPSULE, OF_SPHERE, ERROR, MESSAGE = range(0, 32, 8)
 HEAD = 4  # words
-# Words of an entry: key, kind, addresses of the place of the carrier's middle in the
-# field's frame, of head, coarse lattice, index and samples of a lumen or of the line of
-# a bore, and of the lattice of its motion.
+# Words of an entry: key, kind, addresses of the carrier's centre in the field's frame,
+# of head, coarse lattice, bricks and samples of a lumen or of the line of a bore, and
+# of the lattice of its motion.
 ENTRY, CAPACITY = 8, 1 << 14
 KIND, MIDDLE, ARRAYS, MOTION_ENTRY = 8, 16, 24, 56  # bytes from the entry
 LUMEN, BORE = 0, 1
-# Numbers of a carrier geom: the mark, then the key of its field in three parts, which
-# any printing of a model file keeps.
+# Values of `geom_user` of a carrier: the mark, then the key of its field in three
+# parts, small enough that a printed model file keeps every digit.
 USER, MARK, PART = 4, 730155.0, 1 << 20
 SYMBOL = "cathsim_fields"
-# Before anything that knows it by the symbol is loaded.
+# Allocated before code that refers to the symbol is loaded.
 TABLE = symbol(SYMBOL, HEAD + ENTRY * CAPACITY)
 
 

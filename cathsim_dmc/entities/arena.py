@@ -8,8 +8,8 @@ from cathsim_dmc.entities.contact import FRICTION_STIFFNESS
 BLOOD_DENSITY = 1060.0  # kg/m^3
 GRAVITY = 9.81  # m/s^2
 
-# Forces on the wall are within 0.02 % of the exact solution's on average. At rest what
-# is left undone in each step can add up to a vibration (docs/validation.md).
+# Forces on the wall are within 0.02 % of those of the exact solution on average. At
+# rest, the residuals of the steps can add up to a vibration (docs/validation.md).
 SOLVER_TOLERANCE = 1e-6
 
 
@@ -27,7 +27,7 @@ class AngiographyArena(composer.Arena):
         Args:
             device_density: mean density of the device, kg/m³; gravity is reduced by
                 its buoyancy in blood.
-            tolerance: of the solver of contacts.
+            tolerance: tolerance of the contact solver.
         """
         super()._build(name="arena")
         root = self._mjcf_root

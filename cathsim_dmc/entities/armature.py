@@ -22,7 +22,7 @@ def hinge_armatures(device: Device, lengths: np.ndarray) -> np.ndarray:
 
     Args:
         device: The device, in blood.
-        lengths: (n,) of the links from proximal to distal, m.
+        lengths: (n,), lengths of the links from proximal to distal, m.
     """
     ends = np.cumsum(lengths)
     middles, hinges = ends - lengths / 2, ends[:-1]
@@ -30,7 +30,7 @@ def hinge_armatures(device: Device, lengths: np.ndarray) -> np.ndarray:
     tip, shaft = device.tip.bending_stiffness, device.shaft.bending_stiffness
     half = lengths / 2 / np.where(in_tip, tip, shaft)
     compliances = half[:-1] + half[1:]
-    # Rayleigh's quotient of the free end as its weight would bend it.
+    # Rayleigh's quotient of the free end, with its deflection under its own weight.
     free = hinges > ends[-1] - FREE_END
     arms = np.maximum(middles - hinges[free, None], 0.0)
     masses = (device.linear_density + carried_mass([device])) * lengths

@@ -87,7 +87,7 @@ def _rest_angles(device: devices.Device, lengths: np.ndarray):
 
 
 def _twists(device: devices.Device, lengths: np.ndarray, count: int):
-    """Compliance of the torsion hinges, rad/(N·m), by link: of equal parts, ∫ds/GJ."""
+    """Compliances ∫ds/GJ of evenly spread torsion hinges, rad/(N·m), by link."""
     last = len(lengths) - 1
     bounds.whole("torsion_joints", count, 0, last)  # one at each joint
     if count == 0:

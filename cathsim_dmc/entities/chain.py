@@ -13,7 +13,7 @@ from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.posture import x_first
 
 # Physics step of the tasks, s. An implicit step of length h damps a spring like a
-# relaxation time of h, so the hinges have that much less.
+# relaxation time of h, so the dampers of the hinges are weaker by that much.
 TIMESTEP = 4e-3
 # Rotor inertia of the torsion hinges, kg·m². They are softer, so a larger one would
 # delay the twist by more than a few milliseconds.
@@ -46,17 +46,25 @@ TIP_COLOUR = (0.95, 0.75, 0.1, 1.0)
 
 
 def servo_stiffness(inertia: float, speed: float, acceleration: float) -> float:
-    """Stiffness of a critically damped servo by its platform's limits, N/m or N·m/rad.
+    """Stiffness of a critically damped servo from the limits of its platform.
 
-    Such a platform is accelerated by 2 v √(K/m) / e at most where its command turns
-    from one speed v to the other. The servo must be so soft that its largest force F
-    moves the platform within a physics step by less than F/K.
+    A command that reverses from the speed v to -v accelerates such a platform of mass m
+    by at most 2 v √(K/m) / e. The servo must be so soft that its largest force F moves
+    the platform by less than F/K within a physics step.
+
+    Args:
+        inertia: kg or kg·m².
+        speed: m/s or rad/s.
+        acceleration: m/s² or rad/s².
+
+    Returns:
+        N/m or N·m/rad.
     """
     return inertia * (np.e * acceleration / (2 * speed)) ** 2
 
 
 def hinge_time(material: Any, timestep: float) -> Any:
-    """Damping over stiffness of a hinge whose material has a relaxation time, s.
+    """Damping divided by stiffness of a hinge, s: relaxation time less physics step.
 
     Args:
         material: relaxation time of the material, s; a number or an array.
@@ -66,18 +74,18 @@ def hinge_time(material: Any, timestep: float) -> Any:
 
 
 class Links(NamedTuple):
-    """What a chain of n links is made of, from proximal to distal.
+    """Properties of a chain of n links, from proximal to distal.
 
     Attributes:
         lengths: (n,), m.
-        radius: of all links, m.
-        masses: n, kg.
-        compliances: n - 1 of the joints in bending, rad/(N·m).
-        armatures: n - 1, rotor inertia of their hinges, kg·m², see `armature`.
-        rest_angles: n - 1 pairs, of the hinges about x and y, rad.
+        radius: radius of all links, m.
+        masses: n masses, kg.
+        compliances: n - 1 bending compliances of the joints, rad/(N·m).
+        armatures: n - 1 rotor inertias of their hinges, kg·m², see `armature`.
+        rest_angles: n - 1 pairs, rest angles of the hinges about x and y, rad.
         axial_stiffness: EA of the whole device, N.
-        tip: number of the first link that is drawn as part of the tip.
-        steering: torque of the motors about x and y, N·m, by link.
+        tip: index of the first link that is drawn as part of the tip.
+        steering: torque of the motors about x and y at full command, N·m, by link.
         twists: compliance of the torsion hinges, rad/(N·m), by link.
     """
 
@@ -97,18 +105,18 @@ class Chain(composer.ModelWrapperEntity):
     """Links with hinges about x and y; +z of every link points to the distal end.
 
     The origin of the entity is the position of the distal end at zero insertion.
-    `Catheter` and `DeviceStack` say what the links are made of.
+    `Catheter` and `DeviceStack` define the properties of the links.
 
     Attributes:
-        coaxial: Whether the devices are coaxial ones, each moved by itself.
+        coaxial: Whether the devices are coaxial, each moved by its own drives.
         devices: The devices, from the innermost outwards.
         device: The device; of coaxial devices the outermost, which the sheath guides.
         density: Effective density, kg/m³, that determines the buoyancy in blood.
         timestep: Physics step with which the chain is simulated, s.
         stroke: Longest insertion, m.
         link_lengths: (n,), of the links from proximal to distal, m.
-        distal_shares: (n - 1,), fraction of the compliance of each joint that is that
-            of the half link beyond it; of coaxial devices, of uniform ones.
+        distal_shares: (n - 1,), fraction of each joint's compliance that belongs to the
+            half link distal of it; of coaxial devices, as for a uniform rod.
         links: Bodies from proximal to distal.
         link_geoms: Their capsules.
         head: Site at the distal end.
@@ -140,7 +148,7 @@ class Chain(composer.ModelWrapperEntity):
         rotation: bool,
         timestep: float,
     ) -> None:
-        """Builds base, links, head, motors and sensors; `devices` are there."""
+        """Builds base, links, head, motors and sensors; `devices` must be set."""
         bounds.number("stroke", stroke, unit="m", positive=True)
         self.device = self.devices[-1]
         self.stroke, self.timestep, self.link_lengths = stroke, timestep, links.lengths
@@ -215,7 +223,7 @@ class Chain(composer.ModelWrapperEntity):
         return base
 
     def _add_shaft(self, links: Links):
-        """The part of the device that the follower holds, drawn only."""
+        """Adds the part of the device that the follower holds, drawn only."""
         self.links[0].add(
             "geom",
             name="shaft",
@@ -239,7 +247,7 @@ class Chain(composer.ModelWrapperEntity):
         )
 
     def _add_bends(self, body, index: int, links: Links):
-        """Bending hinges of a link, x before y."""
+        """Adds the bending hinges of a link; returns them, x before y."""
         compliance = links.compliances[index - 1]
         rest = dict(zip("xy", links.rest_angles[index - 1], strict=True))
         ways = {"x": (1, 0, 0), "y": (0, 1, 0)}
@@ -257,7 +265,7 @@ class Chain(composer.ModelWrapperEntity):
         return bends["x"], bends["y"]
 
     def _add_motors(self, links: Links):
-        """The motors of the tip, which add no stiffness, and the servos of the base."""
+        """Adds the motors of the tip, without stiffness, and the servos of the base."""
         drives, tip = self.mjcf_model.actuator, []
         bounded = {"ctrllimited": True, "ctrlrange": (-1, 1)}
         for number, (index, torque) in enumerate(links.steering.items()):
@@ -272,7 +280,7 @@ class Chain(composer.ModelWrapperEntity):
             if joint is None:
                 continue
             speed, acceleration, effort = limits
-            # On the integral of a speed, see `laws.drive`.
+            # The servo follows the integral of a speed, see `laws.drive`.
             stiffness = servo_stiffness(joint.armature, speed, acceleration)
             damping = 2 * (stiffness * joint.armature) ** 0.5
             servos.append(

@@ -31,7 +31,7 @@ class Stack:
         spans: (J,), length of rod of each joint, half of its two links, m.
         tables: Sections of the devices along the chain.
         sections: Outer sections of the devices.
-        arms: (K,), radius of each device by its friction ratio, m.
+        arms: (K,), radius of each device times its friction ratio, m.
     """
 
     def __init__(self, devices: Sequence[Device], link_lengths: np.ndarray):
@@ -68,7 +68,7 @@ class Stack:
         self.arms = ratios * radii
 
     def overlap(self, gaps: ArrayLike) -> laws.Overlap:
-        """Properties by the distances (K,) of the devices' ends from the chain's, m."""
+        """`Overlap` of devices whose ends are `gaps` (K,) from the chain's end, m."""
         found, scratch = stack_memory.overlap(self.tables), stack_memory.scratch
         laws.overlap(
             np.array(gaps, np.float64), self.tables, scratch(self.tables), found
@@ -76,7 +76,7 @@ class Stack:
         return found
 
     def links(self, overlap: laws.Overlap, friction: float) -> laws.Links:
-        """Properties of the links by the Coulomb coefficient of an uncoated device."""
+        """`Links` for a Coulomb coefficient of an uncoated device on the wall."""
         found = stack_memory.links(self.tables)
         laws.links(overlap, self.link_lengths, friction, self.sections, found)
         return found
@@ -88,7 +88,7 @@ def _disc(radius: float) -> float:
 
 
 def carried_mass(devices: Sequence[Device]) -> float:
-    """Mass per length of the blood that devices in each other carry, kg/m.
+    """Mass per length of the blood that coaxial devices carry, kg/m.
 
     Across its axis, a cylinder moves as much blood around it as it displaces (potential
     flow), and all blood in its lumen.

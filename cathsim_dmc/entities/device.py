@@ -130,7 +130,7 @@ class Device:
             bounds.refuse(angle, self.steering_angle, "in [0, π/2) rad for each joint")
 
     def shadow(self, points: np.ndarray) -> Shadow:
-        """The device as X-rays meet it at points (..., n, 3), m, from base to tip."""
+        """X-ray shadow of the device along points (..., n, 3), m, from base to tip."""
         return Shadow(
             points,
             radius=self.outer_radius,

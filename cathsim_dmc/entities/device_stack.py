@@ -23,8 +23,8 @@ LEAD = 0.03
 class DeviceStack(Chain):
     """Coaxial devices, each pushed and turned at its base, on one chain of links.
 
-    The chain ends with the device that reaches farthest, the leading one, and has one
-    motor, which drives that. `physics.sliding` moves the devices and writes the
+    The chain ends where the leading device does, the one that reaches farthest. Its
+    single motor drives that device. `physics.sliding` moves the devices and writes the
     properties of the links once per control step. An action has two entries for each
     device, from the innermost outwards: translation and rotation.
 
@@ -82,7 +82,7 @@ class DeviceStack(Chain):
         overlap = self.stack.overlap(self.start_gaps)
         rest = np.empty((len(self.stack.spans), 2))
         unloaded_hinges(overlap.rest.sum(axis=0).astype(complex), rest)
-        # Each device may reach beyond the others.
+        # Any device may lead, so each hinge has the least armature of all devices.
         alone = [hinge_armatures(one, self.stack.link_lengths) for one in self.devices]
         tip = self.stack.nodes <= self.devices[0].tip_length + 1e-9
         self.density = _density(self.devices)
@@ -98,7 +98,7 @@ class DeviceStack(Chain):
                 axial_stiffness=sum(device.axial_stiffness for device in self.devices),
                 tip=int(tip.argmax()),
             ),
-            {**device_contact(friction), "priority": 1},  # in place of the wall's
+            {**device_contact(friction), "priority": 1},  # overrides the wall's
             stroke=stroke,
             rotation=False,
             timestep=timestep,
@@ -113,7 +113,7 @@ class DeviceStack(Chain):
 
 
 def _density(devices: Sequence[Device]) -> float:
-    """Density, kg/m³, with which the chain has the buoyancy of all devices."""
+    """Density, kg/m³, that gives the chain the buoyancy of all devices."""
     weight = sum(weight_density(device) for device in devices)
     mass = sum(device.linear_density for device in devices)
     mass += carried_mass(devices)

@@ -23,8 +23,8 @@ METAL_POISSON_RATIO = 0.33
 # polymers (Gerdeen 2012, 10.1201/9781420056372). A metal shaft is a coil on a core, so
 # the upper end; for polymers `Device.loss_factor`, within a factor of two.
 METAL_LOSS = 0.01
-# Friction of a hydrophilic coat relative to PTFE: a sixth and a half of bare steel
-# (Schröder 1993).
+# Friction of a hydrophilic coat relative to PTFE: these have a sixth and a half of the
+# friction of bare steel (Schröder 1993).
 HYDROPHILIC = 1 / 3
 
 
@@ -232,7 +232,11 @@ DEVICES: dict[str, Device] = {
 
 
 def get(device: "str | Device", option: str = "device") -> Device:
-    """Returns a device by name, or as given; ValueError names the option if none."""
+    """Returns the device of a name, or a device as given.
+
+    Raises:
+        ValueError: if the name is unknown; the message names the option.
+    """
     if isinstance(device, Device):
         return device
     return DEVICES[bounds.choice(option, device, DEVICES)]
@@ -262,9 +266,10 @@ class Discretisation:
     def link_lengths(self, *devices: Device) -> np.ndarray:
         """Lengths (n,) of the links of a chain from proximal to distal, m.
 
-        The longest tip has as many links as the device with most of them. Where it is
-        bent the most, links are half as long as where it is straight. A shape proximal
-        of it, under a wire that leads by more, has longer links.
+        The longest tip has as many links as the largest `tip_links` of all devices.
+        Where it is bent the most, links are half as long as where it is straight. A
+        shape proximal of this tip, as under a wire that leads by more, has the longer
+        links of the shaft.
 
         Args:
             *devices: one, or coaxial ones.

@@ -7,12 +7,12 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.contact import DRAWN, FRICTION, wall_contact
 
-# Of a geom of the device with the wall, at most; the wall's sensor has room for all.
+# Largest number of contacts of a device's geom with the wall, for the wall's sensor.
 MOST_CONTACTS = 4
 CONTACT_FIELDS = ("found", "force", "dist", "pos", "normal", "tangent")
 
 _LUMEN_COLOUR = (0.8, 0.25, 0.25, 0.25)
-_UNSEEN = 1e-4  # m
+_UNSEEN = 1e-4  # m, radius of the point in place of a surface that is not drawn
 _GOAL_COLOUR = (0.1, 0.7, 0.3, 0.5)
 
 
@@ -36,9 +36,11 @@ class Phantom(composer.ModelWrapperEntity):
         """Builds the wall.
 
         Args:
+            anatomy: lumen and goals.
+            friction: Coulomb coefficient of the wall.
             goal_radius: radius of the goal sites, m.
-            drawn: whether its surface is there to be seen; a point stands for it if
-                not, so that the models have as many geoms.
+            drawn: whether the surface is drawn; otherwise a point replaces it, so that
+                all models have the same number of geoms.
         """
         self.anatomy, self._friction = anatomy, friction
         root = mjcf.RootElement(model="phantom")
@@ -70,8 +72,9 @@ class Phantom(composer.ModelWrapperEntity):
 
         Args:
             device_body: root body of the device, an element of the same model tree.
-            hole: radius of the hole in the cap over the inlet, m; open if larger.
-            moving: whether heart and breathing may move it.
+            hole: radius of the hole in the cap over the inlet, m; no cap if the hole is
+                as wide as the lumen.
+            moving: whether heart and breathing may move the wall.
         """
         root = self.mjcf_model.root_model
         lumen = self.anatomy.lumen.with_hole(hole)
@@ -97,7 +100,7 @@ class Phantom(composer.ModelWrapperEntity):
 
 
 def mesh_file(vertices: np.ndarray, faces: np.ndarray) -> mjcf.Asset:
-    """Vertices (n, 3) m and triangles (m, 3) in MuJoCo's own binary format (MSH)."""
+    """Mesh of vertices (n, 3) m and triangles (m, 3) in MuJoCo's own format (MSH)."""
     counts = np.array([len(vertices), 0, 0, len(faces)], dtype="<i4")
     parts = (counts, vertices.astype("<f4"), faces.astype("<i4"))
     return mjcf.Asset(b"".join(part.tobytes() for part in parts), ".msh")

@@ -12,7 +12,7 @@ def joints_along(
 ) -> NDArray[np.float64]:
     """Angles of the bending hinges that place every node of a chain on a line.
 
-    Torsion hinges stand at zero. The rows are the positions of `Chain.bends` in order.
+    Torsion hinges are at 0. The rows are the positions of `Chain.bends` in order.
 
     Args:
         link_lengths: (n,) lengths of the links from proximal to distal, m.
@@ -33,7 +33,7 @@ def joints_along(
 
 
 def x_first(joint: int) -> bool:
-    """Whether a joint, from 1 on, bends about x first and about y then.
+    """Whether a joint, numbered from 1, bends about x before y.
 
     Two hinges twist by about θxθy/2, with the sign of their order. The order alternates
     from joint to joint, so the twists of neighbours cancel.
@@ -78,7 +78,7 @@ def bends_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 def nodes_of(link_lengths: ArrayLike, bends: ArrayLike) -> NDArray[np.float64]:
     """Nodes of a chain with given angles of its bending hinges.
 
-    Torsion hinges stand at zero.
+    Torsion hinges are at 0.
 
     Args:
         link_lengths: (n,) lengths of the links from proximal to distal, m.

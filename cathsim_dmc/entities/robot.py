@@ -7,8 +7,8 @@ and let them slide between rollers.
 
 ``+z`` runs along the device towards the patient, the origin is the proximal mouth of
 the introducer sheath, ``+y`` is down and ``+x`` the patient's left. `postures` gives
-every joint as a function of insertion and rotation, and the task poses them: slides and
-hinges without load, which do not move between two poses.
+the position of every joint as a function of insertion and rotation, and the task writes
+them. The joints bear no load, so they do not move in between.
 """
 
 from pathlib import Path
@@ -23,9 +23,9 @@ from cathsim_dmc.compiled import compiled
 # The stroke fits a rail of 0.35 m, and the clamps change about once a second at the
 # fastest push (40 mm/s).
 STROKE = 0.040  # m, insertion over which a pair of clamps stays closed
-OVERLAP = 0.002  # m, both pairs are closed at each change
+OVERLAP = 0.002  # m, insertion over which both pairs are closed at each change
 JAW_TRAVEL = 0.004  # m, insertion during which the jaws open, or close
-CYCLE = 2 * (STROKE - OVERLAP)  # m, the two pairs work half a cycle apart
+CYCLE = 2 * (STROKE - OVERLAP)  # m, insertion; the pairs are half a cycle apart
 RETURN = CYCLE - STROKE - 2 * JAW_TRAVEL  # m, insertion while a platform returns
 JAW_OPENING = 0.005  # m, each jaw, fully open
 
@@ -48,7 +48,7 @@ JOINTS = (
 
 @compiled
 def _clamp(insertion, offset):
-    """Travel of a pair's platform from home, and opening of each of its jaws, m.
+    """Travel of a clamp pair's platform from home, and opening of each jaw, m.
 
     A platform moves with the device while its jaws are closed, opening or closing, and
     returns in between.
@@ -63,7 +63,7 @@ def _clamp(insertion, offset):
 
 @compiled
 def _smoothstep(u):
-    """0 before 0, 1 after 1, and smooth between."""
+    """Smoothstep: 0 below 0, 1 above 1, a cubic in between."""
     u = min(max(u, 0.0), 1.0)
     return u * u * (3.0 - 2.0 * u)
 
@@ -75,9 +75,9 @@ def postures(given: NDArray[np.float64]) -> NDArray[np.float64]:
     They are continuous in every argument: angles do not wrap.
 
     Args:
-        given: (4, N), insertion (m) and rotation (rad) of the catheter from the start,
-            which the front clamps hold, and of the guidewire in the rear clamps; both
-            pairs hold one device where they are the same.
+        given: (4, N), insertion (m) and rotation (rad) since the start of the catheter
+            in the front clamps, then of the guidewire in the rear clamps; equal ones if
+            both pairs hold the same device.
     """
     count, ratio = given.shape[1], RING_TEETH / PINION_TEETH
     joints = np.empty((count, 16))
@@ -103,13 +103,13 @@ def postures(given: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @compiled
 def pose(qpos, held, joints):
-    """Writes the joints of N followers, both of whose pairs hold one device.
+    """Writes the joint positions of N followers whose two pairs hold the same device.
 
     Args:
-        qpos: (N, nq), MuJoCo's.
-        held: (2,) int, places of insertion and rotation of the device among them; a
-            negative one stands for 0.
-        joints: (len(JOINTS),) int, places of the joints.
+        qpos: (N, nq), MuJoCo's, written.
+        held: (2,) int, indices in `qpos` of insertion and rotation of the device; a
+            negative index stands for the value 0.
+        joints: (len(JOINTS),) int, indices in `qpos` of the joints.
     """
     given = np.zeros((4, len(qpos)))
     for k in range(4):

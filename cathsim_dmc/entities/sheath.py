@@ -9,7 +9,7 @@ from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.contact import DRAWN, sheath_contact
 
-# Between the device and the bore all round, m: assumed, for lack of a source.
+# Radial clearance between device and bore, m: assumed, for lack of a source.
 CLEARANCE = 0.35e-3
 _LEAST_CURVE_RADIUS, _SPACING = 0.01, 0.5e-3  # m
 _VISIBLE_WALL = 0.4e-3  # m, as drawn
@@ -17,7 +17,7 @@ _COLOUR = (0.35, 0.45, 0.6, 0.35)
 
 
 def straight(length: float) -> np.ndarray:
-    """Line (2, 3) along +z to the origin, of a straight sheath of a length in m."""
+    """Centreline (2, 3) m of a straight sheath, `length` m along +z to the origin."""
     return np.array([[0.0, 0.0, -length], [0.0, 0.0, 0.0]])
 
 
@@ -26,16 +26,16 @@ class Sheath(composer.ModelWrapperEntity):
 
     Real followers grip the device just outside the sheath and support it up to there.
     The bore reaches back over the whole chain and represents both. Friction of clamps
-    and valve is not modelled ("perfect motion"), so the bore has none. In the tasks
-    the bore is there to be seen, and hinges hold the device on its axis.
+    and valve is not modelled ("perfect motion"), so the bore has none. By default the
+    tasks have a bore without contact, and hinges hold the device on its axis.
 
-    The bore is round: one geom that carries it as a field (`collision.fields`), which
-    touches capsules from inside, with no edge at which a link could catch.
+    One geom carries the round bore as a field (`collision.fields`), which has no edge
+    at which a link could catch.
 
     Attributes:
         bore: The geom that carries the bore.
         bore_radius: Radius of the bore where it is straight, m.
-        touches: Whether the bore holds the device.
+        touches: Whether the bore collides with the device.
         vertices: Points (n, 3) of the axis, m, entity's frame.
         length: Length of the bore along its axis, m.
     """
@@ -58,8 +58,8 @@ class Sheath(composer.ModelWrapperEntity):
             link_length: longest link of the device, m. Links are straight, so in a bend
                 their middles lie inside the line; the inner side of the bend is wider
                 by that distance. No effect where the line is straight.
-            clearance: between the device and the bore all round, m; None for a bore
-                that touches nothing, where hinges hold the device (`physics.held`).
+            clearance: radial clearance between device and bore, m; None for a bore
+                without contact, where hinges hold the device (`physics.held`).
 
         Raises:
             ValueError: if the line has fewer than two points, repeats a point or bends

@@ -1,4 +1,4 @@
-"""Memory of the laws of coaxial devices: what they write, and their scratch."""
+"""Allocation of what the laws of coaxial devices write, and of their scratch."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from cathsim_dmc.laws.hinges import Bends
 
 
 def overlap(tables: Tables) -> Overlap:
-    """An `Overlap` for devices, to be written."""
+    """Allocates an `Overlap` of devices, zeros."""
     devices, joints = len(tables.edges), len(tables.lengths) - 1
     return Overlap(
         compliance=np.zeros(joints),
@@ -22,14 +22,14 @@ def overlap(tables: Tables) -> Overlap:
 
 
 def links(tables: Tables) -> Links:
-    """The `Links` of a chain, to be written."""
+    """Allocates the `Links` of a chain, zeros."""
     radius, friction, mass, buoyancy = np.zeros((4, len(tables.lengths)))
     inertia = np.zeros((len(tables.lengths), 2))
     return Links(radius, friction, mass, buoyancy, inertia)
 
 
 def scratch(tables: Tables) -> coaxial.Scratch:
-    """Scratch of the laws of `coaxial`."""
+    """Allocates the scratch of the laws of `coaxial`."""
     devices, joints = len(tables.edges), len(tables.lengths) - 1
     return coaxial.Scratch(
         places=np.zeros(tables.edges.size + 1),
@@ -40,18 +40,18 @@ def scratch(tables: Tables) -> coaxial.Scratch:
 
 
 def rod_scratch(segments: int) -> torsion.Scratch:
-    """Scratch of `torsion.turned`, of rods of so many segments."""
+    """Allocates the scratch of `torsion.turned` for rods of `segments` segments."""
     return torsion.Scratch._make(np.zeros((8, segments)))
 
 
 def chain(tables: Tables) -> sliding.Chain:
-    """The `Chain` of devices, to be written."""
+    """Allocates the `Chain` of devices, zeros."""
     rest = np.zeros((len(tables.lengths) - 1, 2))
     return sliding.Chain(overlap(tables), rest, links(tables))
 
 
 def settling(tables: Tables) -> sliding.Scratch:
-    """Scratch of `sliding.settle`."""
+    """Allocates the scratch of `sliding.settle`."""
     devices, segments = len(tables.edges), len(tables.lengths)
     joints = segments - 1
     return sliding.Scratch(

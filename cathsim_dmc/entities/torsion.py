@@ -1,4 +1,4 @@
-"""Torsional rods of devices, of which `laws.torsion` has the law."""
+"""Torsional rods of devices; `laws.torsion` has their law."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ def rods_of(devices: Sequence[Device], nodes: np.ndarray) -> Rods:
     """The rods of devices.
 
     Args:
-        devices: K of them.
+        devices: K devices.
         nodes: (M + 1,), distances from a device's end, m.
     """
     tips = np.minimum(nodes, [[device.tip_length] for device in devices])

@@ -50,7 +50,7 @@ class Angiograph:
         self.planes()
 
     def third(self, deviation: Deviation = Deviation()) -> Planes:
-        """The view of a third roadmap; empty where there is none."""
+        """Plane of the third roadmap, a tuple of one; empty without a third roadmap."""
         if self.options.third is None:
             return ()
         angles = deviation.primary, deviation.secondary
@@ -84,19 +84,19 @@ def images(
     shadows: Sequence[Shadow],
     random_states: Sequence[np.random.RandomState] | None = None,
 ) -> np.ndarray:
-    """Images before N machines, each of one device or of several in each other.
+    """Images of N machines, each of one device or of several coaxial ones.
 
     Args:
-        machines: N times the planes of a machine, all with as many.
+        machines: planes of the N machines, as many for each.
         shadows: of the devices, with points (N, n, 3) and one radius.
-        random_states: one for each device, or None for images without noise. Of two
-            planes the frontal one draws first.
+        random_states: one for each machine, or None for images without noise. With two
+            planes, the frontal one draws first.
 
     Returns:
         (N, rows, columns, planes) uint8.
     """
     image = _blank(machines, 1)
-    # Frames of one state draw in their order.
+    # Frames that share a random state draw in their order, so not in parallel.
     alone = random_states and len(set(map(id, random_states))) < len(random_states)
     for plane, chosen, fluoroscope in _each(machines):
 
@@ -146,7 +146,7 @@ def _blank(machines: Sequence[Planes], channels: int) -> np.ndarray:
 
 
 def _each(machines: Sequence[Planes]) -> Iterator[tuple[int, np.ndarray, Fluoroscope]]:
-    """Number of a plane, indices of the devices before it, and its fluoroscope."""
+    """Yields the number of a plane, the indices of its devices, and its fluoroscope."""
     groups: dict[int, list[int]] = {}
     for index, planes in enumerate(machines):
         groups.setdefault(id(planes), []).append(index)

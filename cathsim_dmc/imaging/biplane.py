@@ -1,11 +1,10 @@
 """Biplane reconstruction: device, vessel and route in space from two X-ray images.
 
-The device is followed backwards from the marker at its tip in what the live images show
-and the mask images do not (digital subtraction). The vessel is the visual hull of its
-outlines in both roadmaps; the route to the goal marker keeps to the middle of the hull.
-Outlines with errors leave a hull that is thin and broken in narrow branches: the route
-goes on through the gaps, is centred on what the views together show round it, and the
-lumen is pooled along it.
+The device is followed backwards from the marker at its tip, in the digital subtraction
+of live images and mask images. The vessel is the visual hull of its outlines in both
+roadmaps; the route to the goal marker keeps to the middle of the hull. If the outlines
+have errors, the hull is thin and broken in narrow branches: the route then passes its
+gaps, is centred on what all views show around it, and its radii are smoothed.
 """
 
 from dataclasses import replace
@@ -25,45 +24,45 @@ from cathsim_dmc.imaging.options import NO_ERRORS, RoadmapErrors
 # Distance of the points along the device, m, and their number: 0.2 m of it.
 TRACE_SPACING = 5e-3
 TRACE_POINTS = 41
-# With fewer points, the device is sought in other directions behind its tip, too.
+# With fewer points, other first directions behind the tip are tried, too.
 TRACE_ENOUGH = 12
 # From the middle of the marker to the end of the device, m.
 MARKER_TO_HEAD = 0.5 * materials.MARKER_LENGTH
 
 # Distance of the points at which the hull is known, m, and of those of the route.
 HULL_SPACING = 3e-3
-_OUTSIDE = -0.5 * HULL_SPACING  # m; a point so deep still counts as inside
+_OUTSIDE = -0.5 * HULL_SPACING  # m, least depth of a point that counts as inside
 ROUTE_SPACING = 1e-3
-# So far outside the outlines, m, a way may lead through a gap of a roadmap, at so many
-# times the cost of a way along an outline.
+# Least depth, m, of a path that leads through a gap of a roadmap, and the factor of its
+# cost there.
 _THROUGH, _DEAR = -12e-3, 10.0
-# Errors of roadmaps, px: length along which outlines err alike, radius of a gap.
+# Errors of roadmaps, px: correlation length along the outlines, radius of a gap.
 _ALONG, _GAP = 4.0, 3.0
-# Rays of the same place miss each other by less, px; where calibration matters most is
-# this far from the isocentre, m.
+# Largest distance by which rays to one point miss each other, px; distance from the
+# isocentre, m, at which errors of calibration are added to it.
 _WIDEST, _FAR = 2.0, 0.1
-# The route is smoothed by a Gaussian of this deviation, m: three points of the hull. It
-# cuts corners, so between centrings less of it has to do.
+# Standard deviation of the Gaussian that smooths the route, m: three points of the
+# hull. It cuts corners, so it is smaller between centrings.
 _SMOOTHING, _SLIGHTLY = 4e-3, 2e-3
-# Farther than this from its outlines, m, no place of a vessel is better than another.
+# Depth, m, beyond which the cost of a path is constant.
 _WIDE = 12e-3
 _SHAFT = 1.6e-3  # m, width of a usual device
-# From a pixel at the outline to the outline, px, on average.
+# Mean distance of a pixel at the outline from the outline, px.
 _EDGE = 0.25
-# Where outlines have errors. A route is centred so many times; round each of its points
-# in a disc of so many radii of the hull, and between these limits, m. What the views
-# show is pooled along the route over these deviations, m, for its middle and its lumen.
+# For outlines with errors: number of centrings of a route; radius of the disc around
+# each of its points, in radii of the hull, and its limits, m; standard deviations of
+# the smoothing along the route, m, of its centre and of its radii.
 _CENTRINGS, _DISC_RADII, _DISC = 8, 1.3, (4e-3, 12e-3)
 _POOLED_MIDDLE, _POOLED_LUMEN = 2e-3, 6e-3
 _LEAST_ERROR = 0.2  # px
-_LEAST_LUMEN = 1e-3, 2e-3  # m, of outlines without and with errors
+_LEAST_LUMEN = 1e-3, 2e-3  # m, least radius, of outlines without and with errors
 
 
 class Biplane:
     """Two C-arms before one vessel.
 
     Attributes:
-        matrices: (2, 3, 4), from places to pixels, see `CArm.matrix`.
+        matrices: (2, 3, 4), projections of the two planes, see `CArm.matrix`.
         isocentre: point (3,) about which the arms turn, m.
     """
 
@@ -79,8 +78,8 @@ class Biplane:
         Args:
             planes: The two planes.
             third: Further views of the vessel alone.
-            errors: Of the roadmaps and of what is known of the planes.
-            seed: Of these errors.
+            errors: Errors of the roadmaps and of the calibration of the planes.
+            seed: Seed of these errors.
         """
         self._planes, self._roadmaps = planes, (*planes, *third)
         self._errors, self._random = errors, np.random.RandomState(seed)
@@ -89,8 +88,8 @@ class Biplane:
         self._views = np.array([arm.matrix for arm in arms])
         self.matrices = self._views[:2]
         self._focal = np.array([plane.carm.focal_length for plane in self._roadmaps])
-        # By how much rays of both planes may miss each other, px: what the angles are
-        # off by, at a place some way from the isocentre.
+        # Largest distance by which rays of both planes may miss each other, px, with
+        # errors of the angles at the distance `_FAR` from the isocentre.
         off = np.deg2rad(errors.calibration) * _FAR * planes[0].carm.focal_length
         self._widest = _WIDEST + float(off) / planes[0].carm.source_isocentre
         # Grey levels without a device, (2, rows, columns).
@@ -98,7 +97,7 @@ class Biplane:
         self._goal: tuple[np.ndarray, np.ndarray] | None = None
 
     def _believed(self, arm: CArm) -> CArm:
-        """A C-arm whose angles are not quite those that it has."""
+        """A C-arm with random errors of its angles, up to the error of calibration."""
         most = np.deg2rad(self._errors.calibration)
         if not most:
             return arm
@@ -119,7 +118,7 @@ class Biplane:
         pitch = np.mean([plane.carm.pitch for plane in self._planes])
         pixel = pitch * self._planes[0].carm.source_isocentre
         pixel /= self._planes[0].carm.source_detector
-        # Of a rod across a pixel: the mean path through it.
+        # Optical depth of a rod across a pixel, from the mean path through it.
         full = materials.CATHETER * 0.25 * np.pi * _SHAFT**2 / max(pixel, _SHAFT)
         grey = np.moveaxis(image, -1, 0).astype(np.float32)
         depth = np.log(np.maximum(self._masks, 1.0) / np.maximum(grey, 1.0))
@@ -132,7 +131,7 @@ class Biplane:
         return line[:count]
 
     def point(self, pixels: ArrayLike) -> np.ndarray:
-        """Point (3,), m, that is seen at pixels (2, 2), (column, row) of each plane."""
+        """Triangulates a point (3,), m, from pixels (2, 2), (column, row) per plane."""
         places, found = np.asarray(pixels, dtype=np.float64)[:, ::-1], np.empty(3)
         loops.triangulated(self.matrices, np.ascontiguousarray(places), found)
         return found
@@ -149,7 +148,7 @@ class Biplane:
         if self._errors.any:
             width = _POOLED_LUMEN / ROUTE_SPACING
             depths = gaussian_filter1d(depths, width, axis=1, mode="nearest")
-            depths += 0.5 * self._error  # the least of several is too small
+            depths += 0.5 * self._error  # the minimum over the views is biased
         return np.maximum(depths.min(axis=0), least)
 
     def _depths(self, points: ArrayLike) -> np.ndarray:
@@ -161,7 +160,7 @@ class Biplane:
 
     @property
     def _error(self) -> float:
-        """Error of the outlines, a part of its deviation that tells places apart, m."""
+        """Error of the outlines with which places are weighted, m."""
         arm, noise = self._planes[0].carm, self._errors.noise
         return max(0.7 * noise, _LEAST_ERROR) * arm.source_isocentre / arm.focal_length
 
@@ -179,7 +178,7 @@ class Biplane:
         return np.stack(walls)
 
     def _spoiled(self, wall: np.ndarray) -> np.ndarray:
-        """Signed distances (rows, columns) with the errors of a roadmap, px."""
+        """Adds the errors of a roadmap to signed distances (rows, columns), px."""
         from scipy.ndimage import gaussian_filter
 
         errors, random = self._errors, self._random
@@ -190,7 +189,7 @@ class Biplane:
         if errors.noise:
             white = random.normal(size=wall.shape)
             smooth = gaussian_filter(white, _ALONG, mode="wrap")
-            # Of white noise the filter leaves 1 / (2 sqrt(pi) sigma).
+            # The filter scales the deviation of white noise by 1 / (2 sqrt(pi) sigma).
             wall = wall + errors.noise * smooth * 2.0 * np.sqrt(np.pi) * _ALONG
         if len(inside):
             rows, columns = np.indices(wall.shape)
@@ -201,7 +200,7 @@ class Biplane:
 
     @cached_property
     def _hull(self) -> tuple[np.ndarray, np.ndarray]:
-        """First corner (3,) of a grid round the hull, and its depths (X, Y, Z)."""
+        """First corner (3,) of a grid around the hull, and its depths (X, Y, Z), m."""
         arm = self._planes[0].carm
         half = 0.5 * arm.resolution[1] * arm.source_isocentre / arm.focal_length
         low = np.asarray(arm.isocentre) - half
@@ -229,9 +228,10 @@ class Biplane:
         return line
 
     def _centred(self, line: np.ndarray) -> np.ndarray:
-        """A route (P, 3) each of whose points is in the middle of what is round it.
+        """Moves each point of a route (P, 3), m, to the mean of a disc around it.
 
-        Places count by how probable it is that they are in the vessel, and how deep.
+        The weight of a place is the probability that it is in the vessel, times its
+        depth.
         """
         from scipy.ndimage import gaussian_filter1d
         from scipy.special import ndtr
@@ -256,7 +256,7 @@ class Biplane:
         return line + ends[:, None] * mean
 
     def _path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Points of the grid from the start to the goal, the cheapest way."""
+        """Points (n, 3), m, of the grid on the cheapest path from start to goal."""
         low, depth = self._hull
         if self._goal is None or not np.array_equal(self._goal[0], goal):
             margin = 0.4 * HULL_SPACING
@@ -272,7 +272,7 @@ class Biplane:
 
     @property
     def _limit(self) -> float:
-        """Depth, m, from which on places are part of ways."""
+        """Least depth of the places of a path, m."""
         return _THROUGH if self._errors.any else _OUTSIDE
 
 

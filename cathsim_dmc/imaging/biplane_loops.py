@@ -51,7 +51,7 @@ def depths(points, matrices, walls, focal):
 
 @compiled
 def triangulated(matrices, places, point):
-    """Writes the point (3,) that two places see; returns the error in the image, px.
+    """Writes the point (3,), m, of two pixels; returns the reprojection error, px.
 
     Args:
         matrices: (2, 3, 4).
@@ -76,7 +76,7 @@ def triangulated(matrices, places, point):
 
 @compiled
 def _centred(image, row, column, least):
-    """Centre of mass of what exceeds `least` in the 3 x 3 pixels round a place."""
+    """Centre of mass of what exceeds `least` in the 3 x 3 pixels around a place."""
     rows, columns = image.shape
     i, j = round(row), round(column)
     total, r, c = 0.0, 0.0, 0.0
@@ -93,7 +93,7 @@ def _centred(image, row, column, least):
 
 @compiled
 def _peaks(image, least, found):
-    """Writes the highest local maxima (`PEAKS`, 3): value, row, column."""
+    """Writes the highest local maxima (`PEAKS`, 3), value, row, column; counts them."""
     rows, columns = image.shape
     count = 0
     for i in range(1, rows - 1):
@@ -114,7 +114,10 @@ def _peaks(image, least, found):
 
 @compiled
 def _marker(images, matrices, least, widest, point):
-    """Writes where the marker is, rays `widest` px apart at most; returns how dark."""
+    """Writes the marker's place, with rays at most `widest` px apart.
+
+    Returns its optical depth, 0 if there is no marker.
+    """
     first, second = np.zeros((PEAKS, 3)), np.zeros((PEAKS, 3))
     counts = _peaks(images[0], least, first), _peaks(images[1], least, second)
     best, places, there = 0.0, np.empty((2, 2)), np.empty(3)
@@ -150,7 +153,7 @@ def _line(images, matrices, full, point, direction, way):
 
 @compiled
 def _next(images, matrices, directions, way, full, point, last, tried):
-    """Number of the direction in which the device goes on after another, -1 if none."""
+    """Index of the direction in which the device continues, -1 if there is none."""
     best, chosen = 0.25, -1
     first = (last * last).sum() == 0.0
     for k in range(len(directions)):
@@ -175,7 +178,7 @@ def _outside(image, row, column):
 
 @compiled
 def _follow(images, matrices, directions, way, full, tried, line, widest):
-    """Writes points behind the first; returns their number. Marks what it has tried."""
+    """Writes points behind the first; returns the number of all; marks `tried`."""
     last, places, there = np.zeros(3), np.empty((2, 2)), np.empty(3)
     none = np.zeros(len(directions), dtype=np.bool_)
     for number in range(1, len(line)):
@@ -251,7 +254,7 @@ def carried(frame, line, direction):
         else:
             tangent[:] = direction
         # Rodrigues' formula for the least turn that brings z to the tangent.
-        # Of length one: any error would double at every point.
+        # z is normalised, because any error would double at every point.
         z = now[:, 2] / math.sqrt((now[:, 2] ** 2).sum())
         cosine = (z * tangent).sum()
         if cosine < -0.999:

@@ -89,7 +89,7 @@ class CArm:
         return cls(primary=primary, secondary=secondary, **fields)
 
     def centred_on(self, points: ArrayLike) -> "CArm":
-        """The same arm with its isocentre in the middle of the box round `points`.
+        """The same arm with its isocentre in the middle of the box around `points`.
 
         Args:
             points: (..., 3) world frame, m, for example the vertices of the lumen.

@@ -73,9 +73,9 @@ def quantum_noise(
 
 @compiled
 def _count(frame, quanta, draw, quantiles, skew, out):
-    """Writes counts over `quanta` of a frame whose pixels have drawn quantiles."""
+    """Writes counts divided by `quanta` of a frame, from each pixel's quantile."""
     zero = np.float32(0.0)
-    # The skew term and rounding add 1/18 + 1/12 to the variance: taken off here.
+    # The skew term and rounding add 1/18 + 1/12 to the variance, subtracted below.
     excess = np.float32(5.0 / 36.0)
     rows, columns = frame.shape
     for i in range(rows):

@@ -23,7 +23,7 @@ from cathsim_dmc.imaging.carm import NEAREST, CArm
 _SPACING = 1.0 / 3.0
 # Discs may lie further apart on wide shadows: this fraction of their radius.
 _RELATIVE_SPACING = 0.1
-# Discs wider than this (px) are no device's, but one whose radius is in other units.
+# Largest radius of a disc, px; a wider one comes from a radius in another unit.
 _WIDEST = 128
 
 
@@ -66,8 +66,7 @@ def device_attenuation(carm: CArm, shadow: Shadow) -> np.ndarray:
     """
     points = np.asarray(shadow.points, dtype=np.float64)
     radius = np.asarray(shadow.radius, dtype=np.float64)
-    # Filled in, and not a broadcast view: what is compiled is compiled again for
-    # another kind of array.
+    # Filled, not broadcast: numba would compile the loops again for a broadcast array.
     radii = np.empty((*points.shape[:-2], points.shape[-2] - 1))
     radii[...] = radius if radius.ndim == radii.ndim else radius[..., None]
     if not (radii > 0.0).all():
@@ -113,7 +112,7 @@ def _below_left(x, y, left, below):
 def add_disc(image, row, column, radius, weight, scratch):
     """Spreads a weight over the pixels that a disc covers, by the area they share.
 
-    Centre and radius in px; what falls beside the image is left out. Scratch is (3, n),
+    Centre and radius in px; parts outside the image are left out. Scratch is (3, n),
     n at least the columns of the disc.
     """
     rows, columns = image.shape
@@ -148,7 +147,7 @@ def add_disc(image, row, column, radius, weight, scratch):
 
 @compiled
 def _chord(joints, link):
-    """A link from its proximal to its distal joint, and its length."""
+    """Vector of a link from its proximal to its distal joint, and its length."""
     x = joints[link + 1, 0] - joints[link, 0]
     y = joints[link + 1, 1] - joints[link, 1]
     z = joints[link + 1, 2] - joints[link, 2]
@@ -157,9 +156,9 @@ def _chord(joints, link):
 
 @compiled
 def _turn(joints, link, other):
-    """Tangent less chord of a link where it meets another, times its length.
+    """Tangent minus chord of a link at its joint with another, times its length.
 
-    And whether it meets one: else its end is free.
+    The last value says whether there is another link; if not, the end is free.
     """
     if 0 <= other < len(joints) - 1:
         x, y, z, length = _chord(joints, link)
@@ -234,7 +233,7 @@ def _add_link(image, camera, part, scratch):
     if wide > _WIDEST:
         return length, wide
     spacing = max(_SPACING, _RELATIVE_SPACING * wide)
-    # A link that runs far out of the image must not take for ever.
+    # Limits the time of a link that runs far out of the image.
     most = 4.0 * (rows + columns) / _SPACING
     count = int(min(max(math.ceil(math.hypot(u1 - u0, v1 - v0) / spacing), 1.0), most))
     piece = length / count
@@ -247,7 +246,7 @@ def _add_link(image, camera, part, scratch):
             distal = to_tip + (1.0 - fraction) * length
             inside = min(max((marker_length - distal) / piece + 0.5, 0.0), 1.0)
             weight += (marker_mu - mu) * inside
-        # Of the link without its round ends, which are straight.
+        # Fraction of the link without its round ends, which are straight.
         t = min(max(fraction * stretch - back, 0.0), 1.0)
         sag = t * (1.0 - t)
         behind, before = sag * (1.0 - t), sag * t

@@ -23,7 +23,7 @@ WHITE = 8e-3
 _CLOSE = 5e-6  # m, from the wall, where a ray ends
 _MOST_STEPS = 100
 # Nearer to the wall than this, m, the depth along a ray is taken as linear: the next
-# place is where it vanishes, at most so many depths on, before any other wall.
+# step leads to its zero, and is at most `_LONGEST` depths long, to pass no other wall.
 _NEAR, _LONGEST = 1e-3, 8.0
 _STEP = 0.25e-3  # m, to both sides, over which a gradient is taken
 
@@ -65,8 +65,8 @@ def views(
         resolution: (rows, columns).
 
     Returns:
-        grey: (N, rows, columns, 1) uint8, 255 sqrt(cos) `WHITE` / distance at most,
-            cos that of the angle between ray and normal of the wall.
+        grey: (N, rows, columns, 1) uint8, 255 sqrt(cos) `WHITE` / distance, at most
+            255; cos is that of the angle between the ray and the normal of the wall.
         distance: (N, rows, columns, 1) float32, m, along the ray of the pixel's
             centre; `FARTHEST_WALL` where that meets no wall. An open end is closed.
     """
@@ -83,7 +83,7 @@ def views(
 
 @compiled
 def _depth(vessel, point, values):
-    """Depth (m) of a place (3) in space; within its stretch in a vessel that moves."""
+    """Depth (m) of a point (3), in which the stretch of a motion is not counted."""
     growth = 0.0
     if len(vessel.lattice):
         there = values[VALUES:].reshape(-1)
@@ -96,7 +96,7 @@ def _depth(vessel, point, values):
 @compiled
 def _distance(vessel, eye, ray, values):
     """Distance (m) of the wall from an eye (3) along a ray, a unit vector (3)."""
-    # A displacement that stretches space makes distances in it shorter.
+    # The stretch of a motion makes distances shorter than depths, up to this factor.
     stride = 1.0 / (1.0 + STEEPEST) if len(vessel.lattice) else 1.0
     t, step, before = 0.0, 0.0, 0.0
     for _ in range(_MOST_STEPS):
@@ -114,7 +114,7 @@ def _distance(vessel, eye, ray, values):
 
 @compiled
 def _slope(vessel, point, axis, values):
-    """Difference of the depth along an axis at a point (3), by way, m²."""
+    """Difference of the depth along an axis at a point (3), times the step, m²."""
     slope = 0.0
     for side in (-_STEP, _STEP):
         x, y, z = point

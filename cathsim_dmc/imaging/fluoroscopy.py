@@ -1,4 +1,4 @@
-"""Fluoroscopy: the picture an operator sees, computed without OpenGL.
+"""Fluoroscopy: the X-ray image that an operator sees, computed without OpenGL.
 
 The path length through vessel and patient is computed once per anatomy and view
 (`Fluoroscope.from_surface`); the device is drawn in every frame (`Fluoroscope.render`).
@@ -99,7 +99,7 @@ class Fluoroscope:
         """Images of devices in the vessel, whose optical depths add up.
 
         Args:
-            shadows: of one device, or of several in each other, with the same leading
+            shadows: of one device, or of several coaxial ones, with the same leading
                 axes.
             random_states: source of quantum noise: one state, or one per frame in the
                 order of the flattened batch; None for images without noise.

@@ -4,8 +4,8 @@ Mass attenuation coefficients, m²/kg, are those of the NIST tables (Hubbell and
 NIST SRD 126): water 2.059e-2, polyamide 1.95e-2, iodine 0.758, BaSO4 0.512, stainless
 steel 304 0.119, nickel-titanium 0.1176, platinum with 10 % iridium 0.432.
 
-Whatever lies in the patient takes the place of as much water (tissue), so vessel and
-device count with their *excess* over water: `mu - WATER`.
+Vessel and device replace the same volume of water (tissue), so they count with their
+*excess* over water: `mu - WATER`.
 """
 
 # Water and soft tissue, 1/m: 2.059e-2 m²/kg x 1000 kg/m³.

@@ -1,4 +1,4 @@
-"""Options of the fluoroscopy that a task shows, in a form that JSON can hold."""
+"""Options of the fluoroscopy that a task shows, JSON-able."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,11 +14,11 @@ from cathsim_dmc.imaging.carm import VIEWS, CArm
 # the inlet to the ends of the branches.
 DETECTOR_SIZE = 0.38
 
-# Of the endoluminal camera: vertical field of view, degrees, that of a chip-on-tip
-# endoscope; and the distance, m, at which a ray ends that meets no wall.
+# Endoluminal camera: vertical field of view of a chip-on-tip endoscope, degrees, and
+# distance, m, at which a ray that meets no wall ends.
 VIEW_ANGLE, FARTHEST_WALL = 90.0, 0.3
 
-# Bounds of the numbers that are no C-arm's.
+# Bounds (low, high, unit) of the numbers that are not those of a C-arm.
 _BOUNDS = {
     "kerma": (0.0, 1.0, "Gy"),
     "gain": (0.0, 1000.0, ""),
@@ -29,8 +29,8 @@ _MOST_IODINE = 10_000.0  # kg/m³, twice the density of solid iodine
 
 # Name in `carm.VIEWS`, or primary and secondary angle in degrees.
 View = str | Sequence[float]
-# Name of the views with the fewest ambiguous places, see `imaging.views`, and of what
-# stands for them where no anatomy is known.
+# Name of the views with the fewest ambiguous places, see `imaging.views`; and angles,
+# degrees, that replace them where no anatomy is known.
 BEST = "best"
 _ANY = {"view": (0.0, 0.0), "biplane": (90.0, 0.0), "third": (45.0, 0.0)}
 
@@ -44,7 +44,7 @@ class RoadmapErrors:
     Attributes:
         noise: standard deviation of the place of the outlines, pixels; smooth along
             them.
-        erosion: by how much the outlines lie inside those of the vessel, pixels.
+        erosion: distance by which the outlines lie inside those of the vessel, pixels.
         gaps: missing segments of each roadmap.
         calibration: largest error of the angles of each plane, degrees.
     """
@@ -113,7 +113,7 @@ class FluoroscopyOptions:
     source_detector: float = carm.SOURCE_DETECTOR
     source_isocentre: float = carm.SOURCE_ISOCENTRE
     detector_size: float = DETECTOR_SIZE
-    # What makes an object is given; the object is here after validation.
+    # Accepts a mapping, which `__post_init__` converts to `RoadmapErrors`.
     roadmap_errors: Any = NO_ERRORS
 
     def __post_init__(self) -> None:
@@ -166,7 +166,7 @@ class FluoroscopyOptions:
         Args:
             points: (..., 3) whose middle is the isocentre unless `centre` is given, m.
             deviation: added to primary and secondary angle of every plane, degrees.
-            names: of the fields with their views; those of the planes by default.
+            names: names of the fields with the views; by default those of the planes.
 
         Raises:
             ValueError: if a view or a distance is not possible.
@@ -183,9 +183,13 @@ class FluoroscopyOptions:
         return tuple(arms)
 
     def aimed(self, points: np.ndarray, places: np.ndarray) -> Self:
-        """With a centre amid places (n, 3) if that amid points (m, 3), m, misses some.
+        """Puts the isocentre amid `places` if that amid `points` misses some of them.
 
-        A given centre stays, and none is given where neither shows all places.
+        A given centre stays. Options do not change if neither shows all places.
+
+        Args:
+            points: (m, 3), vertices of the lumen, m.
+            places: (n, 3), what every plane should show, m.
         """
 
         def shown(amid: np.ndarray) -> bool:
@@ -197,7 +201,7 @@ class FluoroscopyOptions:
 
 
 def is_best(view: View | None) -> bool:
-    """Whether the anatomy decides about a view."""
+    """Whether a view is "best", which depends on the anatomy."""
     return isinstance(view, str) and view == BEST
 
 

@@ -60,7 +60,7 @@ def surface_thickness(carm: CArm, surface: Surface, supersample: int = 3) -> np.
 
 @compiled
 def _add_surface(image, corners, inverse, faces):
-    """Adds depths (m) at which rays leave a surface, less those where they enter."""
+    """Adds depths (m) at which rays leave a surface, minus those where they enter."""
     rows, columns = image.shape
     for face in range(len(faces)):
         i, j, k = faces[face]

@@ -1,8 +1,8 @@
-"""Views that leave the least doubt about where a vessel runs.
+"""Views of a vessel with the fewest ambiguous places.
 
-Two outlines hold a vessel in their visual hull, which has room where there is no
-vessel: between branches that lie side by side in both. The hull of many views has
-little such room, so what it excludes and a pair does not is ambiguous.
+The visual hull of two outlines also has places outside the vessel, as between branches
+that lie side by side in both views. The hull of many views has few such places, so a
+place is ambiguous if it is outside that hull and inside that of the pair.
 """
 
 import itertools
@@ -32,9 +32,12 @@ def best_views(
     """Angles of the views with the fewest ambiguous places, degrees.
 
     Args:
-        surface: Of the lumen, world frame, m.
-        arm: Whose centre and distances the views have.
-        known: The two views that there are, for a third one; none for the pair itself.
+        surface: Surface of the lumen, world frame, m.
+        arm: C-arm with the isocentre and the distances of the views.
+        known: The two C-arms of a pair, to find a third view; empty to find the pair.
+
+    Returns:
+        (primary, secondary) of the pair, or of the third view alone.
     """
     angles = list(itertools.product(PRIMARY, SECONDARY))
     arms = [replace(arm, primary=p, secondary=s) for p, s in np.deg2rad(angles)]

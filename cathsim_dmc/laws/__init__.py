@@ -1,17 +1,17 @@
 """The physics of devices in vessels, without an engine.
 
 One file is one law: a pure function of named parameters, time and arrays. A law
-allocates nothing (scratch is passed in), knows no engine and no global state, and works
+allocates nothing (scratch is passed in), uses no engine and no global state, and works
 in float64 and SI units. `compiled.law` and `compiled.inlined` compile it for the CPU,
 and `compiled.for_cuda` gives the same function, and all that it calls, to kernels of
 numba-cuda; laws therefore import functions by name, not modules. Parameters are
-NamedTuples, which numba passes at the price of plain arguments. None of their fields is
-called `index` or `count`: on CUDA the tuple's method hides such a field.
+NamedTuples, which numba passes at the cost of plain arguments. No field is called
+`index` or `count`: on CUDA the tuple's method of that name hides the field.
 
     vectors          products of vectors, frames
     field            signed depth in a lumen, on sparse bricks: `FieldArrays`
     bore             clearance in a round bore around a polyline
-    wall             clearance and normal of either: `Wall`
+    wall             clearance and normal of a field or a bore: `Wall`
     places           `Capsule` and `Places`
     capsule          places along a capsule that are nearest to a wall
     planes           tangent planes of the wall at such a place
@@ -24,6 +24,10 @@ called `index` or `count`: on CUDA the tuple's method hides such a field.
     compliance       contact with a compliant wall
     drive            servos that slip
     sheath           hinges of the links in a sheath
+    coaxial          overlap of coaxial devices, and the chain that represents them
+    coaxial_forces   forces between coaxial devices
+    torsion          twist of coaxial devices
+    sliding          coaxial devices in a control step
     device           state that the laws of effects read
     parameters       how the parameters of an effect's law are declared
 

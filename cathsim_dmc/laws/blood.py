@@ -1,10 +1,10 @@
 """Drag of blood on the links of a device.
 
-On a length l and a diameter d, at a velocity u of the blood across the axis and
-Re = ρ|u|d/µ, it is ½ ρ d l C_d |u| u, C_d = 1.18 + 6.8 / Re^0.89 + 1.96 / √Re -
-0.0004 Re / (1 + 3.64e-7 Re²) (Sucker and Brauer 1975, Wärme- und Stoffübertragung 8,
-149; Re from 1e-4 to 2e5). Along the axis it is the friction of the annular gap
-(`physics.flow`).
+Across its axis, a link of length l and diameter d has the drag ½ ρ d l C_d |u| u, with
+the velocity u of the blood across the axis, Re = ρ|u|d/µ and C_d = 1.18 + 6.8 / Re^0.89
++ 1.96 / √Re - 0.0004 Re / (1 + 3.64e-7 Re²) (Sucker and Brauer 1975, Wärme- und
+Stoffübertragung 8, 149; Re from 1e-4 to 2e5). Along its axis, the drag is the friction
+in the annular gap (`physics.flow`).
 """
 
 import math
@@ -16,18 +16,21 @@ from cathsim_dmc.laws.parameters import Array
 
 
 class Blood(NamedTuple):
-    """Blood around the links; its velocity at time t is `peak` beat(rate t + phase).
+    """Blood around the links.
+
+    Its velocity at time t is `velocity` peak beat(rate (t - delay) + phase), or
+    `velocity` if `peak` is 0, plus `space_velocity`.
 
     Attributes:
         density: kg/m³.
         viscosity: Pa·s; 0 for no blood.
         peak: Factor of all velocities at the peak of a beat, 0 for a steady flow.
         rate: Heart rate, 1/s.
-        phase: Of the heart at time 0, in beats.
-        velocity: (L, 3), of the blood at each link, m/s at a factor of 1.
-        delay: (L,), of the beat there, s.
-        friction: (L,), along the axis per length and velocity, N·s/m².
-        space_velocity: (L, 3), of the vessel's space, m/s.
+        phase: Phase of the heart at time 0, in beats.
+        velocity: (L, 3), velocity of the blood at each link, m/s at a factor of 1.
+        delay: (L,), delay of the beat at each link, s.
+        friction: (L,), axial friction per length and velocity, N·s/m².
+        space_velocity: (L, 3), velocity of the moving vessel's space, m/s.
     """
 
     density: Any
@@ -43,14 +46,14 @@ class Blood(NamedTuple):
 
 @compiled
 def beat(phase):
-    """Inflow of the aorta over that at its peak, at a phase in beats."""
+    """Inflow of the aorta at a phase in beats, relative to its peak."""
     first, share = place_in(phase, len(BEAT))
     return (1.0 - share) * BEAT[first] + share * BEAT[first + 1]
 
 
 @compiled
 def cross_drag(blood, speed, radius, length):
-    """Drag across a link over the velocity (m/s) of the blood there, N·s/m."""
+    """Drag across a link divided by the speed (m/s) of the blood across it, N·s/m."""
     reynolds = blood.density * speed * 2 * radius / blood.viscosity
     # ½ Re C_d, which is 0 at rest.
     drag = (0.59 - 2e-4 * reynolds / (1 + 3.64e-7 * reynolds**2)) * reynolds

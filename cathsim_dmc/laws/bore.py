@@ -4,7 +4,7 @@ A bore is one float64 array, `line`: the number of its points, then x, y, z and 
 m, of each. Its ends are open.
 
 The clearance at a point is the radius, interpolated at the nearest place of the line,
-less the distance from there. At an open end it is `FREE`.
+minus the distance from that place. Past an open end it is `FREE`.
 """
 
 import math
@@ -16,7 +16,7 @@ from cathsim_dmc.laws.field import FREE
 from cathsim_dmc.laws.places import Places
 from cathsim_dmc.laws.vectors import along
 
-_LEVEL = 1e-9  # cosine between a capsule and a bore that it lies across
+_LEVEL = 1e-9  # cosine of capsule and bore below which they are perpendicular
 
 
 @law
@@ -48,9 +48,9 @@ def bore_clearance(line, point):
 def straight_bore_places(line, capsule, limit):
     """Places of a capsule nearest to the wall of a bore of one segment.
 
-    Within the bore the clearance is a concave function of the place along the capsule,
-    so only its ends count, and the places where it crosses the planes of the bore's
-    ends. Arguments and result are those of `capsule.nearest_places`.
+    Within the bore the clearance is a concave function of the place along the capsule.
+    Its minima are therefore at the capsule's ends, or where the capsule crosses an end
+    plane of the bore. Arguments and result are those of `capsule.nearest_places`.
     """
     centre, axis, half = capsule.centre, capsule.axis, capsule.half_length
     dx, dy, dz = line[5] - line[1], line[6] - line[2], line[7] - line[3]

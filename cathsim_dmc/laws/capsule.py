@@ -1,8 +1,8 @@
 """Places along a capsule that are nearest to a wall.
 
 Sphere tracing along the axis samples the clearance every `EVERY` m (J. C. Hart, The
-Visual Computer 12 (1996) 527: the clearance changes by at most the distance moved, so
-samples that a neighbour keeps away from the wall are skipped). Each local minimum that
+Visual Computer 12 (1996) 527): the clearance changes by at most the distance moved, so
+samples whose neighbour is far enough from the wall are skipped. Each local minimum that
 can be a contact is then bisected and fitted by a parabola.
 """
 
@@ -19,20 +19,21 @@ from cathsim_dmc.laws.places import Places
 from cathsim_dmc.laws.wall import clearance_along, is_straight_bore
 
 EVERY = 1e-3  # m, between the first samples of a capsule
-SAMPLES = 65  # at most
-# A dent of the clearance must be so deep, m, to be a contact of its own: a capsule
-# that lies flat on a wall has many shallower ones.
+SAMPLES = 65  # largest number of samples
+# Depth, m, of a local minimum of the clearance that is a contact of its own; a capsule
+# that lies flat on a wall has many shallower minima.
 _DENT = 5e-6
-_FLAT = 2e-6  # m, differences of the clearance that are none
+_FLAT = 2e-6  # m, below which clearances count as equal
 _BISECTIONS = 6
 _FAR = 1e-3  # m, error of the coarse lattice far from the wall
 
 
 @inlined
 def _is_dent(samples, count, i, caps):
-    """Whether the clearance rises to both sides of a sample: a contact of its own.
+    """Whether a sample is a local minimum deep enough for a contact of its own.
 
-    It rises by `_DENT`, or up to an end whose cap does not collide.
+    The clearance must rise to both sides by `_DENT`, or up to an end whose cap
+    collides and where it still rises.
     """
     for side, way in enumerate((-1, 1)):
         rise, k = 0.0, i + way
@@ -50,7 +51,7 @@ def _is_dent(samples, count, i, caps):
 
 @inlined
 def _refine(wall, capsule, t, value, step):
-    """Place (m along a capsule) of the least clearance within a step of t, and it.
+    """Place (m) of the least clearance within a step of t, and that clearance (m).
 
     Bisection, because the clearance has a kink at an edge of the wall; then a parabola
     through the last three places.
@@ -86,7 +87,10 @@ def _refine(wall, capsule, t, value, step):
 
 @inlined
 def is_far(wall, capsule, limit):
-    """Whether a capsule is farther from the wall than the limit, m, by its middle."""
+    """Whether a capsule is certain to be farther from the wall than the limit, m.
+
+    The clearance at its middle decides; past an open end, that at its ends.
+    """
     middle = clearance_along(wall, capsule, 0.0)
     if middle < FREE:
         return middle - capsule.half_length > limit + _FAR
@@ -100,9 +104,9 @@ def is_far(wall, capsule, limit):
 
 @inlined
 def _sample(wall, capsule, limit, samples):
-    """Writes clearances (m) of places along a capsule; returns their number and step.
+    """Writes clearances (m) along a capsule; returns their number and spacing (m).
 
-    No places: the wall is farther away than the limit, m.
+    The number is 0 if the wall is farther away than the limit, m.
     """
     count, half = 1, capsule.half_length
     if half > 0.0:
@@ -113,7 +117,7 @@ def _sample(wall, capsule, limit, samples):
         value = samples[i] = clearance_along(wall, capsule, -half + i * step)
         least = min(least, value)
         i += 1
-        # The clearance changes by at most the way, except where an open end begins.
+        # It changes by at most the distance moved, except where an open end begins.
         while i < count and value < FREE and value - step > limit + _FAR:
             value -= step
             samples[i] = value
@@ -123,7 +127,7 @@ def _sample(wall, capsule, limit, samples):
 
 @inlined
 def _candidate(samples, count, i, deepest, caps):
-    """Whether a sample is refined, and whether it is an end whose cap is left out."""
+    """Whether to refine a sample, and whether its end cap does not collide."""
     value = samples[i]
     if i == 0 or i == count - 1:
         beside = samples[min(1, count - 1)] if i == 0 else samples[i - 1]
@@ -135,7 +139,7 @@ def _candidate(samples, count, i, deepest, caps):
 
 @inlined
 def _with(places, t, value):
-    """The two places that are nearest to the wall of those found and one after them."""
+    """Adds a place beyond those found; keeps the two nearest to the wall."""
     found, first, low = places.found, places.first, places.first_clearance
     second, lower = places.second, places.second_clearance
     if found == 2:
@@ -156,7 +160,7 @@ def nearest_places(wall, capsule, limit, samples):
     Args:
         wall: `wall.Wall`.
         capsule: `places.Capsule`.
-        limit: m; what is farther from the wall does not count.
+        limit: Largest clearance of a place, m.
         samples: (SAMPLES,) scratch.
 
     Returns:

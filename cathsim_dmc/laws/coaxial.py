@@ -25,7 +25,7 @@ class Tables(NamedTuple):
         edges: (K, E), start of the uniform pieces of the devices, m from their ends,
             padded with infinity.
         bending: (K, E + 1), EI beyond the device and of the pieces, N·m².
-        moment: (K, E + 1), EI κ there, N·m.
+        moment: (K, E + 1), EI κ likewise, N·m.
     """
 
     nodes: Any
@@ -51,7 +51,7 @@ class Sections(NamedTuple):
 
 
 class Posture(NamedTuple):
-    """How devices lie: `gaps`, `bends` and `turns`."""
+    """Posture of the devices: `gaps`, `bends` and `turns`, see the module."""
 
     gaps: Any
     bends: Any
@@ -59,7 +59,7 @@ class Posture(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of the laws.
+    """Scratch arrays of the laws.
 
     Attributes:
         places: (K E + 1,), m.
@@ -105,8 +105,8 @@ class Links(NamedTuple):
         radius: radius of the outermost device, its mean over the link, m.
         friction: Coulomb coefficient on the wall, its mean over the link.
         mass: mass, kg.
-        buoyancy: fraction of the link's weight that buoyancy cancels, beyond the
-            buoyancy of all devices together, which reduces gravity (`gravcomp`).
+        buoyancy: additional fraction of the link's weight that buoyancy cancels
+            (`gravcomp`); gravity contains the buoyancy of all devices together.
         inertia: (L, 2), moments of inertia of a solid capsule across and along its
             axis, kg·m².
     """
@@ -130,7 +130,7 @@ def _weight(place, joint, nodes, lengths):
 
 @compiled
 def _breaks(gaps, edges, places):
-    """Writes the places, m from the end, where a piece begins, in order."""
+    """Writes the sorted distances from the end of the chain where a piece begins, m."""
     count = 0
     for k in range(edges.shape[0]):
         for e in range(edges.shape[1]):
@@ -145,7 +145,7 @@ def _breaks(gaps, edges, places):
 
 @compiled
 def piece_at(place, edges):
-    """Number of the section of a device at a distance from its end, m."""
+    """Column of `Tables.bending` at a distance from the end of a device, m."""
     piece = 0
     while piece < len(edges) and place >= edges[piece]:
         piece += 1
@@ -196,7 +196,7 @@ def overlap(gaps, tables, scratch, out):
             out.stiffness[k, j] /= span
             out.moment[k, j] /= span
     for link in range(len(lengths)):
-        # A device farther out covers a place that it reaches.
+        # Wherever an outer device is present, it covers the inner ones.
         covered = 0.0
         for k in range(devices - 1, -1, -1):
             reached = (nodes[link] - gaps[k]) / lengths[link]
@@ -208,7 +208,7 @@ def overlap(gaps, tables, scratch, out):
 
 @compiled
 def rest_angles(rest, turns, out):
-    """Writes the rest angles (J,) complex of the joints, rad; `rest` of `Overlap`."""
+    """Writes the rest angles (J,) complex of the joints, rad, from `Overlap.rest`."""
     for j in range(len(out)):
         whole = rest[0, j] * unit(turns[0, j])
         for k in range(1, len(turns)):
@@ -219,7 +219,7 @@ def rest_angles(rest, turns, out):
 @compiled
 def _inertia(mass, radius, length):
     """Moments of inertia of a solid capsule, across and along it, kg·m²."""
-    share = 1 / (1 + 4 * radius / (3 * length))  # of the cylinder in the volume
+    share = 1 / (1 + 4 * radius / (3 * length))  # volume fraction of the cylinder
     cylinder, ball = mass * share, mass * (1 - share)
     square = radius * radius
     across = cylinder * (length * length / 12 + square / 4)

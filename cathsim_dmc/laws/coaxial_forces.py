@@ -12,14 +12,14 @@ from cathsim_dmc.laws.hinges import unit
 
 
 class Lumen(NamedTuple):
-    """What acts on devices in each other.
+    """Loads of coaxial devices within the lumens.
 
     Attributes:
-        start: (K,), compression where each device leaves the others, N.
-        ways: (K - 1,) in [-1, 1], fraction of the friction that acts on device k,
+        start: (K,), axial compression of each device where it leaves the others, N.
+        ways: (K - 1,) in [-1, 1], fraction of the full friction that acts on device k,
             positive when it slides forward in the next one.
         coefficient: Coulomb coefficient between the devices.
-        factor: Of all stiffnesses.
+        factor: Factor of all stiffnesses.
     """
 
     start: Any
@@ -30,7 +30,7 @@ class Lumen(NamedTuple):
 
 @compiled
 def restoring(overlap, posture, scratch, torque, rate):
-    """Restoring torques of the shapes of the devices, and their stiffness.
+    """Writes the restoring torques of the devices' shapes, and their stiffness.
 
     The energy of a joint bent by θ is |θ - Σ R_k e_k|²/2C, e_k = exp(iφ_k), and that of
     two devices against each other -S cos(φ_k - φ_l).
@@ -40,7 +40,7 @@ def restoring(overlap, posture, scratch, torque, rate):
         posture: `Posture`.
         scratch: `Scratch`.
         torque: (K, J), gets the torque on each device about its axis, N·m.
-        rate: (K, J), gets minus its derivative by the rotation, N·m/rad.
+        rate: (K, J), gets its negative derivative by the rotation, N·m/rad.
     """
     compliance, rest, coupling = overlap.compliance, overlap.rest, overlap.coupling
     bends, turns, pulls = posture.bends, posture.turns, scratch.pulls
@@ -86,10 +86,10 @@ def _pull(place, load, posture, tables, joint, device, piece):
 
 @compiled
 def axial(tables, overlap, posture, slopes, scratch, force):
-    """Writes the axial forces of the joints, positive where a device must be pushed.
+    """Writes the axial forces at the joints, positive where a device must be pushed.
 
-    Minus the derivative of the energy by the gap of a device, at given bends and
-    rotations of its rod; that of the leading device is minus the others' sum.
+    They are the negative derivative of the energy by the gap of a device, at given
+    bends and rotations. That of the leading device is the negative sum of the others.
 
     Args:
         tables: `Tables`.
@@ -125,7 +125,7 @@ def axial(tables, overlap, posture, slopes, scratch, force):
             while place >= nodes[link]:
                 link -= 1
             share = (place - nodes[link + 1]) / lengths[link]
-            # The joints at both ends of the link share what it bends.
+            # The joints at both ends of the link share its bending.
             for j, weight in ((link - 1, share), (link, 1 - share)):
                 if 0 <= j < joints:
                     jump = _pull(place, loads[j], posture, tables, j, k, piece)
@@ -137,9 +137,9 @@ def axial(tables, overlap, posture, slopes, scratch, force):
 
 @compiled
 def pressure(tables, overlap, posture, axial, lumen, scratch, force, drag):
-    """Lateral forces of each device on the lumen of the next one, and friction.
+    """Writes the lateral forces of each device on the lumen around it, and friction.
 
-    With the moment M and the compression P, the force is M'' + Pκ per length.
+    With the moment M and the compression P, the force per length is M'' + P κ.
 
     Args:
         tables: `Tables`.
@@ -149,7 +149,7 @@ def pressure(tables, overlap, posture, axial, lumen, scratch, force, drag):
         lumen: `Lumen`.
         scratch: `Scratch`.
         force: (K - 1, J), gets the force of device k on device k + 1 at the joints, N.
-        drag: (K - 1,), gets the axial force that their friction demands of device k, N.
+        drag: (K - 1,), gets the axial force on device k that overcomes friction, N.
     """
     lengths, bends, turns = tables.lengths, posture.bends, posture.turns
     devices, joints = turns.shape
@@ -164,7 +164,7 @@ def pressure(tables, overlap, posture, axial, lumen, scratch, force, drag):
             own[j] -= lumen.factor * overlap.moment[k, j] * unit(turns[k, j])
         for j in range(joints - 1):
             shear[j] = (own[j + 1] - own[j]) / lengths[j + 1]
-        # Compression of the device, from its end on.
+        # Axial compression of the device, summed up from its distal end.
         pushed = lumen.start[k]
         for j in range(joints - 1, -1, -1):
             span = (lengths[j] + lengths[j + 1]) / 2
@@ -178,7 +178,7 @@ def pressure(tables, overlap, posture, axial, lumen, scratch, force, drag):
             lateral = shear[j] + here * bends[j]
             if j > 0:
                 lateral -= shear[j - 1]
-            # Only where both devices are present: the mean of both links.
+            # Only the fraction of both links on which both devices are present.
             present = overlap.present[k + 1]
             force[k, j] = abs(lateral) * ((present[j] + present[j + 1]) / 2)
             rubbing = lumen.ways[k] * lumen.coefficient * force[k, j]
@@ -190,7 +190,7 @@ def pressure(tables, overlap, posture, axial, lumen, scratch, force, drag):
 def wall_friction(arms, outermost, force, coefficient, torque):
     """Writes limits (K, J) of the friction torque of the wall on the devices, N·m.
 
-    The arms (K,) are radii by friction ratio, m, the forces (L,) those on the links, N.
+    The arms (K,) are radius times friction ratio, m; the forces (L,) act on links, N.
     """
     devices, links = outermost.shape
     for k in range(devices):

@@ -1,9 +1,9 @@
 """Compliant wall: the contact of a link as a spring of the vessel's stiffness.
 
 A tube of radius r, modulus E, thickness h and Poisson's ratio ν under a point load has
-the stiffness 4 E h² / (√(3 (1 - ν²)) r) when what surrounds it holds it round, and
-E/(1 - ν²) h³ / (12 · 0.149 r³) · r √(r/h) when it is free to become oval
-(docs/vessel_model.md has the sources); `support` weighs them geometrically.
+the stiffness 4 E h² / (√(3 (1 - ν²)) r) where its surroundings keep it round, and
+E/(1 - ν²) h³ / (12 · 0.149 r³) · r √(r/h) where it may become oval (sources in
+docs/vessel_model.md). The stiffness is their geometric mean with the weight `support`.
 """
 
 import math
@@ -14,19 +14,20 @@ from cathsim_dmc.laws.parameters import Array
 from cathsim_dmc.laws.planes import MOST
 
 POISSON = 0.5
-# Thickness of an artery over its radius, and the least: 1.4 and 1.0 mm at the ascending
-# and descending aorta (PMC3154923), 0.6 mm at a carotid.
+# Thickness relative to the radius of an artery, and least thickness, m: 1.4 and 1.0 mm
+# at the ascending and descending aorta (PMC3154923), 0.6 mm at a carotid.
 _RELATIVE, _THINNEST = 0.1, 0.6e-3
 
 
 class Material(NamedTuple):
-    """What the wall is made of.
+    """Material of the wall.
 
     Attributes:
         modulus: Young's modulus, Pa.
-        thickness: m; NaN for an artery's, a tenth of the radius, 0.6 mm at least.
-        support: 1 for a vessel held by what surrounds it, 0 for one free to become
-            oval, or between.
+        thickness: m; NaN for that of an artery, a tenth of the radius and at least
+            0.6 mm.
+        support: Weight from 0 to 1: 1 for a vessel that its surroundings keep round, 0
+            for one that may become oval.
     """
 
     modulus: Any
@@ -35,12 +36,12 @@ class Material(NamedTuple):
 
 
 class Law(NamedTuple):
-    """Contact of MuJoCo with a wall.
+    """MuJoCo's contact parameters of a wall.
 
     Attributes:
         solref: (2,).
         solimp: (5,).
-        relaxation: Of a compliant wall, s; 0 for `solref` as it is.
+        relaxation: Relaxation time of a compliant wall, s; 0 to use `solref`.
     """
 
     solref: Any
@@ -53,7 +54,7 @@ class Sharing(NamedTuple):
 
     Attributes:
         shared: (L, MOST), 1 where contact n of a link shares the spring of its place
-            with another one, else 0; what is beyond the last contact means nothing.
+            with another one, else 0; undefined beyond the last contact.
     """
 
     shared: Any = Array("links", MOST)
@@ -63,9 +64,9 @@ class Links(NamedTuple):
     """The links of a device, arrays (L,).
 
     Attributes:
-        geoms: Their geoms.
-        weight: Inverse weights, 1/kg.
-        rigid: Stiffness of their contact with a rigid wall, N/m.
+        geoms: Geoms of the links.
+        weight: Inverse weights (`body_invweight0`), 1/kg.
+        rigid: Stiffness of the links' contact with a rigid wall, N/m.
     """
 
     geoms: Any
@@ -88,7 +89,7 @@ def stiffness(radius, material):
 
 @compiled
 def reference(stiffness, weight, law):
-    """`solref` (2) of a spring, N/m, on a link of an inverse weight, 1/kg."""
+    """`solref` (2) of a contact of a stiffness (N/m) and an inverse weight (1/kg)."""
     first, last = law.solimp[0], law.solimp[1]
     scale = stiffness * last * (1.0 - first) * weight / first
     return -scale * last / first, -scale * law.relaxation
@@ -96,15 +97,15 @@ def reference(stiffness, weight, law):
 
 @compiled
 def write_contacts(radius, material, links, laws, solref, solimp):
-    """Writes the contacts of the links of a simulation.
+    """Writes the contact parameters of the links of a simulation.
 
     Args:
-        radius: (L,), of the lumen around each link, m; 0 where it is in none.
+        radius: (L,), radius of the lumen around each link, m; 0 for none.
         material: `Material`.
-        links: `Links`; what is stiffer than the rigid wall has its contact.
+        links: `Links`; where the vessel is stiffer than `rigid`, the rigid law applies.
         laws: `Law` of the rigid wall, and of the compliant one.
-        solref: (ngeom, 2), of the geoms, written.
-        solimp: (ngeom, 5), likewise.
+        solref: (ngeom, 2), `geom_solref`, written.
+        solimp: (ngeom, 5), `geom_solimp`, written.
     """
     rigid, compliant = laws
     for n in range(len(links.geoms)):
@@ -123,6 +124,6 @@ def write_contacts(radius, material, links, laws, solref, solimp):
 
 @compiled
 def share(contact):
-    """Halves stiffness and damping of a contact that shares its place's spring."""
+    """Halves stiffness and damping of a contact that shares the spring of its place."""
     solref = contact.solref
     solref[0], solref[1] = 0.5 * solref[0], 0.5 * solref[1]

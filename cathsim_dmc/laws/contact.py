@@ -2,8 +2,8 @@
 
 A contact is a row of `out`: unit normal (3) away from the wall, clearance of the
 capsule's axis (m), place along the axis (m), and 1 where the contact shares the spring
-of its place with another one, else 0. `world_contact` turns it into what an engine of
-rigid bodies takes.
+of its place with another one, else 0. `world_contact` converts it for an engine of
+rigid bodies.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from cathsim_dmc.laws.vectors import along, cross, dot, length, opposite
 from cathsim_dmc.laws.wall import is_straight_bore, normal_at
 
 CONTACT = 6  # numbers of a contact
-# First impedance that marks a link beside a compliant wall, and the largest one of a
-# contact that starts soft enough for a single plane.
+# First number of `solimp` that marks a link at a compliant wall, and the largest one of
+# a contact that starts soft enough for a single plane.
 COMPLIANT, _SOFT_START = 0.7, 0.1
-# One plane suffices in a compliant wall up to a depth times slope, m, of so much, m/s²,
-# over |`solref`|: less than half a rigid wall's load.
+# In a compliant wall, one plane suffices up to a depth times slope, m, of this number,
+# m/s², divided by |`solref`|: less than half a rigid wall's load.
 _LIGHT = 15.0
-# Contact activation distance, m: between contacts under load, one physics step without
-# any lets the light tip jump by most of a millimetre.
+# Contact activation distance, m: under load, a single physics step without a contact
+# lets a light tip jump by most of a millimetre.
 _ACTIVATION = 1e-4
-_TOUCHING = -1e-9  # m, the distance of a contact that is only activated
-# Depth, m, at the end of the physics step from which a link hits.
+_TOUCHING = -1e-9  # m, distance of a contact within the activation distance
+# Depth at the end of the physics step, m, from which a motion is an impact.
 IMPACT = 1e-4
-_JOINED = 1e-6  # m, between the end of a capsule and the joint of its body
+_JOINED = 1e-6  # m, within which the end of a capsule is at the joint of its body
 
 
 class Law(NamedTuple):
-    """How a link and a wall meet; see `contact_law`.
+    """Contact parameters of a link and a wall; see `contact_law`.
 
     Attributes:
         radius: Of the capsule, m.
-        margin: m, within which a contact may be asked for without a force.
+        margin: Margin of the pair, m, within which a contact without a force is made.
         activation: Contact activation distance, m; 0 where there is none.
         compliant: Whether the wall is compliant: the planes of a place share a spring.
         single: Whether one plane suffices under a light load.
@@ -65,8 +65,8 @@ class Sweep(NamedTuple):
 
     Attributes:
         travel: (3) m, of the centre.
-        turn: (3) of places along the capsule, per metre from the centre.
-        reach: Clearance below which it may hit the wall, m; -inf where none is asked.
+        turn: (3), further displacement per metre from the centre along the capsule.
+        reach: Clearance below which it may hit the wall, m; -inf to ignore impacts.
     """
 
     travel: Any
@@ -75,7 +75,7 @@ class Sweep(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of a law, for one capsule at a time.
+    """Scratch arrays of a law, for one capsule at a time.
 
     Attributes:
         samples: (capsule.SAMPLES,) float64.
@@ -87,17 +87,17 @@ class Scratch(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """A place of a capsule that touches, and its share of the contacts."""
+    """A place of a capsule at the wall, and its limit of contacts."""
 
     t: Any  # m along the axis
     clearance: Any  # m
     lowest: Any  # whether it is the one with the least clearance
-    most: Any  # contacts that it may have, with those before it
+    most: Any  # limit of contacts up to this place, those before it included
 
 
 @inlined
 def contact_law(wall, radius, margin, impedance, reference):
-    """The law of a link.
+    """`Law` of a link and a wall.
 
     Args:
         wall: `wall.Wall`.
@@ -106,7 +106,7 @@ def contact_law(wall, radius, margin, impedance, reference):
         impedance: First number of the link's `solimp`.
         reference: First number of its `solref`; -stiffness in a compliant wall.
     """
-    # A straight sheath holds the shaft without any load.
+    # No activation in a straight sheath: the shaft is not loaded there.
     near = 0.0 if margin > 0.0 or is_straight_bore(wall) else _ACTIVATION
     compliant = impedance == COMPLIANT and not wall.is_bore
     light = _LIGHT / abs(reference) if compliant else 0.0
@@ -116,7 +116,7 @@ def contact_law(wall, radius, margin, impedance, reference):
 
 @inlined
 def end_caps(centre, axis, half_length, joint):
-    """Which end caps collide: one at the joint of its body is another link's."""
+    """Which end caps (2) collide: a cap at the joint of its body is the neighbour's."""
     low, high = 0.0, 0.0
     for k in range(3):
         low += (centre[k] - half_length * axis[k] - joint[k]) ** 2
@@ -126,7 +126,7 @@ def end_caps(centre, axis, half_length, joint):
 
 @inlined
 def looks_ahead(law):
-    """Whether contacts are made for impacts in the physics step to come."""
+    """Whether an impact in the coming physics step makes a contact in advance."""
     return law.activation > 0.0 and not law.compliant
 
 
@@ -138,7 +138,7 @@ def sweep_of(capsule, law, travel, turn):
         capsule: `places.Capsule`.
         law: `Law`.
         travel: (3) m, of its centre in a physics step, in the frame of the wall.
-        turn: (3) rad, of the capsule.
+        turn: (3) rad, rotation of the capsule in that step.
     """
     if not looks_ahead(law):
         still = (0.0, 0.0, 0.0)
@@ -157,7 +157,7 @@ def hits(law, sweep, t, normal, clearance):
         sweep: `Sweep`.
         t: m along the capsule.
         normal: (3) unit vector away from the wall.
-        clearance: m.
+        clearance: Clearance of the place, m.
     """
     ahead = dot(normal, along(sweep.travel, sweep.turn, t))
     return clearance + ahead <= law.radius - IMPACT
@@ -165,10 +165,10 @@ def hits(law, sweep, t, normal, clearance):
 
 @inlined
 def nth(places, n, compliant):
-    """Place n of a capsule, and how many contacts the capsule may have with it.
+    """`_Place` n of a capsule, with the limit of the contacts up to it.
 
-    None where it lies so close to a lower place that both are one, and fewer than all
-    where another place follows.
+    The limit is 0 at a rigid wall where a place with less clearance is within `EVERY`.
+    It leaves one contact for a second place, or two if that has less clearance.
     """
     t, clearance = places.first, places.first_clearance
     other = places.second_clearance
@@ -183,7 +183,7 @@ def nth(places, n, compliant):
 
 @inlined
 def turns_of(capsule, place, half_length):
-    """How far `planes.tangent_planes` looks; a sphere may have one contact."""
+    """`turns` of `planes.tangent_planes`; a sphere has one contact at most."""
     if capsule.half_length == 0.0:
         return 0
     return 1 + int(place.lowest and abs(place.t) >= half_length)
@@ -191,13 +191,13 @@ def turns_of(capsule, place, half_length):
 
 @inlined
 def append(law, planes, count, bounds, t, written, out):
-    """Appends planes to the contacts and returns how many there are.
+    """Appends planes to the contacts; returns the number of contacts.
 
     Args:
         law: `Law`.
         planes: (planes.PLANES, 4).
         count: Number of planes.
-        bounds: Most contacts in all, and the clearance, m, past which a plane is none.
+        bounds: Limit of contacts in all, and largest clearance of a plane, m.
         t: m along the capsule.
         written: Number of contacts so far.
         out: (MOST, CONTACT).
@@ -215,7 +215,7 @@ def append(law, planes, count, bounds, t, written, out):
 
 @law
 def contacts(wall, capsule, law, sweep, scratch, out):
-    """Contacts of a capsule with a wall at rest.
+    """Writes the contacts of a capsule with a wall at rest.
 
     Args:
         wall: `wall.Wall`.

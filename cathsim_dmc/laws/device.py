@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 
 class Links(NamedTuple):
-    """The links of a device in a physics step, of a law that acts in "control".
+    """Links of a device in a physics step, the argument of a law in "control".
 
     Attributes:
         xipos: (L, 3), centres of mass.
@@ -15,9 +15,10 @@ class Links(NamedTuple):
         xmat: (L, 9), orientations of the bodies, row by row.
         cvel: (L, 6), rotational and translational velocity about the centre of mass of
             the kinematic tree.
-        subtree_com: (L, 3), that centre is the first row.
-        xfrc_applied: (L, 6), force and torque on the centres of mass, N and N·m, 0
-            before the first law of a physics step, to be added to.
+        subtree_com: (L, 3), centres of mass of the subtrees; the first row is that of
+            the kinematic tree.
+        xfrc_applied: (L, 6), force and torque on the centres of mass, N and N·m. Laws
+            add to it; it is 0 before the first law of a physics step.
     """
 
     xipos: Any
@@ -29,7 +30,7 @@ class Links(NamedTuple):
 
 
 class Device(NamedTuple):
-    """A device in a physics step, of a law that acts in "passive".
+    """A device in a physics step, the argument of a law in "passive".
 
     Attributes:
         xipos: (L, 3), centres of mass of the links.
@@ -39,14 +40,15 @@ class Device(NamedTuple):
         geom_size: (ngeom, 3), radius and half length of capsules, m.
         geoms: (L,) int64, geoms of the links.
         body_dofadr: (L,) int32, first degree of freedom of each link.
-        body_dofnum: (L,) int32, how many it has.
-        cdof: (nv, 6), motion of each degree of freedom about the tree's centre of mass.
+        body_dofnum: (L,) int32, number of degrees of freedom of each link.
+        cdof: (nv, 6), motion axis of each degree of freedom about the tree's centre of
+            mass, rotation first.
         qpos: (nq,), positions of the joints, m and rad.
-        qfrc_passive: (nv,), generalised forces, N and N·m, to be added to.
-        jnt_stiffness: (njnt,), of the springs of the joints, N·m/rad.
-        qpos_spring: (nq,), positions at which these have no torque, rad.
+        qfrc_passive: (nv,), generalised forces, N and N·m; laws add to them.
+        jnt_stiffness: (njnt,), stiffness of the joints' springs, N·m/rad.
+        qpos_spring: (nq,), rest positions of these springs, rad.
         hinge_joints: (2 J,) int64, joints of the hinges in the order of the chain.
-        hinge_qpos: (2 J,) int64, their places in `qpos`.
+        hinge_qpos: (2 J,) int64, indices of these joints in `qpos`.
         hinge_dofs: (2 J,) int64, their degrees of freedom.
     """
 
@@ -69,13 +71,13 @@ class Device(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """A contact of the device with the wall, of a law that acts in "contact".
+    """A contact of the device with the wall, the argument of a law in "contact".
 
     Attributes:
-        pos: (3), place, m.
+        pos: (3), position, m.
         frame: (9), rows: normal from the device into the wall, and two tangents.
         solimp: (5,), impedance of the contact.
-        solref: (2,), stiffness and damping of the contact, to be changed.
+        solref: (2,), negative stiffness and damping of the contact; a law changes it.
     """
 
     pos: Any

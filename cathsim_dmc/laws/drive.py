@@ -1,18 +1,18 @@
 """Drive of a device: a position servo that follows its command until its clamp slips.
 
-The actuator pulls the platform with K (u - x) - d v, critically damped, and with the
-force at which the clamp slips at most. u is the integral of the command, by which the
-platform comes to rest where it has been told, and what the load on it compresses the
-servo by. It moves in ramps, so a platform of mass m is accelerated by Δv √(K/m) / e at
-most where the command changes by Δv; in motion it is 2 v √(m/K) behind, and it stops
-without turning back. Where the clamp has slipped, so has the command.
+The force of the actuator is K (u - x) - d v, critically damped and limited to the force
+at which the clamp slips. u is the integral of the command, at which the platform comes
+to rest, plus the compression of the servo under its load. u changes in ramps: where the
+commanded speed changes by Δv, a platform of mass m is accelerated by at most
+Δv √(K/m) / e. In motion it lags by 2 v √(m/K), and it stops without overshoot. Slip of
+the clamp shifts u by the same distance.
 """
 
 from typing import Any, NamedTuple
 
 from cathsim_dmc.compiled import compiled
 
-# Largest speed of a platform that makes up for a load, over that of the full command.
+# Largest speed of a platform that compensates a load, relative to full command.
 FASTEST = 1.1
 
 
@@ -20,16 +20,16 @@ class Servos(NamedTuple):
     """The D servos of a model, arrays (D,).
 
     Attributes:
-        qpos, dof, act: Places of joint and command among MuJoCo's `qpos`, `qvel` and
-            `act`.
-        gain: Force by command, N/m or N·m/rad.
+        qpos, dof, act: Indices of the joint and its command in MuJoCo's `qpos`, `qvel`
+            and `act`.
+        gain: Force per `act` (s at full command), N/s or N·m/s.
         stiffness: N/m or N·m/rad.
-        damping: N·s/m or N·m·s/rad, with that of an implicit step, see `hinge_time` of
-            `entities.chain`.
+        damping: Damping, that of an implicit step included (see `hinge_time` of
+            `entities.chain`), N·s/m or N·m·s/rad.
         limit: Largest force of the clamp, N or N·m.
-        reach: Way of a control step at full command, m or rad.
-        rise: Change of the load that moves the platform with its full speed when it is
-            made up for at once, N or N·m.
+        reach: Travel in a control step at full command, m or rad.
+        rise: Load change whose compensation in one step moves the platform at its full
+            speed, N or N·m.
     """
 
     qpos: Any
@@ -44,11 +44,11 @@ class Servos(NamedTuple):
 
 
 class Told(NamedTuple):
-    """What N simulations have been told, arrays (N, D), m and rad.
+    """Commanded places of the drives of N simulations, arrays (N, D), m and rad.
 
     Attributes:
-        place: Where each base comes to rest if nothing more is commanded.
-        slipped: Way by which each clamp has slipped in the episode.
+        place: Place at which each base comes to rest without a further command.
+        slipped: Distance by which each clamp has slipped in the episode.
     """
 
     place: Any
@@ -56,7 +56,7 @@ class Told(NamedTuple):
 
 
 class State(NamedTuple):
-    """State of N simulations, arrays (N, ...) of MuJoCo's."""
+    """MuJoCo's state of N simulations, arrays (N, ...)."""
 
     qpos: Any
     qvel: Any
@@ -65,12 +65,12 @@ class State(NamedTuple):
 
 @compiled
 def slip(servos, state, way):
-    """Writes the way (N, D) by which clamps have slipped, m and rad.
+    """Writes the slip (N, D) of the clamps, m and rad.
 
     Args:
         servos: `Servos`.
         state: `State` after a control step.
-        way: (N, D), positive where the device has stayed behind the command.
+        way: (N, D), written; positive where the device is behind the command.
     """
     for i in range(len(way)):
         for k in range(way.shape[1]):
@@ -83,15 +83,15 @@ def slip(servos, state, way):
 
 @compiled
 def follow(servos, state, command, load, told, way):
-    """Lets clamps slip and makes up for loads, before a control step.
+    """Subtracts slip from the commands and compensates loads, before a control step.
 
     Args:
         servos: `Servos`.
-        state: `State`; `act` changes.
+        state: `State`; `act` is written.
         command: (N, D) in [-1, 1], of the control step to come.
         load: (N, D), force of each platform on its device, N and N·m.
-        told: `Told`, which changes.
-        way: (N, D), by which the clamps have slipped in the last control step, written.
+        told: `Told`, updated.
+        way: (N, D), written: slip of the clamps in the last control step, m and rad.
     """
     slip(servos, state, way)
     for i in range(len(command)):

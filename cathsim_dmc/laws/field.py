@@ -17,15 +17,15 @@ from typing import Any, NamedTuple
 
 from cathsim_dmc.compiled import inlined, law
 
-# Places in the head of a field.
+# Offsets in the head of a field.
 EDGE, SHAPE, QUANTUM, ENDS = 3, 4, 7, 8
 # Numbers of an open end: position, outward direction, radii of the lumen and of the
 # hole in its cap.
 END, FIRST_END = 8, 9
 FREE = 1.0  # m, clearance of a place behind an open end
-# m behind an open end, in which a device is free; farther off a vessel may pass.
+# m behind an open end in which a device is free; another vessel may lie farther off.
 BEHIND = 28e-3
-_THICK = 5e-3  # m, more than any wall past the plane of an open end
+_THICK = 5e-3  # m, above the thickness of any wall past the plane of an open end
 
 
 class FieldArrays(NamedTuple):
@@ -36,7 +36,8 @@ class FieldArrays(NamedTuple):
             m per unit of depth, number of open ends, and each of these (`END`).
         coarse: int16, depths at the corners of the bricks.
         bricks: int32, first place of a brick in `samples`, -1 for none.
-        samples: int16; of each brick the cells n along its edge and (n + 1)³ depths.
+        samples: int16; of each brick the number n of cells along its edge, then
+            (n + 1)³ depths.
     """
 
     head: Any
@@ -67,7 +68,7 @@ def behind(head, point):
 
 @inlined
 def _trilinear(values, corner, strides, share):
-    """Value in a cell of a lattice, by the place of its first corner in `values`."""
+    """Value in the cell of a lattice whose first corner is `values[corner]`."""
     (sy, sz), (u, v, w), at = strides, share, corner
     low = (1.0 - v) * ((1.0 - w) * values[at] + w * values[at + 1])
     low += v * ((1.0 - w) * values[at + sz] + w * values[at + sz + 1])
@@ -84,7 +85,7 @@ def depth_at(field, point):
     edge = head[EDGE]
     a, b, c = int(head[SHAPE]), int(head[SHAPE + 1]), int(head[SHAPE + 2])
     u, v, w = (x - head[0]) / edge, (y - head[1]) / edge, (z - head[2]) / edge
-    # NaN is in the first cell: `max` would leave it, and no cell has that number.
+    # NaN goes to the first cell: `max` would keep NaN, which is no valid index.
     uu = min(u if u > 0.0 else 0.0, a - 1e-9)
     vv = min(v if v > 0.0 else 0.0, b - 1e-9)
     ww = min(w if w > 0.0 else 0.0, c - 1e-9)
@@ -105,7 +106,7 @@ def depth_at(field, point):
         share = (uu - i, vv - j, ww - k)
         value = _trilinear(field.samples, corner, strides, share)
     depth = head[QUANTUM] * value
-    # Beyond the box nothing is inside, though a lumen may leave it by an open end.
+    # Points beyond the box are outside, even where a lumen leaves it at an open end.
     return depth if beyond == 0.0 else min(depth, 0.0) - beyond
 
 
@@ -116,11 +117,11 @@ def _cap_distance(level, across, hole):
     Args:
         level: m behind the front of the cap.
         across: m from the axis of the hole.
-        hole: Radius of it, m.
+        hole: Radius of the hole, m.
     """
     if across > hole:
-        # A tilted sheath leaves the straight continuation of the hole: it is as far
-        # inside of the cap as `field_clearance` takes for free.
+        # A tilted sheath leaves the straight continuation of the hole. Past `_THICK`,
+        # `field_clearance` takes the depth -level for free.
         if level <= 0.0 or level >= _THICK:
             return -level
         return -min(level, across - hole)
@@ -131,9 +132,9 @@ def _cap_distance(level, across, hole):
 
 @inlined
 def walled_depth(field, point):
-    """Depth (m) at a point (3) m where flat caps leave holes in open ends.
+    """Depth (m) at a point (3) m, with flat caps that leave holes in open ends.
 
-    A cap reaches back for as far as a device is free behind it.
+    A cap reaches back to `BEHIND`.
     """
     head, value = field.head, depth_at(field, point)
     for number in range(int(head[ENDS])):
@@ -172,7 +173,7 @@ def field_clearance(field, point):
 def field_gradient(field, point, step):
     """Central differences (3) of the depth at a point (3) m, `step` m to each side.
 
-    They are 2 `step` times the gradient. Open ends do not count.
+    They are 2 `step` times the gradient. Points past open ends are not `FREE`.
     """
     slopes = (0.0, 0.0, 0.0)
     for axis in range(3):
@@ -206,7 +207,7 @@ def depths(field, points, free, out):
 
 @law
 def gradients(field, points, step, out):
-    """Writes gradients (n, 3) of the depth at points (n, 3) m."""
+    """Writes gradients (n, 3) of the depth at points (n, 3) m, NaN if not finite."""
     for n in range(len(points)):
         x, y, z = points[n]
         out[n] = math.nan

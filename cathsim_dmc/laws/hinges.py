@@ -2,7 +2,7 @@
 
 A joint bends by a complex angle, bend_y - i bend_x for small ones, in frames that do
 not twist along the chain (docs/pair_model.md). The order of its hinges alternates from
-joint to joint (`posture.x_first`): x is first where the joint's number is even.
+joint to joint (`posture.x_first`): x is first where the joint's index is even.
 """
 
 import math
@@ -12,7 +12,7 @@ from cathsim_dmc.compiled import compiled
 
 # Largest bend that is divided exactly between two hinges, rad.
 _LARGEST_BEND = 1.2
-# Difference that replaces a derivative, rad.
+# Step of the central differences, rad.
 _STEP = 1e-5
 
 
@@ -60,7 +60,7 @@ def _bend(x, y, first):
 
 @compiled
 def _difference(x, y, first, dx, dy):
-    """Derivative of `_bend` by x or y, of which the other step is 0."""
+    """Central difference of `_bend` by x or y; the step of the other one is 0."""
     ahead, behind = _bend(x + dx, y + dy, first), _bend(x - dx, y - dy, first)
     return (ahead - behind) / (2 * (dx + dy))
 
@@ -119,19 +119,19 @@ def unloaded_hinges(shape, free):
 
 @compiled
 def free_hinges(shape, compliance, angles, scratch, free):
-    """Writes the rest angles about x and y of the hinges of the chain as it is bent.
+    """Writes the rest angles that make the hinges of a bent chain isotropic joints.
 
-    Two hinges measure a bend differently in each direction, and twist. The springs have
-    the torques of the isotropic energy Σ|β_j - ΣR_k e_k|²/2C_j, in which β_j depends on
-    the hinges of the joint and on the twist of those before it: at angles θ, the rest
-    angles are θ - C ∂E/∂θ.
+    The angles of two hinges in series measure a bend differently in each direction, and
+    the hinges twist. At angles θ, springs with the rest angles θ - C ∂E/∂θ have the
+    torques of the isotropic energy E = Σ|β_j - ΣR_k e_k|²/2C_j. The bend β_j depends on
+    the hinges of joint j and on the twist of the joints before it.
 
     Args:
         shape: (J,) complex or float64, rest angles of the joints, rad.
         compliance: (J,), rad/(N·m).
         angles: (2 J,), positions of the hinges in the order of the chain, rad.
         scratch: `Bends`.
-        free: (J, 2), rad.
+        free: (J, 2), written: about x and about y, rad.
     """
     joints = len(shape)
     bent(angles, scratch)
@@ -144,7 +144,7 @@ def free_hinges(shape, compliance, angles, scratch, free):
         pull = (complex(shape[j]) - bends[j]) * unit(-twists[j])
         free[j, 0] = x + (over_x.conjugate() * pull).real
         free[j, 1] = y + (over_y.conjugate() * pull).real
-    # Torsional moment of all beyond the joint: derivative of the energy by a twist.
+    # Torsional moment of all joints beyond: derivative of the energy by the twist.
     moment = 0.0
     for j in range(joints - 1, -1, -1):
         first = j % 2
@@ -158,13 +158,13 @@ def free_hinges(shape, compliance, angles, scratch, free):
 
 @compiled
 def steered(commands, angles, scratch, turned):
-    """Writes commands of motors, turned out of untwisted frames into those of links.
+    """Turns motor commands from untwisted frames into the frames of the links.
 
     Args:
         commands: (N, 2 M), about x and y of the last M joints of each of N chains.
         angles: (N, 2 J), positions of the hinges in the order of the chains, rad.
         scratch: `Bends`.
-        turned: (N, 2 M).
+        turned: (N, 2 M), written; may be `commands`.
     """
     motors, twists = commands.shape[1] // 2, scratch.twists
     for i in range(len(commands)):

@@ -1,10 +1,10 @@
 """Motion of a vessel: how heart and breathing displace space.
 
-A place x in space holds what lies at X = x - u(x, t) in the vessel at rest, with
-u = a(t) H(x) + b(t) B(x); the radius of the lumen grows by g(X) r(t) p(t - s/c), with
-the way s from the heart and the velocity c of the pulse wave. H, B, g and s lie on a
-lattice (`anatomy.motion.Motion`) and are trilinear between its points. The course in
-time and its sources are those of docs/vessel_model.md.
+A point x in space corresponds to the point X = x - u(x, t) of the vessel at rest, with
+u = a(t) H(x) + b(t) B(x). The radius of the lumen grows by g(x) r(t) p(t - s(x)/c),
+with the distance s from the heart and the velocity c of the pulse wave. H, B, g and s
+are sampled on a lattice (`anatomy.motion.Motion`) and trilinear between its points.
+docs/vessel_model.md has the course in time and its sources.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from typing import Any, NamedTuple
 from cathsim_dmc.compiled import inlined, law
 from cathsim_dmc.laws.heart import SYSTOLE, pulse
 
-# Of the head of a lattice: origin (3) m, step m, shape (3); then its values.
+# Numbers in the head of a lattice: origin (3) m, step m, shape (3). Its values follow.
 HEAD = 7
 # Values at a point: displacement by the heart (3) and by breathing (3) at amplitude 1,
-# m, growth of the radius, m·kPa, and way from the heart, m.
+# m, growth of the radius, m·kPa, and distance from the heart, m.
 VALUES = 8
 # Numbers of `warp`: place at rest (3), its gradient (9) row by row, growth of the
-# radius and its gradient (3), velocity of space at a fixed place (3), rate of growth.
+# radius and its gradient (3), ∂u/∂t (3) and rate of growth of the radius.
 WARP = 20
-RAMP = 0.5  # s, over which an episode's vessel begins to move
+RAMP = 0.5  # s, over which the motion begins in an episode
 _TURNS = 60  # iterations at most
-_CLOSE = 1e-7  # m
+_CLOSE = 1e-7  # m, change below which the iteration ends
 
 
 class MotionParameters(NamedTuple):
-    """What moves a vessel.
+    """Parameters of the motion of a vessel.
 
     Attributes:
         heart: Amplitude of the heart, m.
         breathing: Amplitude of breathing.
         distensibility: 1/kPa.
         rate: Heart rate, 1/s.
-        phase: Of the heart at time 0, in beats.
+        phase: Phase of the heart at time 0, in beats.
         wave_speed: Pulse wave velocity, m/s.
-        breath_rate: 1/s.
-        breath_phase: Of breathing at time 0, in breaths.
+        breath_rate: Breathing rate, 1/s.
+        breath_phase: Phase of breathing at time 0, in breaths.
     """
 
     heart: Any
@@ -59,9 +59,9 @@ class Course(NamedTuple):
         heart: Amplitude of the heart, m.
         breathing: Amplitude of breathing.
         growth: Amplitude of the radius, 1/kPa.
-        heart_rate, breathing_rate, growth_rate: Their derivatives, per s.
+        heart_rate, breathing_rate, growth_rate: Their time derivatives, per s.
         beats: Phase of the pulse at the heart, in beats.
-        lag: Its lag, beats per metre.
+        lag: Lag of the pulse with the distance from the heart, beats per metre.
         rate: Heart rate, 1/s.
     """
 
@@ -80,7 +80,8 @@ class Course(NamedTuple):
 def course_at(parameters, time):
     """`Course` of `MotionParameters` at a time, s.
 
-    Both amplitudes go from 0 to 1 and back by half a cosine. All begin over `RAMP`.
+    The amplitudes of heart and breathing rise from 0 and fall back by half a cosine
+    each. All amplitudes ramp up over `RAMP`.
     """
     heart, breathing, distensibility = parameters[:3]
     rate, begun = parameters.rate, parameters.phase
@@ -129,17 +130,17 @@ def nth_course(parameters, n, time):
 
 @inlined
 def _cell(place, count):
-    """Cell of a lattice, share of it, and 0 outside, where nothing changes, else 1."""
+    """Cell of a lattice, fraction within it, and 1 in the lattice, else 0."""
     last = count - 1.0
     inside = 1.0 if 0.0 <= place <= last else 0.0
-    # NaN, which `max` would leave, is in the first cell.
+    # NaN goes to the first cell: `max` would keep it.
     place = min(place if place > 0.0 else 0.0, last - 1e-9)
     return int(place), place - int(place), inside
 
 
 @law
 def interpolate(lattice, point, out):
-    """Writes the values (8) at a point into out[:, 0], their gradients behind them."""
+    """Writes the values (8) at a point to out[:, 0], their gradients to out[:, 1:]."""
     step, ny, nz = lattice[3], int(lattice[5]), int(lattice[6])
     i, u, first_flat = _cell((point[0] - lattice[0]) / step, lattice[4])
     j, v, second_flat = _cell((point[1] - lattice[1]) / step, lattice[5])
@@ -165,7 +166,7 @@ def interpolate(lattice, point, out):
 
 @law
 def warp(lattice, course, point, values, out):
-    """Writes what a motion does to a point of space.
+    """Writes the motion at a point in space.
 
     Args:
         lattice: (7 + 8 a b c,) float64 of `anatomy.motion.Motion`.
@@ -194,13 +195,13 @@ def warp(lattice, course, point, values, out):
 
 @inlined
 def rest_place(there):
-    """Place at rest (3) m where `warp` has looked."""
+    """Place at rest (3) m, from the output of `warp`."""
     return (there[0], there[1], there[2])
 
 
 @law
 def first_past(inlet, points):
-    """Number of the first of places (n, 3) m past an inlet (position, way in), or n."""
+    """Index of the first point (n, 3) past an inlet (position, direction in), or n."""
     for n in range(len(points)):
         level = 0.0
         for k in range(3):
@@ -225,7 +226,7 @@ def to_rest(lattice, course, points, scratch, out):
 
 @law
 def to_space(lattice, course, points, scratch, out, growth):
-    """Writes places in space (n, 3) m of those at rest, and growth of radii (n,) m.
+    """Writes the places in space (n, 3) of places at rest (n, 3), and growth (n,), m.
 
     Fixed-point iteration x ← X + u(x), which converges while space does not fold. For
     `scratch` see `to_rest`.
@@ -246,9 +247,9 @@ def to_space(lattice, course, points, scratch, out, growth):
 
 @law
 def carried(there, flow):
-    """What a flow (3) at rest becomes where `warp` has looked, and det A.
+    """Flow (3) at rest mapped into space, from the output of `warp`, and det A.
 
-    det A A⁻¹ flow, with A the gradient of the place at rest, conserves volume.
+    The map det A A⁻¹, with the gradient A of the place at rest, conserves volume.
     """
     p, q, r = flow
     a, b, c = there[3], there[4], there[5]
@@ -263,10 +264,10 @@ def carried(there, flow):
 
 @law
 def wall_velocity(there, normal):
-    """Velocity (3) m/s of the wall's material where `warp` has looked.
+    """Velocity (3) m/s of the wall, from the output of `warp`.
 
-    Space moves with A⁻¹ ∂u/∂t (see `carried`), and a wall that widens against its
-    normal (3), which points away from it.
+    Space moves at A⁻¹ ∂u/∂t (see `carried`). A widening wall moves against its normal
+    (3), which points away from the wall.
     """
     (u, v, w), scale = carried(there, (there[16], there[17], there[18]))
     u, v, w, grow = u / scale, v / scale, w / scale, there[19]
@@ -275,7 +276,7 @@ def wall_velocity(there, normal):
 
 @law
 def planes_in_space(there, planes, count):
-    """Turns planes at rest (normal and clearance) into those in space; see `warp`."""
+    """Maps planes (normal and clearance) at rest into space, in place; see `warp`."""
     for row in range(count):
         x, y, z = planes[row, 0], planes[row, 1], planes[row, 2]
         u = there[3] * x + there[6] * y + there[9] * z

@@ -1,9 +1,9 @@
 """Contact of a capsule or a sphere with a wall that moves.
 
-The wall is the one at rest, looked up at the place at rest of each place in space
-(`motion`). The straight image of a capsule at rest, which is off by `_IMAGE` and by the
-strain of space, finds the places that may touch; their contacts are looked up exactly,
-and the planes turned back into space.
+The clearance at a point in space is that of the wall at rest, at the point's place at
+rest (`motion`). Places that may touch are found on a straight image of the capsule at
+rest, whose error is `_IMAGE` plus the strain of space. At each of these places, the
+wall is evaluated exactly and its planes are mapped back into space.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from cathsim_dmc.laws.planes import Touch, plane_normal, tangent_planes, write_p
 from cathsim_dmc.laws.vectors import along
 from cathsim_dmc.laws.wall import clearance, normal_at
 
-_IMAGE = 0.2e-3  # m
+_IMAGE = 0.2e-3  # m, error of the straight image of a capsule
 
 
 class MovingScratch(NamedTuple):
-    """Memory of the law, for one capsule at a time.
+    """Scratch arrays of the law, for one capsule at a time.
 
     Attributes:
         samples: (capsule.SAMPLES,) float64.
@@ -44,7 +44,7 @@ class MovingScratch(NamedTuple):
 
 @law
 def _image(capsule, there):
-    """A capsule at rest, how much longer it is there, and the strain of space."""
+    """Image of a capsule at rest, its stretch, and the squared strain of space."""
     strain = 0.0
     for k in range(3, 12):
         strain += (there[k] - (1.0 if k % 4 == 3 else 0.0)) ** 2
@@ -59,7 +59,7 @@ def _image(capsule, there):
 
 @law
 def moving_contacts(wall, capsule, law, sweep, motion, scratch, out):
-    """Contacts of a capsule with a wall that moves.
+    """Writes the contacts of a capsule with a wall that moves.
 
     Args:
         wall: `wall.Wall` at rest.
@@ -103,7 +103,7 @@ def moving_contacts(wall, capsule, law, sweep, motion, scratch, out):
         planes_in_space(there, planes, 1)
         bound, count = limit if place.lowest else margin, 1
         if planes[0, 3] <= bound:
-            # A lumen that has grown touches where it is, not where it was at rest.
+            # The surfaces meet at the grown lumen, not at the lumen at rest.
             touching = max(law.radius - there[12], 1e-9) if law.single else 0.0
             touch = Touch(point, image.axis, normal, depth, touching, law.light)
             count = tangent_planes(wall, touch, reach, turns, planes)

@@ -35,8 +35,8 @@ def shapes(kind: Any, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
         sizes: Sizes of the chain by name.
 
     Raises:
-        ValueError: if it is another class, a field has another default than an
-            `Array`, or the shape of one names no size.
+        ValueError: if `kind` is no NamedTuple class, a field has a default that is no
+            `Array`, or a shape names an unknown size.
     """
     declared = getattr(kind, "_field_defaults", None)
     if declared is None or not all(isinstance(a, Array) for a in declared.values()):

@@ -4,12 +4,12 @@ from typing import Any, NamedTuple
 
 
 class Capsule(NamedTuple):
-    """A link of a device, in the frame of a wall. A sphere has no length.
+    """A link of a device, in the frame of a wall; a sphere has half length 0.
 
     Attributes:
         centre: (3) m.
         axis: (3) unit vector.
-        half_length: m, half its length without the end caps.
+        half_length: Half the length of the cylindrical part, m.
         caps: (2) whether the end caps at -half_length and half_length collide.
     """
 
@@ -23,8 +23,8 @@ class Places(NamedTuple):
     """The places of a capsule that are nearest to the wall, two at most.
 
     Attributes:
-        found: How many there are.
-        first, second: m along the axis from the centre.
+        found: Number of places, 0 to 2.
+        first, second: Positions along the axis from the centre, m.
         first_clearance, second_clearance: Distance of the axis from the wall there, m.
     """
 

@@ -1,17 +1,16 @@
 """Tangent planes of the wall at a place of a capsule.
 
-Where the wall is hollow across the device, one tangent plane turns with the device as
-it rolls there, from step to step: a force f at a distance r from the axis about which
-it turns is a stiffness f / r that no implicit step contains, and throws light links to
-and fro. The wall is then two planes, tangent to it at `_ASIDE` to both sides: the
-clearance linearised there. A wall that bends by more than 17° is a corner: two planes
-of the walls beside it.
+Where the wall is concave across the device, the normal of a single tangent plane turns
+as the device moves sideways. A force f at a radius r then acts as a stiffness f / r
+outside the implicit step, and light links oscillate. The contact is therefore two
+planes, the clearance linearised at `_ASIDE` to both sides. Where the wall bends by more
+than 17° (a corner), they are the tangent planes of the walls to both sides.
 
 Under a light load one plane suffices. The force of a contact whose impedance starts
-soft grows with the cube of the depth, so that its load times the slope s of the wall
-beside it is a stiffness that the time step resolves up to a depth of
-`_DEEP` (`_SLOPED` / s)^(1/3). In a compliant wall the force is linear in the depth, and
-the bound is `light` / s. docs/physics.md derives both.
+soft grows with the cube of the depth, so load times slope s of the clearance is a
+stiffness that the time step resolves up to a depth of `_DEEP` (`_SLOPED` / s)^(1/3)
+(docs/physics.md). In a compliant wall the force is linear in the depth, and the bound
+is `light` / s.
 """
 
 from __future__ import annotations
@@ -27,17 +26,18 @@ from cathsim_dmc.laws.vectors import along, cross, dot, length, unit
 from cathsim_dmc.laws.wall import clearance, normal_at
 
 PLANES = 6  # rows of scratch: four planes at most, and the two beside the place
-MOST = 4  # planes, so contacts, of a place
-_ASIDE = 0.4e-3  # m, to both sides, from where tangent planes are taken
-_HEAD_ON = 0.1  # sine between a capsule and the normal
-_HOLLOW = 5e-6  # m, least distance of the planes' edge from the wall
-# One plane suffices to this depth, m, at this slope; with 0.1 mm, tips swing at steps
-# of 4 ms where they should rest. Two planes bear what one does at a depth less by the
-# share `_SHARED`; from there to twice the depth they approach the wall.
+MOST = 4  # largest number of planes of a place, and of contacts of a capsule
+_ASIDE = 0.4e-3  # m, to both sides, where tangent planes are taken
+_HEAD_ON = 0.1  # sine of capsule and normal below which the capsule is head-on
+_HOLLOW = 5e-6  # m, least fall of the clearance to both sides in a hollow
+# One plane suffices up to the depth `_DEEP`, m, at the slope `_SLOPED`; with 0.1 mm,
+# tips oscillate at steps of 4 ms instead of resting. Two planes bear more than one, so
+# they start off the wall by the fraction `_SHARED` of that depth and reach the wall at
+# twice the depth.
 _DEEP, _SLOPED, _SHARED = 0.4e-4, 0.06, 0.18
-_CORNER = -0.3  # slope of the clearance beside a place in a corner
-_STEEP = 0.5  # cosine between a wall of a corner and the normal, least to share a load
-_ROOM = 1e-4  # m, activation distance of the second wall of a corner
+_CORNER = -0.3  # slope of the clearance below which a place is in a corner
+_STEEP = 0.5  # cosine to the normal above which a plane is moved to the true depth
+_ROOM = 1e-4  # m, additional activation distance of the walls of a corner
 
 
 class Touch(NamedTuple):
@@ -48,8 +48,8 @@ class Touch(NamedTuple):
         axis: (3) unit vector of the capsule.
         normal: (3) unit vector away from the wall.
         clearance: Distance of the point from the wall, m.
-        touching: Clearance at which the surfaces meet, m, where one plane suffices
-            under a light load; 0 where it never does.
+        touching: Clearance at which the surfaces meet, m, if one plane suffices under
+            a light load; 0 if it never does.
         light: Depth times slope up to which one plane suffices in a compliant wall,
             m; 0 in a rigid one.
     """
@@ -64,7 +64,7 @@ class Touch(NamedTuple):
 
 @inlined
 def _sideways(axis, normal, turn):
-    """Unit vector (3) along the wall: across a capsule, or along it at turn 1."""
+    """Unit tangent (3) of the wall: across a capsule at turn 0, along it at turn 1."""
     b = cross(axis, normal)
     if length(b) < _HEAD_ON:
         # An end that stands on the wall: any direction along the wall will do.
@@ -100,16 +100,16 @@ def plane_normal(planes, row):
 
 @inlined
 def _beside(wall, touch, side, slope, there, planes, row):
-    """Writes the plane tangent to the wall beside a place; False where it has none.
+    """Writes the plane tangent to the wall beside a place; False if it has no normal.
 
     Args:
         wall: `wall.Wall`.
         touch: The place.
         side: (3) unit vector along the wall.
-        slope: Of the clearance, over the way from the place to there.
+        slope: Slope of the clearance along `side` at `_ASIDE`.
         there: Clearance at `_ASIDE` along `side`, m.
-        planes: Gets the plane.
-        row: Where.
+        planes: (`PLANES`, 4), gets the plane.
+        row: Row of the plane.
     """
     if slope < _CORNER:
         offset = (_ASIDE * side[0], _ASIDE * side[1], _ASIDE * side[2])
@@ -137,12 +137,12 @@ def _clearances_beside(wall, point, side):
 
 @law
 def tangent_planes(wall, touch, limit, turns, planes):
-    """Writes the planes that stand for a wall that is hollow at a place.
+    """Writes the planes that represent the wall at a place.
 
     Args:
         wall: `wall.Wall`.
         touch: `Touch`.
-        limit: m; planes farther away are left out.
+        limit: Largest clearance of a plane, m.
         turns: 0 for one plane at most, 1 to look across the capsule, 2 along it too.
         planes: (`PLANES`, 4), gets unit normals away from the wall and clearances, m.
 
@@ -154,7 +154,7 @@ def tangent_planes(wall, touch, limit, turns, planes):
     for turn in range(turns):
         side = _sideways(touch.axis, touch.normal, turn)
         low, high = _clearances_beside(wall, touch.point, side)
-        # To both sides the clearance slopes by its bend, times the way there.
+        # Slope at `_ASIDE` of a parabola; the mean of both sides removes its tilt.
         rise = 0.5 * (low + high) - depth
         slope = 2.0 * rise / _ASIDE
         if low >= FREE or high >= FREE or rise >= -_HOLLOW:

@@ -1,8 +1,8 @@
-"""Sheath: the hinges of the links in it are so stiff that they stay on its axis.
+"""Introducer sheath: stiff hinges keep the links inside it on its axis.
 
-A frictionless sheath fixes place and direction of its mouth, and passes axial forces
-on, whatever line it follows before. It is simulated as a straight one: a joint has the
-compliance of the part of the rod about it that is out of the sheath.
+A frictionless sheath fixes position and direction of the device at its mouth and
+transmits axial forces, whatever its curve. It is therefore simulated as straight: a
+joint has the compliance of that part of its rod which is outside the sheath.
 """
 
 from typing import Any, NamedTuple
@@ -11,14 +11,14 @@ import numpy as np
 
 from cathsim_dmc.compiled import compiled
 
-# Share of its compliance that a joint keeps in the sheath. With 1e-3 the part in the
-# sheath bends as a cantilever, and a tip that stands 40 mm out of 260 mm of sheath is
-# 18 % too soft, with 1e-6 it is 1 % too soft.
+# Fraction of its compliance that a joint keeps in the sheath. A tip that protrudes
+# 40 mm from 260 mm of sheath is 18 % too soft with 1e-3, because the part in the sheath
+# bends as a cantilever, and 1 % too soft with 1e-6.
 LEAST = 1e-6
 
 
 class Hinges(NamedTuple):
-    """Hinges about x and y of J joints, (J, 2), or all of a model, MuJoCo's arrays.
+    """Properties of hinges: (J, 2) about x and y of J joints, or MuJoCo's arrays.
 
     Attributes:
         stiffness: `jnt_stiffness`, N·m/rad.
@@ -35,12 +35,13 @@ class Joints(NamedTuple):
     """The joints of a chain.
 
     Attributes:
-        joint, dof, qpos: (J, 2), places of the hinges about x and y among `Hinges` of
-            the model.
-        place: (J,), m past the mouth of the sheath at insertion 0.
-        behind, ahead: (J,), lengths of the rod before and beyond the joint that it
-            stands for, m.
-        distal: (J,), fraction of its compliance that is that of the rod beyond it.
+        joint, dof, qpos: (J, 2), indices of the hinges about x and y in
+            `jnt_stiffness`, `dof_damping` and `qpos_spring` of the model.
+        place: (J,), distance past the mouth of the sheath at insertion 0, m.
+        behind, ahead: (J,), lengths of rod proximal and distal of the joint that it
+            represents, m.
+        distal: (J,), fraction of the joint's compliance that belongs to the rod distal
+            of it.
     """
 
     joint: Any
@@ -53,17 +54,17 @@ class Joints(NamedTuple):
 
 
 def held_stiffness(stiffness, out):
-    """Stiffness, N·m/rad, of joints of whose compliance a fraction is in no sheath."""
+    """Stiffness, N·m/rad, of joints with a fraction of compliance out of the sheath."""
     return stiffness / np.maximum(out, LEAST)
 
 
 @compiled
 def hold(joints, insertion, free, hinges, out):
-    """Writes the hinges of a chain of which a part is in the sheath.
+    """Writes the hinges of a chain that is partly in the sheath.
 
     Args:
         joints: `Joints`.
-        insertion: Of the chain, m.
+        insertion: Insertion of the chain, m.
         free: `Hinges` of the joints without a sheath.
         hinges: `Hinges` of the model, which are written.
         out: (J,), fraction of each joint's compliance that is out of the sheath,

@@ -1,7 +1,8 @@
-"""Coaxial devices in a control step: how they turn, and where they are told to go.
+"""Coaxial devices in a control step: rotations, and targets of their insertions.
 
-The friction of wall and lumen and the shapes load the rods (`torsion`, `coaxial`);
-`settle` takes one simulation, the others N; K devices, J joints, L links.
+Friction at wall and lumen and the shapes of the devices load the rods (`torsion`,
+`coaxial`). `rest`, `lay` and `settle` take one simulation, the other functions N. K
+devices, J joints, L links.
 """
 
 from typing import Any, NamedTuple
@@ -20,11 +21,11 @@ class Devices(NamedTuple):
     Attributes:
         tables: `coaxial.Tables`.
         rods: `torsion.Rods`.
-        arms: (K,), radius of each device by its friction ratio, m.
+        arms: (K,), radius of each device times its friction ratio, m.
         sections: `coaxial.Sections`.
         lumen_friction: Coulomb coefficient between the devices.
-        duration: Of a control step, s.
-        torque: Largest of a rotary unit, N·m.
+        duration: Duration of a control step, s.
+        torque: Torque limit of a rotary unit, N·m.
     """
 
     tables: Any
@@ -37,12 +38,12 @@ class Devices(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """What acts on the devices of one simulation in a control step.
+    """Loads on the devices of one simulation in a control step.
 
     Attributes:
-        turned: (K,), by how much the bases are turned, rad.
-        force: (L,), of the wall on the links, N.
-        axial: In the leading device where it leaves the others, N.
+        turned: (K,), rotation of the bases in the control step, rad.
+        force: (L,), force of the wall on the links, N.
+        axial: Axial force in the leading device where it leaves the others, N.
         friction: Coulomb coefficient of an uncoated device on the wall.
         stiffness: Factor of all stiffnesses.
         loss: Factor of all loss factors.
@@ -60,13 +61,13 @@ class State(NamedTuple):
     """State of the devices of one simulation.
 
     Attributes:
-        gaps: (K,), way from the end of each device to that of the chain, m.
+        gaps: (K,), distance from the end of each device to that of the chain, m.
         hinges: (2 J,), positions of the hinges, rad.
-        angles: (K, M + 1), rotations of the nodes, rad; changes.
+        angles: (K, M + 1), rotations of the nodes, rad; updated.
         ways: (K - 1,), fraction of the friction between devices that acts.
-        drag: (K - 1,), that friction, N; changes.
-        slipped: (K,), way by which the clamps have slipped, rad; changes.
-        axial: (K, J), axial forces at the joints, N; changes.
+        drag: (K - 1,), friction between devices, N; written.
+        slipped: (K,), angle by which the clamps have slipped, rad; updated.
+        axial: (K, J), axial forces at the joints, N; written.
     """
 
     gaps: Any
@@ -79,7 +80,7 @@ class State(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of `settle` and `rest`.
+    """Scratch arrays of `settle` and `rest`.
 
     Attributes:
         coaxial: `coaxial.Scratch`.
@@ -124,14 +125,14 @@ class Chain(NamedTuple):
 
 @compiled
 def rest(devices, state, friction, scratch, chain):
-    """Writes the `Chain` of devices as they are turned.
+    """Writes the `Chain` of devices at their present rotations.
 
     Args:
         devices: `Devices`.
         state: `State`.
         friction: Coulomb coefficient of an uncoated device on the wall.
         scratch: `Scratch`.
-        chain: `Chain`, whose overlap is that of the gaps.
+        chain: `Chain`; its overlap is read and must be that of the gaps.
     """
     tables, overlap, turns = devices.tables, chain.overlap, scratch.turns[0]
     torsion.at_joints(state.angles, state.gaps, tables.nodes, turns)
@@ -144,14 +145,14 @@ def rest(devices, state, friction, scratch, chain):
 
 @compiled
 def lay(devices, state, friction, scratch, chain):
-    """Writes the `Chain` of devices that have just been laid; see `rest`."""
+    """Writes the `Chain` of devices at the start of an episode; see `rest`."""
     coaxial.overlap(state.gaps, devices.tables, scratch.coaxial, chain.overlap)
     rest(devices, state, friction, scratch, chain)
 
 
 @compiled
 def _push(devices, loads, state, scratch, overlap, posture):
-    """Writes axial forces and friction in the lumen, and adds its torque to loads."""
+    """Writes axial forces and lumen friction; adds the friction torque to loads."""
     tables, gaps, turns, ahead = devices.tables, state.gaps, posture.turns, scratch.gaps
     for k in range(len(gaps)):
         ahead[0, k], ahead[1, k] = gaps[k] + _GAP_STEP, 0.0
@@ -172,8 +173,8 @@ def _push(devices, loads, state, scratch, overlap, posture):
     coaxial_forces.pressure(
         tables, overlap, posture, axial, lumen, memory, force, state.drag
     )
-    # The lumen holds back the device in it; that one is too soft in torsion to turn
-    # the lumen in its turn.
+    # The lumen brakes the device in it. Its reaction on the lumen is left out: the
+    # inner device is too soft in torsion to turn the outer one.
     for k in range(len(gaps) - 1):
         for j in range(turns.shape[1]):
             held = friction * force[k, j] * devices.sections.radii[k]
@@ -182,7 +183,7 @@ def _push(devices, loads, state, scratch, overlap, posture):
 
 @compiled
 def settle(devices, loads, state, scratch, chain):
-    """Turns the devices of one simulation, and writes the `Chain` that they are then.
+    """Turns the devices of one simulation and writes the `Chain` that results.
 
     Args:
         devices: `Devices`.
@@ -227,7 +228,11 @@ def settle(devices, loads, state, scratch, chain):
 
 @compiled
 def held(insertion, reached, where):
-    """Writes insertions (N, K): leading devices at (N,), the others as commanded."""
+    """Writes the insertions (N, K) of all devices, m.
+
+    The leading device is at `reached` (N,); the others are as commanded by `insertion`
+    (N, K), at most at `reached`.
+    """
     count, devices = insertion.shape
     for i in range(count):
         leader = 0
@@ -240,7 +245,7 @@ def held(insertion, reached, where):
 
 @compiled
 def gaps(insertion, ways):
-    """Writes the way (N, K) from the end of each device to that of the chain, m."""
+    """Writes the distance (N, K) from the end of each device to the chain's, m."""
     count, devices = insertion.shape
     for i in range(count):
         farthest = insertion[i].max()
@@ -250,10 +255,10 @@ def gaps(insertion, ways):
 
 @compiled
 def advance(before, step, limits, target, lead):
-    """Writes where (N, K) the devices are to go, and the chain's insertion (N,) then.
+    """Writes the target insertions (N, K) of the devices and (N,) of the chain, m.
 
-    They move from `before` (N, K) by `step` (N, K), m, within two limits; the chain
-    cannot be drawn back behind its start.
+    The devices move from `before` (N, K) by `step` (N, K) within `limits` (least,
+    most), m. The chain cannot retract behind its start.
     """
     count, devices = before.shape
     least, most = limits
@@ -269,10 +274,11 @@ def advance(before, step, limits, target, lead):
 
 @compiled
 def rubbing(force, lead, depth, nodes, size):
-    """Writes the size (N, L) of contact forces (N, L, 6) on links past the sheath, N.
+    """Writes magnitudes (N, L) of contact forces (N, L, 6) on links past the sheath, N.
 
-    The chain's end is past the sheath's mouth by its insertion (N,) and a depth, m;
-    nodes (L + 1,) are the ends of the links from there, m.
+    They are 0 on links in the sheath. The chain ends `lead` (N,) + `depth` past the
+    mouth of the sheath, m. `nodes` (L + 1,) are the distances of the ends of the links
+    from the end of the chain, m.
     """
     count, links = force.shape[:2]
     for i in range(count):
@@ -287,14 +293,15 @@ def rubbing(force, lead, depth, nodes, size):
 def points(line, places, nodes, found):
     """Writes points (N, K, P, 3) of a line (N, L + 1, 3) at places (N, K, P), m.
 
-    Nodes (L + 1,) are the distances of its points; behind its base it is straight.
+    Places and nodes (L + 1,), those of the line's points, are distances from the end of
+    the line, m. Behind its base the line is straight.
     """
     last = len(nodes) - 1
     for i in range(places.shape[0]):
         for k in range(places.shape[1]):
             for p in range(places.shape[2]):
                 place = max(places[i, k, p], 0.0)
-                # The node behind the place, and the one before it.
+                # Node `far` is proximal of the place, `far + 1` distal of it.
                 far = last - 1
                 while far > 0 and nodes[far] <= place:
                     far -= 1
@@ -321,13 +328,14 @@ def _second(ways):
 def leading_load(force, line, ways, nodes, load):
     """Writes the axial force (N,) in the leading device where it leaves the others, N.
 
-    The force (N, L, 6) is that on each link from the one before it, torque first; the
-    ways (N, K) lead from the ends of K > 1 devices to that of the line (N, L + 1, 3).
+    `force` (N, L, 6) acts on each link from the one before it, torque first. `ways`
+    (N, K) are the distances from the ends of K > 1 devices to that of the line
+    (N, L + 1, 3), `nodes` (L + 1,) those of the line's points, m.
     """
     count, links = force.shape[:2]
     for i in range(count):
         second = _second(ways[i])
-        # The one after the link with the place in it: its joint bears what is beyond.
+        # The first link distal of the place: its joint bears the load beyond.
         link = 1
         while link < links - 1 and nodes[link] > second:
             link += 1

@@ -1,9 +1,9 @@
-"""Springs of a device with a shape: torques that those of an engine lack.
+"""Springs of a pre-shaped device: torques that an engine's hinge springs lack.
 
-The springs of the hinges have the rest angles of the unloaded device. Bent and twisted,
-its isotropic energy has others (`hinges.free_hinges`); the difference is a passive
-force. Taken once in a control step, it lags behind the hinges and pumps energy into
-them.
+The engine's springs have the rest angles of the unloaded device. In a bent and twisted
+device, the isotropic energy has other rest angles (`hinges.free_hinges`). The
+difference acts as a passive torque in every physics step: updated once per control
+step, it would lag behind the hinges and add energy to them.
 """
 
 from typing import Any, NamedTuple
@@ -14,10 +14,10 @@ from cathsim_dmc.laws.parameters import Array
 
 
 class Springs(NamedTuple):
-    """The joints of a device whose shape lies in the plane of x and z.
+    """Joints of a device whose shape lies in the x-z plane.
 
     Attributes:
-        rest: (J,), angles about y, rad.
+        rest: (J,), rest angles about y, rad.
         compliance: (J,), rad/(N·m).
     """
 
@@ -26,7 +26,7 @@ class Springs(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of the law.
+    """Scratch arrays of the law.
 
     Attributes:
         angles: (2 J,), rad.
@@ -41,7 +41,7 @@ class Scratch(NamedTuple):
 
 @compiled
 def shape_torques(springs, device, scratch):
-    """Adds the torques that the springs of the hinges lack.
+    """Adds to `qfrc_passive` the torques that the hinge springs lack.
 
     Args:
         springs: `Springs`.

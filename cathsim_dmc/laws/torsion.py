@@ -1,8 +1,8 @@
 """Twist of coaxial devices: a one-dimensional rod along each of them.
 
-The M + 1 nodes of a rod are those of the chain when the device reaches its end; the
-rotary unit holds the first. The rod has no inertia: it is in equilibrium with its loads
-at the end of every control step (docs/pair_model.md).
+The M + 1 nodes of a rod coincide with those of the chain when the device reaches the
+chain's end; the rotary unit holds the first node. The rod has no inertia: it is in
+equilibrium with its loads at the end of every control step (docs/pair_model.md).
 
 Functions of one simulation; K devices, J = M - 1 joints. `angles` (K, M + 1) are
 rotations of the nodes, rad; `gaps` (K,) the distance from the end of each device to
@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 from cathsim_dmc.compiled import compiled
 
-# Rate of rotation below which Coulomb friction is viscous, rad/s; a sticking device
-# creeps more slowly.
+# Rate of rotation below which Coulomb friction is viscous, rad/s: a sticking device
+# creeps at a lower rate.
 STICKING = 0.02
 # Largest number of iterations that find the sticking nodes; two or three are usual.
 _ROUNDS = 5
@@ -33,7 +33,7 @@ class Rods(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of `turned`, arrays (M,)."""
+    """Scratch of `turned`, arrays (M,)."""
 
     diagonal: Any
     beside: Any
@@ -47,7 +47,7 @@ class Scratch(NamedTuple):
 
 @compiled
 def _on_rod(joint, gap, nodes, first):
-    """Segment of a rod, from `first` on, with a joint; the fraction before it."""
+    """Segment of a rod, from `first` on, that holds a joint; its fraction before it."""
     place = max(nodes[joint + 1] - gap, 0.0)
     while first < len(nodes) - 2 and nodes[first + 1] > place:
         first += 1
@@ -72,9 +72,9 @@ def at_joints(angles, gaps, nodes, turns):
 
 @compiled
 def at_nodes(loads, gaps, nodes, shared):
-    """Writes loads (F, K, M) of the nodes but the bases, from F kinds of the joints.
+    """Writes F kinds of loads (F, K, M) of all nodes but the bases.
 
-    The nodes on both sides of a joint share its load.
+    The nodes on both sides of a joint share its load, one of `loads` (F, K, J).
     """
     kinds, devices, joints = loads.shape
     for k in range(devices):
@@ -108,7 +108,7 @@ def _balance(diagonal, beside, load, pivot, move):
 
 @compiled
 def _sign(value, least):
-    """-1, 0 or 1, 0 up to a size."""
+    """Sign of a value, 0 up to the magnitude `least`."""
     if not abs(value) > least:
         return 0.0
     return 1.0 if value > 0.0 else -1.0
@@ -116,7 +116,7 @@ def _sign(value, least):
 
 @compiled
 def _balance_sticking(scratch, friction, least):
-    """Balance with Coulomb friction, linear up to `least`, by Newton's method."""
+    """Solves with Coulomb friction, linear up to `least`, by Newton's method."""
     load, move, way = scratch.load, scratch.move, scratch.way
     stiff, pull, count = scratch.stiff, scratch.pull, len(load)
     for m in range(count):
@@ -140,15 +140,15 @@ def _balance_sticking(scratch, friction, least):
 
 @compiled
 def turned(angles, base, rods, duration, loads, scratch, new):
-    """Writes rotations (K, M + 1) of the nodes in equilibrium, the bases rotated.
+    """Writes equilibrium rotations (K, M + 1) of the nodes, rad, for rotated bases.
 
     Args:
         angles: (K, M + 1), rotations of the nodes before, rad.
-        base: (K,), rotations of the bases, rad.
+        base: (K,), rotations of the bases from there, rad.
         rods: `Rods`.
-        duration: of that rotation, s.
-        loads: (3, K, M) on the nodes but the bases: torque, N·m, minus its derivative
-            by the rotation, N·m/rad, and largest torque of Coulomb friction, N·m.
+        duration: duration of that rotation, s.
+        loads: (3, K, M) on all nodes but the bases: torque, N·m; its negative
+            derivative by the rotation, N·m/rad; limit of the friction torque, N·m.
         scratch: `Scratch`.
         new: (K, M + 1), may be `angles`.
     """
@@ -161,8 +161,8 @@ def turned(angles, base, rods, duration, loads, scratch, new):
             now = stiffness * (angles[k, m + 1] - angles[k, m])
             coupling = (1 + lag) * stiffness
             load[m] = loads[0, k, m] - now
-            # A negative rate has no equilibrium nearby; there the torque is explicit,
-            # and the damping of the rod bounds the speed.
+            # With a negative derivative there is no equilibrium nearby: the torque is
+            # explicit, and the damping of the rod bounds the speed.
             diagonal[m] = coupling + max(loads[1, k, m], 0.0)
             if m == 0:
                 load[0] += coupling * base[k]

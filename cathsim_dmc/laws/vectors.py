@@ -56,7 +56,7 @@ def into(frame, vector):
 
 @inlined
 def opposite(frame, vector):
-    """Negative (3), in the world, of a vector in a frame (see `into`)."""
+    """Negated vector (3) in the world, from its components in a frame (see `into`)."""
     return (
         0.0 - frame[0] * vector[0] - frame[1] * vector[1] - frame[2] * vector[2],
         0.0 - frame[3] * vector[0] - frame[4] * vector[1] - frame[5] * vector[2],

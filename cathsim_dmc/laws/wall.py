@@ -1,4 +1,4 @@
-"""The wall of a lumen or of a bore: distance and normal at a point."""
+"""The wall of a lumen or of a bore: clearance and normal at a point."""
 
 from typing import Any, NamedTuple
 
@@ -7,8 +7,8 @@ from cathsim_dmc.laws.bore import bore_clearance
 from cathsim_dmc.laws.field import FieldArrays, field_clearance, field_gradient
 from cathsim_dmc.laws.vectors import along, length
 
-_STEP = 0.25e-3  # m, to both sides, over which the wall's normal is taken
-_LEAST = 1e-12  # length of a gradient that has no direction
+_STEP = 0.25e-3  # m, to each side, of the differences that give the normal
+_LEAST = 1e-12  # length below which a gradient has no direction
 
 
 class Wall(NamedTuple):
@@ -16,8 +16,8 @@ class Wall(NamedTuple):
 
     Attributes:
         is_bore: Whether `line` describes it; otherwise `field` does.
-        field: Of a lumen, `field.FieldArrays`.
-        line: Of a bore, see `bore`.
+        field: `field.FieldArrays` of a lumen.
+        line: Array of a bore, see `bore`.
     """
 
     is_bore: Any
@@ -27,7 +27,7 @@ class Wall(NamedTuple):
 
 @inlined
 def clearance(wall, point):
-    """Distance (m) of a point (3) m from the wall, `FREE` past its open ends."""
+    """Clearance (m) at a point (3) m, > 0 inside, `FREE` past open ends."""
     if wall.is_bore:
         return bore_clearance(wall.line, point)[0]
     return field_clearance(wall.field, point)
@@ -35,13 +35,13 @@ def clearance(wall, point):
 
 @inlined
 def clearance_along(wall, capsule, t):
-    """Distance (m) from the wall of the place t (m) along a capsule's axis."""
+    """Clearance (m) at the place t (m) along a capsule's axis."""
     return clearance(wall, along(capsule.centre, capsule.axis, t))
 
 
 @law
 def normal_at(wall, point):
-    """Unit vector (3) away from the wall at a point (3) m; zeros where there is none.
+    """Unit normal (3) away from the wall at a point (3) m; zeros if undefined.
 
     In a lumen it is the direction of the depth's central differences over 0.25 mm to
     each side.

@@ -1,8 +1,8 @@
 """Adapters of the laws to MuJoCo: they read its structs, call a law, and write them.
 
 An adapter gets the addresses of `mjModel`, of `mjData` and of the layout of the
-simulation (`collision.own`), and the place of its parameters in `userdata`. Those of
-the package are kept on disk; `made` compiles that of a law of one's own.
+simulation (`collision.own`), and the offset of its parameters in `userdata`. Compiled
+adapters of the package are kept on disk; `made` compiles the adapter of a user's law.
 """
 
 import functools
@@ -59,14 +59,14 @@ _adapter = native.callback("void(int64, int64, int64, int64)")
 
 @compiled
 def _parameters(kind, data, layout, start):
-    """Parameters of a simulation from a place in `userdata` on."""
+    """Parameters of a simulation, from an offset in `userdata` on."""
     last = data_field(data, "userdata")[start:]
     return unpacked(kind, last, word(layout + LINKS), word(layout + JOINTS))
 
 
 @compiled
 def links_of(model, data, layout):
-    """The links of a simulation's device."""
+    """`Links` of a simulation's device."""
     first = word(layout + LINK)
     last = first + word(layout + LINKS)
     return Links(
@@ -81,7 +81,7 @@ def links_of(model, data, layout):
 
 @compiled
 def device_of(model, data, layout):
-    """The device of a simulation."""
+    """`Device` of a simulation."""
     first, links = word(layout + LINK), word(layout + LINKS)
     hinges, last = 2 * word(layout + JOINTS), first + links
     places, nv = native.longs(word(layout + PLACES)), model_field(model, "nv")
@@ -107,7 +107,7 @@ def device_of(model, data, layout):
 
 @compiled
 def _contact(contact):
-    """A contact at an address."""
+    """`Contact` of the MuJoCo contact at an address."""
     return Contact(
         contact_field(contact, "pos"),
         contact_field(contact, "frame"),
@@ -156,9 +156,9 @@ def compliance(model, data, layout, start):
 def motion(model, data, layout, start):
     """Writes the wall's velocity into the Jacobian of its contacts.
 
-    MuJoCo knows the velocity of a contact as J qvel. The model has one more degree of
-    freedom, the last, whose velocity is 1 m/s in every physics step; its column of J
-    gets the velocity of the wall in the frame of each contact.
+    MuJoCo computes the velocity of a contact as J qvel. The last degree of freedom of
+    the model has a velocity of 1 m/s in every physics step; its column of J gets the
+    velocity of the wall in the frame of each contact.
     """
     nv, wall = model_field(model, "nv"), word(layout + WALL)
     data_field(data, "qvel")[nv - 1] = 1.0
@@ -192,8 +192,8 @@ def hold_links(sheathed, first, stop):
 
     Args:
         sheathed: `held.Sheathed`.
-        first: Number of the first simulation.
-        stop: Number after that of the last one.
+        first: Index of the first simulation.
+        stop: Index after that of the last one.
     """
     for i in range(first, stop):
         free, (stiffness, damping, rest) = sheathed.free[i], sheathed.places[i]
@@ -211,10 +211,11 @@ def act(drives, sheathed, steering, robot, load, control):
         drives: `drives.Bound`.
         sheathed: `held.Sheathed`; None where a bore holds the links.
         steering: `single_device.Steering`; None without motors.
-        robot: Places of insertion and rotation, and of the joints of the robot, see
+        robot: Indices of insertion and rotation, and of the joints of the robot, see
             `entities.robot.pose`.
         load: (N, D), see `laws.drive.follow`.
-        control: (N, A), action of the motors, then of the drives; becomes the control.
+        control: (N, A), action of the motors, then of the drives; overwritten with the
+            control.
     """
     base, joints = robot
     pose(drives.state.qpos, base, joints)
@@ -240,15 +241,15 @@ def _rows(address, count, width):
 
 @compiled
 def press(places, radius, material, links, laws):
-    """Writes the contacts of N simulations, see `laws.compliance.write_contacts`.
+    """Writes contact parameters of N simulations, see `compliance.write_contacts`.
 
     Args:
-        places: (N, 2) int64, addresses of `solref` and `solimp` of the geoms; 0 where
-            there is no episode yet.
-        radius: (N, L).
+        places: (N, 2) int64, addresses of `geom_solref` and `geom_solimp`; 0 before the
+            first episode.
+        radius: (N, L), radius of the lumen around each link, m; 0 for none.
         material: (N, 3), the numbers of `laws.compliance.Material`.
         links: `laws.compliance.Links`.
-        laws: Of the rigid wall, and of the compliant one.
+        laws: `laws.compliance.Law` of the rigid wall, and of the compliant one.
     """
     count = links.geoms.max() + 1
     for i in range(len(places)):
@@ -280,9 +281,9 @@ def _fields(places, sizes):
 
 @compiled
 def _in_sheath(sheathed, fields, i):
-    """Takes over the hinges of a simulation as written, and holds those in the sheath.
+    """Copies the hinges of a simulation as free ones, and holds those in the sheath.
 
-    A branch on None is dropped for an argument alone.
+    numba removes a branch on None only if it tests an argument.
     """
     if sheathed is not None:
         joints, free = sheathed.joints, sheathed.free[i]
@@ -302,8 +303,8 @@ def settle(live, loads, state, rows, lays):
         live: `chain_fields.Live`.
         loads: `laws.sliding.Loads` of N simulations, arrays with the leading axis N.
         state: `laws.sliding.State` of them, likewise.
-        rows: Number of the first simulation, and the number after that of the last.
-        lays: Whether the devices have just been laid, see `laws.sliding.lay`.
+        rows: Index of the first simulation, and the index after that of the last.
+        lays: Whether an episode begins, see `laws.sliding.lay`.
     """
     devices, scratch, chain = live.devices, live.scratch, live.chain
     for i in range(rows[0], rows[1]):
@@ -329,21 +330,21 @@ def settle(live, loads, state, rows, lays):
 
 @functools.cache
 def made(law: Callable, kind: Any, acts_in: str) -> Any:
-    """The adapter of a law of one's own, whose indices are checked.
+    """Adapter of a user's law, with checked indices.
 
     Args:
         law: See `effects.Effect.law`.
         kind: Class of its parameters.
         acts_in: "passive", "control" or "contact".
     """
-    # It refers to a law that changes from process to process: it is not kept on disk.
+    # It is not kept on disk, because the law may differ between processes.
     apply = compiled(law, cache=False, checked=True)
     state_of = links_of if acts_in == "control" else device_of
 
     def guarded(given, time, state, layout, start):
         try:
             apply(given, time, state)
-        except Exception:  # noqa: BLE001  C cannot be told
+        except Exception:  # noqa: BLE001  C has no exceptions
             native.longs(layout + FAULT)[0] = start + 1
 
     guarded = compiled(guarded, cache=False)

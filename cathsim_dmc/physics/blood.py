@@ -13,7 +13,7 @@ BLOOD_VISCOSITY = 3.5e-3  # Pa·s, of whole blood at high shear rates
 
 
 class StillBlood(Effect):
-    """Blood at rest; a flow writes its velocity."""
+    """Blood at rest; the subclass `Flow` writes a velocity."""
 
     parameters = Blood
     acts_in, adapter = "passive", "blood"

@@ -18,8 +18,8 @@ from cathsim_dmc.physics.readings import ids
 class Fields(NamedTuple):
     """Fields of the model that change as the devices slide, with MuJoCo's names.
 
-    The constants that MuJoCo derives from masses (`body_invweight0`, ...) stay those of
-    the start: the armature of the hinges outweighs the links in them many times.
+    Constants that MuJoCo derives from masses (`body_invweight0`, ...) are not updated:
+    the armature of the hinges outweighs the links in them many times.
     """
 
     jnt_stiffness: np.ndarray
@@ -39,15 +39,15 @@ FIELDS = Fields._fields
 
 
 class Places(NamedTuple):
-    """Places of the elements of a chain in a compiled model, and its constants.
+    """Indices of the elements of a chain in a compiled model, and its constants.
 
     Attributes:
-        joint: First hinge among the joints.
-        dof: First hinge among the degrees of freedom.
-        qpos: First hinge among the positions.
-        body: First link.
-        geoms: (L,), of the links.
-        axes: (L,), which of a link's axes of inertia lies along it.
+        joint: Joint of the first hinge.
+        dof: Degree of freedom of the first hinge.
+        qpos: Index in `qpos` of the first hinge.
+        body: Body of the first link.
+        geoms: (L,), geoms of the links.
+        axes: (L,), index of the axis of inertia that lies along each link.
         half_lengths: (L,), of the cylinders of the links, m.
         times: (K,), relaxation times of the materials, s.
         timestep: Physics step, s.
@@ -72,7 +72,7 @@ class Live(NamedTuple):
         scratch: `laws.sliding.Scratch`.
         chain: `laws.sliding.Chain`, written for one simulation after the other.
         places: `Places`.
-        fields: (N, 11) int64, addresses of the `Fields`; 0 where there is no episode.
+        fields: (N, 11) int64, addresses of the `Fields`; 0 before the first episode.
         sizes: (5,), numbers of joints, of degrees of freedom, of positions, of geoms
             and of bodies of the model.
         sheathed: `held.Sheathed`; None where a bore holds the links.
@@ -88,10 +88,10 @@ class Live(NamedTuple):
 
 
 def places_of(model: mujoco.MjModel, chain: DeviceStack) -> Places:
-    """Places of a chain in a compiled model; ValueError if its links are scattered."""
+    """`Places` of a chain in a model; ValueError if its links are not contiguous."""
     bodies, joints = ids(model, chain.links), np.sort(ids(model, chain.bends))
     places = [joints, model.jnt_dofadr[joints], model.jnt_qposadr[joints]]
-    # Both kinds of elements follow each other, from proximal to distal.
+    # Links and hinges are contiguous, from proximal to distal.
     if any((np.diff(each) != 1).any() for each in [bodies, *places]):
         raise ValueError(f"the links of {chain!r} do not follow each other")
     geoms = ids(model, chain.link_geoms).astype(np.intp)
@@ -110,7 +110,7 @@ def places_of(model: mujoco.MjModel, chain: DeviceStack) -> Places:
 
 
 def fields_of(field: Callable[[str], np.ndarray]) -> Fields:
-    """Live fields of a model, by a function that gives one by its name."""
+    """Live fields of a model, from a function that returns a field by its name."""
     return Fields._make(map(field, FIELDS))
 
 
@@ -120,12 +120,12 @@ def write_still(
     gaps: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
 ) -> None:
-    """Writes into a model the properties of the chain while the devices stand still.
+    """Writes the properties of a chain whose devices stand still into a model.
 
     Args:
-        gaps: (K,), way from the end of each device to that of the chain, m; those at
-            the start of an episode if None.
-        rotation: (K,), of each device, not twisted, rad; 0 if None.
+        gaps: (K,), distance from the end of each device to that of the chain, m; those
+            at the start of an episode if None.
+        rotation: (K,), rotation of each untwisted device, rad; 0 if None.
     """
     stack = entity.stack
     turns = np.zeros((len(entity.devices), len(stack.spans)))
@@ -149,8 +149,8 @@ def write(fields, places, chain, stiffness_factor, loss_factor):
         fields: live `Fields`.
         places: `Places`.
         chain: `laws.sliding.Chain`.
-        stiffness_factor: of all stiffnesses.
-        loss_factor: of all loss factors.
+        stiffness_factor: factor of all stiffnesses.
+        loss_factor: factor of all loss factors.
     """
     overlap, rest, links, times = chain.overlap, chain.rest, chain.links, places.times
     for j in range(len(rest)):

@@ -1,4 +1,4 @@
-"""How far links may go in a physics step, so that contacts are looked for again."""
+"""Displacement of links in a physics step: where contacts are computed again."""
 
 import math
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from cathsim_dmc.compiled import compiled
 
 
 class Motion(NamedTuple):
-    """Views (N, ...) of what moves the links of N devices, with MuJoCo's names."""
+    """Views (N, ...) of MuJoCo's arrays that give the velocities of links."""
 
     qvel: Any
     cdof: Any
@@ -22,11 +22,11 @@ class Links(NamedTuple):
     """The M links that can touch a wall.
 
     Attributes:
-        parents: (nv,), degree of freedom before each of the model.
-        bodies: (M,), numbers of the links among all bodies.
-        last: (M,), degree of freedom that moves each last.
+        parents: (nv,), parent of each degree of freedom, -1 for none.
+        bodies: (M,), bodies of the links.
+        last: (M,), last degree of freedom that moves each link.
         roots: (M,), first bodies of their kinematic trees.
-        reach: (M,), m, farthest places from the origins of the bodies.
+        reach: (M,), largest distance of the axis from the origin of the body, m.
     """
 
     parents: Any
@@ -55,12 +55,12 @@ def in_doubt(peak, depth, limits, motion, links, way):
 
     Args:
         peak: (N,), largest force of a contact in it, N.
-        depth: (N,), m, of the deepest one.
-        limits: Of force, N, of depth, m, and the physics step, s.
+        depth: (N,), depth of the deepest contact in it, m.
+        limits: Limits of force, N, and of depth, m, and the physics step, s.
         motion: `Motion`.
         links: `Links`.
-        way: (N,), m, is given the largest way of places of the devices in a physics
-            step, but along themselves.
+        way: (N,), written: largest displacement of the devices in a physics step,
+            without its part along the devices, m.
     """
     hardest, deepest, timestep = limits
     total, doubt = np.empty((len(links.parents), 6)), False
@@ -72,7 +72,7 @@ def in_doubt(peak, depth, limits, motion, links, way):
 
 @compiled
 def _speed(motion, links, i, total):
-    """Largest velocity of places of one device; `total` (nv, 6) is scratch."""
+    """Largest speed of one device across its axis, m/s; `total` (nv, 6) is scratch."""
     velocity, places, bodies = motion.qvel[i], motion.xpos[i], links.bodies
     parents, found = links.parents, 0.0
     for dof in range(len(parents)):

@@ -4,16 +4,16 @@ import numpy as np
 
 from cathsim_dmc.laws import sliding
 
-# Length of the straight device behind its base that X-rays meet, m.
+# Length of straight device behind the base that fluoroscopy shows, m.
 BEHIND = 0.3
-# Where points of a device are tracked, m from its end.
+# Distances of the tracked points of a device from its end, m.
 DEVICE_PLACES = np.arange(7, -1, -1) * 15e-3
 
 
 def device_points(line: np.ndarray, gaps: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Points (N, K, n, 3) of devices that end at gaps (N, K) from the end of a line, m.
 
-    Nodes (L + 1,) are the distances of the points of the line (N, L + 1, 3) from it.
+    Nodes (L + 1,) are the distances of the line's points (N, L + 1, 3) from its end.
     """
     # A device has one point more than the chain: behind, its own nodes, its end.
     beyond = (nodes < gaps[..., None]).sum(axis=-1, keepdims=True)
@@ -32,7 +32,7 @@ def points_at(line: np.ndarray, places: np.ndarray, nodes: np.ndarray) -> np.nda
 
 
 def gaps_of(insertion: np.ndarray) -> np.ndarray:
-    """How far (N, K) each device ends from the end of the chain, m.
+    """Distances (N, K) from the ends of the devices to the end of the chain, m.
 
     Args:
         insertion: (N, K), m.

@@ -1,9 +1,10 @@
 """The functions in MuJoCo's callbacks, which call the laws of all effects.
 
 MuJoCo has one `mjcb_passive` and one `mjcb_control` for all models of a process. The
-two functions here call what stood there before them, and then, for a simulation with a
-`Layout`, the adapters of its laws in their order. `stand` puts them there, and back
-where somebody has removed them; what replaces them without calling them is followed.
+two functions here call the function that was installed before them and then, for a
+simulation with a `Layout`, the adapters of its laws in order. `stand` installs them,
+also again if they were removed. A function that has replaced them without calling them
+is then called before them.
 """
 
 import ctypes
@@ -43,7 +44,7 @@ def _run(laws, model, data, layout):
 
 @_callback
 def _passive(model, data):
-    """Adds passive forces, and changes contacts before they get a reference."""
+    """Runs the laws of passive forces, and of contacts before they get a reference."""
     call_before(address_of("cathsim_before_passive"), model, data)
     layout = layout_of(model, data)
     if layout != 0:
@@ -52,7 +53,7 @@ def _passive(model, data):
 
 @_callback
 def _control(model, data):
-    """Adds forces on the links, which are 0 before the first law."""
+    """Zeroes `xfrc_applied`, then runs the laws that add to it."""
     call_before(address_of("cathsim_before_control"), model, data)
     layout = layout_of(model, data)
     if layout != 0 and word(word(layout + CONTROL)) > 0:
@@ -63,7 +64,7 @@ def _control(model, data):
 
 @native.callback("void(int64, int64, int64, int64)")
 def _answer(model, data, layout, start):
-    """Counts the callbacks that reach a law, of `_reached`."""
+    """Law that counts its calls, see `_reaches`."""
     data_field(data, "userdata")[0] += 1.0
 
 
@@ -71,10 +72,10 @@ class Law(NamedTuple):
     """A law of a layout.
 
     Attributes:
-        name: Of the effect and its law.
+        name: Name of the class of the effect.
         acts_in: "passive", "control" or "contact".
-        adapter: What a callback calls, see `adapters`.
-        start: Place of its parameters in `userdata`.
+        adapter: Function that a callback calls, see `adapters`.
+        start: Offset of its parameters in `userdata`.
     """
 
     name: str
@@ -84,7 +85,7 @@ class Law(NamedTuple):
 
     @property
     def address(self) -> int:
-        """Address of the adapter, compiled; ValueError if that cannot be."""
+        """Address of the compiled adapter; ValueError if numba cannot compile it."""
         try:
             return self.adapter.address
         except native.NotCompiledError as error:
@@ -96,11 +97,11 @@ class Law(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where laws find a device and its vessel in a model.
+    """Indices of a device and its vessel in a model, for laws.
 
     Attributes:
-        first_link: Number of the first link among the bodies; the others follow it.
-        geoms: (L,), of the links.
+        first_link: Body of the first link; those of the others follow it.
+        geoms: (L,), geoms of the links.
         hinges: (3, 2 J), joints of the hinges in the order of the chain, their
             positions and their degrees of freedom.
         wall: Geom of the wall, -1 for none.
@@ -115,7 +116,7 @@ class Places(NamedTuple):
 
     @classmethod
     def of(cls, model: mujoco.MjModel, index: ModelIndex) -> "Places":
-        """Those of a task's scene."""
+        """Indices in the scene of a task."""
         qpos = np.sort(index.bends_qpos, axis=None)
         joints = np.searchsorted(model.jnt_qposadr, qpos)
         hinges = np.array([joints, qpos, model.jnt_dofadr[joints]])
@@ -126,14 +127,14 @@ class Places(NamedTuple):
 
 
 class Layout:
-    """What callbacks know of all simulations of a model with some effects.
+    """Layout of all simulations of a model with some effects, for the callbacks.
 
     Attributes:
-        label: What the last number of `userdata` is in an episode.
+        label: Value of the last number of `userdata` in an episode.
     """
 
     def __init__(self, sizes: Sequence[int], places: Places, laws: Sequence[Law]):
-        """Puts the layout into the table of the process, see `layout`.
+        """Adds the layout to the table of the process, see `layout`.
 
         Raises:
             MemoryError: if the process has too many layouts.
@@ -143,7 +144,7 @@ class Layout:
         where = np.concatenate([places.geoms, *places.hinges]).astype(np.int64)
         named = [(law.name, law.acts_in, law.start) for law in laws]
         kind = repr((sizes, places.first_link, places[3:], where.tolist(), named))
-        # The same in every process, as it is part of a state that is saved.
+        # Equal in every process, because the label is part of the saved state.
         number = int.from_bytes(hashlib.sha256(kind.encode()).digest()[:6], "big") + 1
         taken = own.TABLE[:, 0].view(np.float64)
         if 2 * np.count_nonzero(taken) >= own.CAPACITY:
@@ -166,11 +167,11 @@ class Layout:
             *(where.ctypes.data, places.wall, places.bore),
             *(start.get(adapters.motion, -1), 0, start.get(adapters.compliance, -1)),
         )
-        # Last: threads may look for other layouts meanwhile.
+        # The label is written last: other threads search the table concurrently.
         taken[slot] = self.label
 
     def _list(self, *callbacks: str) -> np.ndarray:
-        """Number of the laws of a callback, then adapter and parameters of each."""
+        """Number of laws of a callback, then adapter and offset of each."""
         found = [law for name in callbacks for law in self._laws if law.acts_in == name]
         rows = [(law.address, law.start) for law in found]
         return np.array([len(rows), *np.ravel(rows)], np.int64)
@@ -190,12 +191,12 @@ class Layout:
 
 
 def laws(effect: Any, kind: Any, start: int) -> list[Law]:
-    """The law of an `effects.Effect`, none or one.
+    """List of the law of an `effects.Effect`; empty if it has none.
 
     Args:
-        effect: It.
+        effect: The effect.
         kind: Class of its parameters.
-        start: Their place in `userdata`.
+        start: Offset of its parameters in `userdata`.
 
     Raises:
         ValueError: if the effect does not say where its law acts.
@@ -214,10 +215,10 @@ _LOCK = threading.RLock()  # held while layouts or callbacks change
 
 
 def layout(model: mujoco.MjModel, places: Places, laws: Sequence[Law]) -> Layout:
-    """The layout of a model with some laws, the same for equal ones.
+    """Returns the layout of a model with some laws, the same one for equal arguments.
 
     Raises:
-        RuntimeError: if a Python function stands in a callback.
+        RuntimeError: if a Python function is installed in a callback.
     """
     sizes = tuple(int(getattr(model, name)) for name in own.SIZES)
     arrays = [np.asarray(each, np.int64).tobytes() for each in places[1:3]]
@@ -230,10 +231,10 @@ def layout(model: mujoco.MjModel, places: Places, laws: Sequence[Law]) -> Layout
 
 
 def _standing(name: str) -> int:
-    """Address of the function in a callback, 0 for none.
+    """Address of the function that is installed in a callback, 0 for none.
 
     Raises:
-        RuntimeError: if a Python function stands there.
+        RuntimeError: if it is a Python function.
     """
     stood = getattr(mujoco, f"get_{name}")()
     if stood is not None and not hasattr(stood, "argtypes"):
@@ -246,12 +247,12 @@ def _standing(name: str) -> int:
 
 
 def stand() -> None:
-    """Puts the functions of this module into MuJoCo's callbacks where they are not.
+    """Installs the functions of this module in MuJoCo's callbacks, where needed.
 
-    Whatever stands there and does not call them is called before them.
+    A function that is installed there and does not call them is called before them.
 
     Raises:
-        RuntimeError: if a Python function stands in a callback.
+        RuntimeError: if a Python function is installed in a callback.
     """
     with _LOCK:
         for name, function in (("mjcb_passive", _passive), ("mjcb_control", _control)):
@@ -264,7 +265,7 @@ def stand() -> None:
 
 @functools.cache
 def _probe() -> dict[str, tuple[mujoco.MjModel, mujoco.MjData, Layout]]:
-    """For each callback, a simulation whose only law answers."""
+    """For each callback, a simulation whose only law is `_answer`."""
     text = "<mujoco><size nuserdata='2'/></mujoco>"
     model = mujoco.MjModel.from_xml_string(text)
     sizes = [int(getattr(model, name)) for name in own.SIZES]
@@ -276,7 +277,7 @@ def _probe() -> dict[str, tuple[mujoco.MjModel, mujoco.MjData, Layout]]:
 
 
 def _reaches(name: str) -> bool:
-    """Whether what stands in a callback calls the function of this module."""
+    """Whether the function in a callback calls that of this module."""
     model, data, layout = _probe()[name]
     data.userdata[:] = 0.0, layout.label
     mujoco.mj_forward(model, data)

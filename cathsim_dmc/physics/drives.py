@@ -16,7 +16,7 @@ from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 
 class Bound(NamedTuple):
-    """What `laws.drive` takes of N simulations.
+    """Arguments of `laws.drive` for N simulations.
 
     Attributes:
         servos: `laws.drive.Servos`.
@@ -29,7 +29,7 @@ class Bound(NamedTuple):
     told: Any
 
     def of(self, rows: slice) -> "Bound":
-        """Some of the simulations."""
+        """Returns the arguments for some of the simulations."""
         return Bound(self.servos, part(self.state, rows), part(self.told, rows))
 
 
@@ -37,14 +37,14 @@ class Drives:
     """The D drives of N simulations: translation, and rotation if there is one.
 
     Attributes:
-        slipped: (N, D), way by which each clamp has slipped in the episode, m and rad.
-        bound: Servos, state and what they have been told, for compiled functions.
+        slipped: (N, D), slip of each clamp in the episode, m and rad.
+        bound: Servos, state and commanded places, for compiled functions.
         told: (N, D), place at which each base comes to rest without a further command,
-            m and rad; it is that far behind in motion.
+            m and rad; a base in motion lags it.
     """
 
     def __init__(self, model: mujoco.MjModel, arrays: Any):
-        """Finds the servos; the arrays are views (N, ...) of MuJoCo's that stay."""
+        """Finds the servos; `arrays` are lasting views (N, ...) of MuJoCo's arrays."""
         found = np.flatnonzero(
             model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR.value
         )
@@ -52,7 +52,7 @@ class Drives:
         self._arrays, dofs = arrays, model.jnt_dofadr[joints]
         gain, spring = model.actuator_gainprm[found, 0], model.actuator_biasprm[found]
         stiffness, speed = -spring[:, 1], gain / -spring[:, 1]
-        # A step of the spring by s moves a critically damped mass with s √(K/m) / e.
+        # A step s of the rest place moves a critically damped mass at s √(K/m) / e.
         rise = np.sqrt(stiffness * model.dof_armature[dofs]) * speed * math.e
         self._servos = drive.Servos(
             qpos=model.jnt_qposadr[joints],
@@ -82,13 +82,13 @@ class Drives:
         self.slipped[index] = 0.0
 
     def resting(self) -> np.ndarray:
-        """Places (N, D) at which the bases come to rest, where clamps have slipped."""
+        """Places (N, D) at which the bases come to rest after slip, m and rad."""
         slip = np.empty_like(self.told)
         drive.slip(self._servos, self.bound.state, slip)
         return self.told - slip
 
     def follow(self, command: np.ndarray, load: np.ndarray | None = None) -> np.ndarray:
-        """Lets clamps slip and makes up for loads, before a control step.
+        """Subtracts slip from the commands, compensates loads, before a control step.
 
         Args:
             command: (N, D) in [-1, 1], of the control step to come.
@@ -96,7 +96,7 @@ class Drives:
                 sensors if None.
 
         Returns:
-            Way (N, D) by which the clamps have slipped in the last one, m and rad.
+            Slip (N, D) of the clamps in the last control step, m and rad.
         """
         slip = np.empty_like(self.told)
         if load is None:
@@ -107,7 +107,7 @@ class Drives:
 
 
 def hold(model: mujoco.MjModel, data: mujoco.MjData) -> Drives:
-    """The drives of one simulation, whose commands are set to where the bases stand."""
+    """Returns the drives of one simulation, commanded to hold their bases in place."""
     names = ("qpos", "qvel", "act", "sensordata")
     arrays = {name: getattr(data, name)[None] for name in names}
     drives = Drives(model, types.SimpleNamespace(**arrays))
@@ -116,7 +116,7 @@ def hold(model: mujoco.MjModel, data: mujoco.MjData) -> Drives:
 
 
 def _load_sensor(model: mujoco.MjModel, joint: int) -> int:
-    """Place among `sensordata` of the force or torque of a platform on its device."""
+    """Index in `sensordata` of the force or torque of a platform on its device."""
     slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE.value
     kind = mujoco.mjtSensor.mjSENS_FORCE if slides else mujoco.mjtSensor.mjSENS_TORQUE
     bodies = model.site_bodyid[model.sensor_objid * (model.sensor_type == kind.value)]

@@ -1,10 +1,10 @@
 """Effects on the simulation: forces, fields of the model, commands of the drives.
 
 A task lists them: `suite.make_task(name, effects=[...])`. An effect restarts with each
-episode and acts once in a control step on the arrays of all simulations. In every
-physics step acts its law, a function of its parameters that is compiled and that MuJoCo
-calls through `dispatcher`. The parameters of all effects of a simulation lie one after
-the other in MuJoCo's `userdata`; its last number says by which layout.
+episode and acts once per control step on the arrays of all simulations. Its law acts in
+every physics step: a compiled function of the effect's parameters, which MuJoCo calls
+through `dispatcher`. The parameters of all effects of a simulation lie one after the
+other in MuJoCo's `userdata`; the last number of `userdata` is the label of the layout.
 """
 
 import dataclasses
@@ -24,21 +24,21 @@ from cathsim_dmc.physics.readings import ModelIndex, Readings
 
 @dataclasses.dataclass(frozen=True)
 class Draw:
-    """What was drawn for an episode; None where the model's own value stands.
+    """Values drawn for an episode; None keeps the model's own value.
 
     Attributes:
         displacement: (3,) of the tip at the start, frame of the inlet, m.
         friction: Coulomb coefficient.
-        stiffness: factor.
-        loss: factor.
-        viscosity: factor.
+        stiffness: factor of EI and GJ.
+        loss: factor of the loss factor of the material.
+        viscosity: factor of the viscosity of blood.
         view: added to the angles of the C-arms, primary and secondary, whole degrees.
         gain: factor of the gain of the angiography machine.
         kerma: factor of its kerma.
-        goal_shift: m along the branch.
-        roll: rad.
-        delay: control steps.
-        insertion: m, beyond the task's own start.
+        goal_shift: shift of the goal along its branch, m.
+        roll: roll of the device about its axis, rad.
+        delay: delay of the action, control steps.
+        insertion: insertion beyond the task's own start, m.
     """
 
     displacement: np.ndarray
@@ -57,20 +57,20 @@ class Draw:
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """N simulations, as an effect finds them.
+    """N simulations that an effect acts on.
 
     Attributes:
         model: The compiled scene, as it is without effects.
-        chain: The entity of the device, or of several in each other.
-        index: Places of the task's quantities in the model.
-        start_depth: Way of the chain's end past the mouth of the sheath at zero
+        chain: The entity of the device, or of coaxial devices.
+        index: Indices of the task's quantities in the model.
+        start_depth: Distance of the chain's end past the mouth of the sheath at zero
             insertion, m.
         arrays: The state, arrays (N, ...) with MuJoCo's names: those of
             `ModelIndex.FIELDS` and of `Effect.data_fields`.
-        field: Gives a field of the model that one simulation has for itself, by its
-            number and MuJoCo's name, to be written.
-        parameters: Those of the effect's law, `Effect.parameters` of views (N, ...);
-            they are part of MuJoCo's state, and 0 when an episode begins.
+        field: Returns a field of one simulation's own model, to be written, by the
+            index of the simulation and MuJoCo's name of the field.
+        parameters: Parameters of the effect's law, `Effect.parameters` of views
+            (N, ...). They are part of MuJoCo's state, and 0 when an episode begins.
     """
 
     model: mujoco.MjModel
@@ -83,7 +83,7 @@ class World:
 
     @property
     def num_simulations(self) -> int:
-        """N."""
+        """Number N of simulations."""
         return len(self.arrays.qpos)
 
 
@@ -97,29 +97,30 @@ class NoParameters(NamedTuple):
 
 
 class Effect:
-    """Changes nothing; a subclass overrides what it needs.
+    """Base class of effects, which changes nothing; subclasses override its methods.
 
     Attributes:
         data_fields: Fields of `mujoco.MjData` that it reads, beside
             `ModelIndex.FIELDS`.
         model_fields: Fields of `mujoco.MjModel` that it writes.
-        step_fields: Those of `model_fields` that `act` writes. The device writes its
-            own in every control step: what it has from its hinges and masses follows
-            from options of the task, and an effect that declares one is refused.
+        step_fields: Those of `model_fields` that `act` writes. Fields that the device
+            writes in every control step, such as those of its hinges, are refused:
+            `restart` or options of the task set them.
         state: Names of its attributes, arrays with a leading axis N, that are its state
-            beside parameters and fields: what an episode goes on from. A snapshot keeps
-            them, and writes into them in place; what MuJoCo derives it does not keep,
-            so `act` reads that from its argument `state`.
-        parameters: NamedTuple of what its law reads, see `laws.parameters`; None for
-            none.
-        law: Static method, plain loops that numba compiles and MuJoCo calls in every
-            physics step: parameters of one simulation, time in s, and in "control" the
-            `laws.device.Links`, to whose `xfrc_applied` it adds forces, in "passive"
-            the `laws.device.Device`, to whose `qfrc_passive` it adds, in "contact" a
-            `laws.device.Contact`, whose `solref` it changes. None for none.
+            beside parameters and fields. A snapshot saves them and restores them in
+            place. It does not save quantities that MuJoCo derives; `act` reads these
+            from its argument `state`.
+        parameters: NamedTuple class of the parameters of its law, see
+            `laws.parameters`; None for none.
+        law: Static method law(parameters, time, state) of plain loops, which numba
+            compiles and MuJoCo calls in every physics step: parameters of one
+            simulation, time in s, and a state by `acts_in`. In "control" it adds to
+            `xfrc_applied` of `laws.device.Links`, in "passive" to `qfrc_passive` of
+            `laws.device.Device`, in "contact" it changes `solref` of
+            `laws.device.Contact`. None for none.
         acts_in: "control", "passive" or "contact".
         adapter: Name of a function of `physics.adapters` in place of `law`.
-        world: The simulations, there from `bind` on.
+        world: The simulations, set by `bind`.
     """
 
     data_fields: tuple[str, ...] = ()
@@ -133,36 +134,36 @@ class Effect:
     world: World
 
     def bind(self, world: World) -> None:
-        """Finds what it acts on; no episode has begun yet."""
+        """Takes the simulations that it acts on, before their first episode."""
         self.world = world
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Takes the anatomy of one simulation, before an episode begins in it."""
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
-        """Begins an episode of one simulation, whose device lies at its start.
+        """Begins an episode of one simulation, whose device is at its start.
 
         Args:
-            index: Number of the simulation.
-            episode: What the task has drawn for it.
-            random_state: Source of what the effect draws itself.
+            index: Index of the simulation.
+            episode: Values that the task has drawn for the episode.
+            random_state: Source of the effect's own draws.
         """
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Acts once, before the physics steps of a control step.
 
         Args:
-            action: (N, A), of the agent or of the effect before this one.
+            action: (N, A), from the agent or from the effect before this one.
             state: Readings after the last control step.
 
         Returns:
-            (N, A), what the next effect gets; the drives get it clipped to [-1, 1].
+            (N, A), action for the next effect; the drives get it clipped to [-1, 1].
         """
         return action
 
 
 def check_action(effect: Effect, action: Any, shape: tuple[int, ...]) -> None:
-    """Refuses (ValueError) what `act` of an effect has returned."""
+    """Raises ValueError unless `act` of an effect has returned an array of `shape`."""
     name = f"act of {type(effect).__name__} returns"
     if action is None:
         raise ValueError(f"{name} None; return the action that takes effect")
@@ -180,7 +181,7 @@ def _kind(effect: Effect) -> Any:
 
 
 def _sizes(chain: Chain) -> dict[str, int]:
-    """The sizes that shapes of parameters name."""
+    """Sizes of a chain, by the names in the shapes of parameters."""
     sizes = {"links": len(chain.links), "joints": len(chain.bends) // 2}
     if chain.coaxial:
         stack: Any = chain
@@ -189,19 +190,19 @@ def _sizes(chain: Chain) -> dict[str, int]:
 
 
 def of_kind(effects: Iterable[Effect], kind: type[E]) -> E | None:
-    """The effect of a class among some; None if there is none."""
+    """The first effect of a class; None if there is none."""
     return next((effect for effect in effects if isinstance(effect, kind)), None)
 
 
 def userdata_size(effects: Iterable[Effect], chain: Chain) -> int:
-    """Numbers of MuJoCo's `userdata` that some effects take."""
+    """Length of MuJoCo's `userdata` for some effects, the label included."""
     sizes, kinds = _sizes(chain), [_kind(effect) for effect in effects]
     found = [declared.total(kind, sizes) for kind in kinds if kind is not None]
     return sum(found) + 1 if found else 0
 
 
 def views(kind: Any, rows: np.ndarray, sizes: Mapping[str, int]) -> Any:
-    """Parameters (N, ...) in rows (N, P), of a class."""
+    """Parameters of a NamedTuple class: views (N, ...) of rows (N, P)."""
     found, start = [], 0
     for shape in declared.shapes(kind, sizes).values():
         count = math.prod(shape)
@@ -211,23 +212,23 @@ def views(kind: Any, rows: np.ndarray, sizes: Mapping[str, int]) -> Any:
 
 
 class Layout:
-    """Where the parameters of some effects lie in `userdata`.
+    """Layout of the parameters of effects in `userdata`.
 
     Attributes:
-        effects: They.
+        effects: The effects, in their order in `userdata`.
     """
 
     def __init__(self, effects: Sequence[Effect], world: World, places: Any = None):
-        """Gives each effect its part of the world, and has MuJoCo call the laws.
+        """Binds the effects to their parameters, and has MuJoCo call their laws.
 
         Args:
-            effects: Of one rollout only.
-            world: Simulations; its parameters are all of `userdata`, (N, n).
+            effects: Effects, not shared with another rollout.
+            world: Simulations; `parameters` is the whole `userdata`, (N, n).
             places: `dispatcher.Places` of the device; None for those of a task's scene.
 
         Raises:
             ValueError: if the scene was built for other effects.
-            RuntimeError: if a Python function stands in one of MuJoCo's callbacks.
+            RuntimeError: if one of MuJoCo's callbacks is a Python function.
         """
         from cathsim_dmc.physics import dispatcher  # late, as numba takes long
 
@@ -254,10 +255,10 @@ class Layout:
         self._stand = dispatcher.stand
 
     def begin(self, indices: np.ndarray) -> None:
-        """Has laws act on simulations (K,), whose `userdata` have been reset.
+        """Switches the laws on in simulations (K,) whose `userdata` have been reset.
 
         Raises:
-            RuntimeError: if a Python function stands in one of MuJoCo's callbacks.
+            RuntimeError: if one of MuJoCo's callbacks is a Python function.
         """
         self._stand()
         self._user[indices, -1] = self._callbacks.label

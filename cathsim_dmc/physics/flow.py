@@ -1,8 +1,8 @@
 """Blood that flows: a pulsatile flow past the links of the device.
 
-docs/vessel_model.md has the equations and their sources. The velocity at each link is
-taken once a control step where the link is, its course in time (`laws.blood.beat`) in
-every physics step.
+docs/vessel_model.md has the equations and their sources. The velocity at the position
+of each link is computed once per control step, its course in time (`laws.blood.beat`)
+in every physics step.
 """
 
 import dataclasses
@@ -66,21 +66,21 @@ _LIMITS = {
 
 
 class Flow(StillBlood):
-    """Blood in vessels that live: it may flow, and moves with what moves them.
+    """Blood in living vessels: it may flow, and it moves with the vessels.
 
     Attributes:
-        radius: (N, L), of the lumen around each link, m, 0 where it is in none.
+        radius: (N, L), radius of the lumen around each link, m; 0 for none.
     """
 
     state = ("_wave_speed", "radius", "_link_radii")
     radius: np.ndarray
 
     def __init__(self, options: FlowOptions | None, moving: Moving | None = None):
-        """Takes the options of the task, None for no flow, and what moves vessels."""
+        """Takes the options, None for no flow, and the effect that moves vessels."""
         self._options, self._moving = options, moving
 
     def bind(self, world: World) -> None:
-        """Finds the parameters of blood and the radii of the links."""
+        """Takes the simulations, and the radii of the links from the model."""
         super().bind(world)
         radii = world.model.geom_size[world.index.geoms, 0]
         self._link_radii = np.tile(radii, (world.num_simulations, 1))
@@ -90,7 +90,7 @@ class Flow(StillBlood):
         self.radius = np.zeros(self._link_radii.shape)
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
-        """Fills the vessels of an anatomy."""
+        """Takes the circulation of the anatomy of one simulation."""
         murray = self._options is not None and self._options.split == "murray"
         blood = anatomy.murray_circulation if murray else anatomy.circulation
         self._circulations[index], self._alike = blood, None
@@ -109,7 +109,7 @@ class Flow(StillBlood):
         self._wave_speed[index] = speed
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
-        """Finds the blood at the middle of each link."""
+        """Writes velocity and friction of the blood at the middle of each link."""
         nodes = state.centreline
         found = self._at(0.5 * (nodes[:, :-1] + nodes[:, 1:]))
         self.radius = found[..., 4]
@@ -128,7 +128,7 @@ class Flow(StillBlood):
         return {"rate": rate, "phase": phase, "wave_speed": speed}
 
     def _at(self, points: np.ndarray) -> np.ndarray:
-        """What `velocities` finds at points (N, P, 3) in space: (N, P, 8)."""
+        """Output (N, P, 8) of `velocities` at points (N, P, 3), m, in space."""
         places, out = np.ascontiguousarray(points), np.zeros((*points.shape[:2], 8))
         if self._alike is None:
             count = range(len(points))
@@ -148,11 +148,11 @@ class Flow(StillBlood):
         return out
 
     def read(self, time: np.ndarray, state: Readings) -> dict[str, np.ndarray]:
-        """Figures of `vessel.VesselReadings`.
+        """Blood velocity and heart phase, by their names in `vessel.VesselReadings`.
 
         Args:
-            time: (N,) of the episodes, s.
-            state: At that time.
+            time: (N,), time since the start of the episodes, s.
+            state: Readings at that time.
         """
         found = self._at(state.head[:, None])[:, 0]
         if self._options is None:
@@ -168,7 +168,7 @@ class Flow(StillBlood):
 
 @compiled
 def profile(share):
-    """Velocity over its mean at a share of the lumen's radius; 0 outside."""
+    """Velocity relative to its mean, at a fraction of the lumen's radius; 0 outside."""
     return (1.0 - share**EXPONENT) * (EXPONENT + 2) / EXPONENT if share < 1.0 else 0.0
 
 
@@ -181,7 +181,7 @@ def _beat(phases, out):
 
 @compiled
 def velocities_of(own, points, segments, out):
-    """`velocities` (N, P, 8) at points (N, P, 3) of the simulations (n,) at rest."""
+    """Writes `velocities` (N, P, 8) of simulations `own` (n,) with vessels at rest."""
     growth = np.zeros(points.shape[1])
     for n in own:
         velocities(points[n], growth, segments, out[n])
@@ -189,16 +189,16 @@ def velocities_of(own, points, segments, out):
 
 @compiled
 def moving_velocities_of(lattice, own, given, points, segments, out):
-    """As `velocities_of`, past the inlet of vessels that move.
+    """As `velocities_of`, in vessels that move, at points past the inlet.
 
     Args:
-        lattice: Of `anatomy.motion.Motion`.
-        own: (n,) int64.
+        lattice: Lattice of `anatomy.motion.Motion`.
+        own: (n,) int64, indices of the simulations.
         given: `laws.motion.MotionParameters` of arrays (N,), times (N,) in s, and
-            inlets (N, 2, 3).
+            inlets (N, 2, 3), position (m) and direction.
         points: (N, P, 3) m, in space.
-        segments: As of `velocities`.
-        out: (N, P, 8).
+        segments: See `velocities`.
+        out: (N, P, 8), written.
     """
     parameters, times, inlets = given
     for n in own:
@@ -209,7 +209,7 @@ def moving_velocities_of(lattice, own, given, points, segments, out):
 
 @compiled
 def moving_velocities(lattice, course, points, segments, out):
-    """As `velocities` at a time, s; `out` (P, 8) ends with that of space, m/s."""
+    """As `velocities` in a moving vessel; out[:, 5:] is the velocity of space, m/s."""
     values, there = np.empty((VALUES, 4)), np.empty((len(points), WARP))
     for p in range(len(points)):
         x, y, z = points[p]
@@ -245,19 +245,19 @@ def _fill(found, speed, radii, flowing, blood):
 
 @compiled
 def velocities(points, growth, segments, out):
-    """Writes velocity, way from the heart and radius of the lumen at some places.
+    """Writes velocity, distance from the heart and radius of the lumen at points.
 
     Args:
         points: (P, 3), m, in the vessel at rest.
-        growth: (P,), of the radius of the lumen, m.
-        segments: of the vessels, `anatomy.circulation.Segments`.
-        out: (P, 5 or more): velocity for an inflow of 1 m³/s, 1/m²; way, m; radius,
-            m; 0 outside the lumen.
+        growth: (P,), growth of the radius of the lumen, m.
+        segments: segments of the vessels, `anatomy.circulation.Segments`.
+        out: (P, 5 or more), written: velocity (3) for an inflow of 1 m³/s, 1/m²;
+            distance, m; radius, m; all are 0 outside the lumen.
     """
     ends, radii, shares, ways, vessel = segments
     count = len(vessel)
     nearest = np.empty(vessel[-1] + 1)
-    segment = np.zeros(vessel[-1] + 1, np.int64)  # of a place that is none, the first
+    segment = np.zeros(vessel[-1] + 1, np.int64)  # 0 for a NaN point
     for p in range(len(points)):
         nearest[:] = np.inf
         k = 0
@@ -271,7 +271,7 @@ def velocities(points, growth, segments, out):
             v = vessel[k]
             if square < nearest[v]:
                 nearest[v], segment[v] = square, k
-            # So many of the next, none of which exceeds this one, are farther away.
+            # The next `step` segments, none of them longer, are farther away.
             ahead = (math.sqrt(square) - math.sqrt(nearest[v])) * 0.999999
             step = int(ahead / abs(ways[k, 1] - ways[k, 0]))
             k += 1
@@ -285,7 +285,7 @@ def velocities(points, growth, segments, out):
             after = t > 1.0 and (k == count - 1 or vessel[k + 1] != v)
             t = min(max(t, 0.0), 1.0)
             radius = growth[p] + (1.0 - t) * radii[k, 0] + t * radii[k, 1]
-            # Depth in the tube of the vessel, none past its ends.
+            # Depth in the tube of the vessel, -inf past its ends.
             nearest[v] = radius - math.sqrt(nearest[v])
             if before or after:
                 nearest[v] = -np.inf

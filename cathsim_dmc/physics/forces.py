@@ -10,18 +10,19 @@ import numpy as np
 # The order is MuJoCo's own, whatever the order in the model file.
 CONTACT_SIZE = 1 + 3 + 1 + 3 + 3 + 3
 
-# Shown wherever a peak is.
+# Note shown with every peak force.
 PEAK_NOTE = (
     "Peaks depend on the physics step: at 4 ms they read 0.4 to 0.7 times those at "
     "0.5 ms."
 )
 
-# A physics step was too long if one begins with a contact harder, N, or deeper, m, than
-# this, or a control step ends deeper: something crossed the lumen and hit the wall.
+# A control step is too coarse if one of its physics steps begins with a contact harder,
+# N, or deeper, m, than this, or if it ends deeper: a device has snapped across the
+# lumen.
 HARDEST = 5.0
 DEEPEST = 0.3e-3
-# The control step is then done again with steps so many times shorter; a power of two,
-# which divides exactly.
+# The control step is then repeated with physics steps shorter by this factor; a power
+# of two divides exactly.
 REFINEMENT = 8
 
 
@@ -29,8 +30,8 @@ REFINEMENT = 8
 class Contacts:
     """Contacts of the device with the wall; K rows, of which some are empty.
 
-    World frame, SI units, float64. Empty rows hold zeros. A place of a hollow lumen may
-    be two rows, each with about half of its load.
+    World frame, SI units, float64. Empty rows hold zeros. A contact with a hollow wall
+    may be two rows, each with about half of the load.
 
     Attributes:
         present: (..., K) bool.
@@ -68,21 +69,21 @@ class Contacts:
 
 
 class WallForce(NamedTuple):
-    """Force on the wall over one control step, N, by its magnitudes: never negative.
+    """Magnitudes of the force on the wall over one control step, N, never negative.
 
-    The means are what a load cell that is read at 25 Hz shows. They are judged and
-    learnt from (reward terms, `safe success`, the observation `force`, the expert), as
-    they hardly depend on the physics step.
+    The means correspond to a load cell that is read at 25 Hz. Reward terms, `safe
+    success`, the observation `force` and the expert use them, because they hardly
+    depend on the physics step.
 
     Attributes:
         sum: (...), sum of the magnitudes of all contacts, last substep.
-        max: (...), largest single contact, last substep; one place of the wall may
-            be two contacts.
+        max: (...), largest single contact, last substep; a hollow wall may have two
+            contacts at one place.
         peak_sum: (...), largest sum of any substep of the control step; it depends
             on the physics step, see `PEAK_NOTE`.
         peak_max: (...), largest single contact of any substep; likewise.
-        mean_sum: (...), mean over the substeps of the sum over all contacts; where
-            nothing has moved yet, `sum`.
+        mean_sum: (...), mean over the substeps of the sum over all contacts; `sum`
+            before the first control step.
         mean_max: (...), mean over the substeps of the largest single contact.
     """
 
@@ -94,7 +95,7 @@ class WallForce(NamedTuple):
     mean_max: np.ndarray
 
     def named(self) -> dict[str, np.ndarray]:
-        """The forces as logs and records name them, see `NAMES`."""
+        """The forces by their names in logs and records, `NAMES`."""
         return dict(zip(NAMES, self, strict=True))
 
 
@@ -102,10 +103,10 @@ NAMES = tuple(f"wall_force_{name}" for name in WallForce._fields)
 
 
 def wall_force(rows: np.ndarray) -> tuple[WallForce, np.ndarray]:
-    """Summarises the sensor's rows (N, S, K * 14) of the S steps of a control step.
+    """Summarises the sensor's rows (N, S, K * 14) of the S substeps of a control step.
 
     Returns:
-        Forces, and the depth (N,) of the deepest contact in them, m.
+        Forces, arrays (N,), and the depth (N,) of the deepest contact, m.
     """
     found = _loops().summed(rows, CONTACT_SIZE)
     return WallForce._make(found[:6]), found[6]

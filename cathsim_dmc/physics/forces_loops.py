@@ -13,7 +13,7 @@ def summed(rows, size):
     """The arrays (N,) of `forces.WallForce`, and the depth of the deepest contact.
 
     Args:
-        rows: (N, S, K * size), of the sensor, which fills its places from the first.
+        rows: (N, S, K * size), rows of the sensor, filled from the first contact on.
         size: numbers of a contact.
 
     Returns:
@@ -45,7 +45,7 @@ def pressed(rows, size):
     """Depth of the deepest contact, m, and the work ½ Σ f r of all, J: (2, N).
 
     Args:
-        rows: (N, K * size), of the sensor.
+        rows: (N, K * size), rows of the sensor.
         size: numbers of a contact.
     """
     found = np.zeros((2, len(rows)))
@@ -59,5 +59,5 @@ def pressed(rows, size):
 
 @compiled
 def higher(one, other):
-    """The larger of two numbers, or one that is none."""
+    """The larger of two numbers; NaN if one of them is."""
     return one if one > other or math.isnan(one) else other

@@ -36,13 +36,13 @@ class Held:
         bends_qpos: np.ndarray,
         start_depth: float,
     ):
-        """Finds the hinges in a model whose fields are those without a sheath.
+        """Finds the hinges in a model with the values of hinges without a sheath.
 
         Args:
-            model: Without a sheath.
+            model: Model with the values without a sheath.
             chain: The entity.
             bends_qpos: (J, 2), see `readings.ModelIndex`.
-            start_depth: Way of the chain's end past the mouth at insertion 0, m.
+            start_depth: Distance of the chain's end past the mouth at insertion 0, m.
         """
         lengths = chain.link_lengths
         places = np.cumsum(lengths)[:-1] - np.sum(lengths) + start_depth
@@ -66,7 +66,7 @@ class Held:
         return np.array([field[places] for field, places in pairs])
 
     def write(self, fields: sheath.Hinges, free: np.ndarray, insertion: float) -> None:
-        """Writes the fields of hinges whose values are (3, J, 2) without a sheath."""
+        """Writes hinges at an insertion, m; `free` (3, J, 2) is without a sheath."""
         values = sheath.Hinges._make(free)
         sheath.hold(self.joints, float(insertion), values, fields, self.out)
 
@@ -84,9 +84,10 @@ class Held:
 
 
 class Released(Effect):
-    """Hinges without a sheath as an episode begins, for effects that change them.
+    """Resets the hinges to their values without a sheath as an episode begins.
 
-    The device, which acts last, holds what it then finds.
+    Other effects may then change them. The device restarts last and stiffens the hinges
+    in the sheath from the values that it finds.
     """
 
     model_fields = FIELDS
@@ -105,19 +106,19 @@ class Released(Effect):
         ]
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
-        """Writes the values of one simulation that none has changed."""
+        """Writes the unchanged values into the model of one simulation."""
         for name, where, values in self._nominal:
             self.world.field(index, name)[where] = values
 
 
 class Sheathed(NamedTuple):
-    """The hinges of N simulations.
+    """Hinges of N simulations in a sheath.
 
     Attributes:
         joints: `laws.sheath.Joints`.
         insertion: (N,), m.
         free: (N, 3, J, 2), stiffness, damping and rest angles without a sheath.
-        places: (N, 3) int64, see `addresses`; 0 where there is no episode yet.
+        places: (N, 3) int64, see `addresses`; 0 before the first episode.
         out: (N, J), fraction of each joint's compliance that is out of the sheath.
     """
 
@@ -128,16 +129,16 @@ class Sheathed(NamedTuple):
     out: Any
 
     def of(self, rows: slice) -> "Sheathed":
-        """Some of the simulations."""
+        """Returns the hinges of some of the simulations."""
         return Sheathed._make((self.joints, *(each[rows] for each in self[1:])))
 
 
 def addresses(fields: Sequence[np.ndarray]) -> list[int]:
-    """Where the fields of a model, contiguous arrays of float64, lie in memory."""
+    """Addresses of fields of a model, which are contiguous arrays of float64."""
     assert all(each.dtype == float and each.flags.c_contiguous for each in fields)
     return [each.ctypes.data for each in fields]
 
 
 def fields_of(field: Callable[[str], np.ndarray]) -> sheath.Hinges:
-    """Live fields of a model, by a function that gives one by its name."""
+    """Live fields of a model, from a function that returns a field by its name."""
     return sheath.Hinges._make(map(field, FIELDS))

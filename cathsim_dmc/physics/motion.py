@@ -1,8 +1,8 @@
 """A vessel that moves: pulsation, heartbeat and breathing (`anatomy.motion`).
 
-The wall of a moving vessel is the field at rest, looked up at x - u(x, t) in every
+The wall of a moving vessel is the field at rest, evaluated at x - u(x, t) in every
 physics step (docs/vessel_model.md). An episode begins at rest, at the end of diastole
-and of expiration, and moves in full after `laws.motion.RAMP`.
+and of expiration; the motion reaches its full amplitude after `laws.motion.RAMP`.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ _LIMITS = {
     "breath_phase": (0.0, 1.0, ""),
 }
 OF_HEART = {"rate": 60.0, "phase": 0.0, "wave_speed": 4.6}
-_CLOCK_MASS = 0.1  # kg; a contact that moves at 0.05 m/s feels 0.025 kg⁻¹ of it
+_CLOCK_MASS = 0.1  # kg; gives a contact at 0.05 m/s an inverse weight of 0.025 kg⁻¹
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,9 +39,9 @@ class MotionOptions:
     """How a vessel moves; a range (low, high) is drawn from in each episode.
 
     Attributes:
-        heart: Way of the aortic root in a beat, m, 0 to 0.012, before it is smoothed
-            and fades towards the inlet (docs/vessel_model.md).
-        breathing: Amplitude over that of Sailer 2015, 0 to 2, likewise.
+        heart: Displacement of the aortic root in a beat, m, 0 to 0.012, before it is
+            smoothed and faded towards the inlet (docs/vessel_model.md).
+        breathing: Amplitude relative to that of Sailer 2015, 0 to 2, likewise.
         distensibility: Area distensibility of a wide artery, 1/kPa, 0 to 0.08; 0.044
             when young, 0.02 at about 50 years.
         rate: Heart rate, 1/min, 30 to 200; None for that of the flow, or 60.
@@ -49,7 +49,7 @@ class MotionOptions:
             the flow, or 0.
         wave_speed: Pulse wave velocity, m/s, 2 to 20; None for that of the flow, or
             4.6.
-        breath_rate: Of breathing, 1/min, 4 to 60.
+        breath_rate: Breathing rate, 1/min, 4 to 60.
         breath_phase: Phase of breathing at the start, 0 to 1; 0 is the end of
             expiration.
     """
@@ -67,7 +67,7 @@ class MotionOptions:
         check_drawn(self, _LIMITS)
 
     def check(self, anatomy: Anatomy) -> None:
-        """Raises ValueError if the largest amplitudes fold an anatomy."""
+        """Raises ValueError if the largest amplitudes fold the space of an anatomy."""
         heart, breathing = float(np.max(self.heart)), float(np.max(self.breathing))
         anatomy.motion.check(anatomy.name, heart, breathing)
 
@@ -76,7 +76,7 @@ class Moving(Effect):
     """Moves the wall of each simulation.
 
     Attributes:
-        flow: `flow.Flow` with the same heart; None for none.
+        flow: `flow.Flow` with the same heart; None without a flow.
     """
 
     parameters = MotionParameters
@@ -89,7 +89,7 @@ class Moving(Effect):
         self._options, self.flow = options, None
 
     def bind(self, world: World) -> None:
-        """Starts at rest."""
+        """Allocates the clocks and inlets of the simulations."""
         super().bind(world)
         self._motions: dict[int, Motion] = {}
         self._surfaces: dict[int, Surface] = {}
@@ -99,7 +99,7 @@ class Moving(Effect):
         self._step = world.model.opt.timestep
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
-        """Takes the motion of an anatomy."""
+        """Takes the motion of the anatomy of one simulation."""
         self._motions[index], self._surfaces[index] = anatomy.motion, anatomy.surface
         self.inlets[index] = anatomy.inlet.position, anatomy.inlet.direction
         self._alike = None
@@ -118,7 +118,7 @@ class Moving(Effect):
         self._clock[index] = 0.0
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
-        """Counts the control steps; the last effect of the vessel."""
+        """Advances the clock by a control step; the last effect of the vessel."""
         self._clock += CONTROL_TIMESTEP
         return action
 
@@ -141,7 +141,7 @@ class Moving(Effect):
 
     @property
     def alike(self) -> list[tuple[Motion, np.ndarray]]:
-        """Motions, each with the simulations (n,) of its anatomy."""
+        """Motions, each with the indices (n,) of the simulations of its anatomy."""
         if self._alike is None:
             count = range(self.world.num_simulations)
             self._alike = rows.alike(self._motions[index] for index in count)
@@ -153,11 +153,11 @@ class Moving(Effect):
 
     @property
     def times(self) -> np.ndarray:
-        """Times (N,) s, of what MuJoCo has derived, one physics step before the end."""
+        """Times (N,), s, of quantities that MuJoCo derives: a physics step earlier."""
         return np.maximum(self._clock - self._step, 0.0)
 
     def at_rest(self, state: Readings) -> Readings:
-        """Readings with the places at rest of those in space; the sheath rests."""
+        """Readings with centreline and head past the inlet mapped to rest."""
         from cathsim_dmc.physics import motion_loops  # late, as numba takes long
 
         places, times = state.centreline.copy(), self.times
@@ -188,7 +188,7 @@ class Moving(Effect):
         return self._motions[index].lattice, self._numbers(index), time
 
     def surface(self, index: int) -> Surface:
-        """The lumen's surface of one simulation where it is now."""
+        """Present surface of the lumen of one simulation."""
         parameters, time = self.warp(index)[1:]
         return self._motions[index].surface(parameters, time, self._surfaces[index])
 
@@ -197,7 +197,7 @@ def add_clock(root) -> None:
     """Adds the body of the last degree of freedom, see `adapters.motion`.
 
     Args:
-        root: MJCF of the whole scene, to which nothing is attached any more.
+        root: MJCF of the complete scene; nothing may be attached to it afterwards.
     """
     clock = root.worldbody.add("body", name="vessel_clock", gravcomp=1)
     inertia = [_CLOCK_MASS * 1e-4] * 3

@@ -1,7 +1,7 @@
 """Places in vessels that move, of simulations of one anatomy; compiled loops.
 
-Numbers of simulations (n,) choose rows of arrays (N, ...). What is given of their
-motions are `laws.motion.MotionParameters` of arrays (N,) and times (N,), s.
+`own` (n,) are the indices of the simulations in arrays (N, ...). `given` are
+`laws.motion.MotionParameters` of arrays (N,) and times (N,), s.
 """
 
 import numpy as np
@@ -19,14 +19,14 @@ from cathsim_dmc.laws.motion import (
 
 @compiled
 def to_rest_of(lattice, own, given, inlets, places):
-    """Has places past the inlet stand where they are at rest.
+    """Maps places past the inlet from space to the vessel at rest, in place.
 
     Args:
-        lattice: Of `anatomy.motion.Motion`.
+        lattice: Lattice of `anatomy.motion.Motion`.
         own: (n,) int64.
         given: See the module.
         inlets: (N, 2, 3), position (m) and direction of the inlets.
-        places: (N, P, 3) m, those in space; become those at rest.
+        places: (N, P, 3) m, in space; overwritten with the places at rest.
     """
     parameters, times = given
     scratch = np.empty((VALUES + WARP // 4, 4))
@@ -38,7 +38,7 @@ def to_rest_of(lattice, own, given, inlets, places):
 
 @compiled
 def to_space_of(lattice, own, given, places):
-    """Has places (N, 3) m at rest stand where they are in space."""
+    """Maps places (N, 3) m of the vessel at rest into space, in place."""
     parameters, times = given
     scratch, growth = np.empty((VALUES + WARP // 4, 4)), np.empty(1)
     for n in own:

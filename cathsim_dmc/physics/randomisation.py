@@ -1,4 +1,4 @@
-"""Domain randomisation: what differs from episode to episode, drawn from one source.
+"""Domain randomisation: quantities that are drawn for each episode, from one source.
 
 Composer and the batched path draw the same `Draw` in the same order;
 `RandomisedModel` writes it to fields of the compiled model, so nothing is compiled
@@ -26,7 +26,7 @@ START_JITTER = 1e-3  # m
 Range = Sequence[float] | variation.Variation
 Drawn = float | Sequence[float]  # a number, or a range (low, high) that is drawn from
 
-# Least and largest value of what is drawn, far beyond what differs between sessions,
+# Allowed range of each drawn quantity: far wider than the differences between sessions,
 # within what can be simulated.
 _RANGES = {
     "friction": (0.0, 2.0, ""),
@@ -132,33 +132,33 @@ class Randomisation:
 
     @classmethod
     def make(cls, value: "Randomisation | Mapping[str, Any] | bool") -> "Randomisation":
-        """From a task's option: False, True for `DEFAULT_RANGES`, or fields."""
+        """Builds it from an option: False, True for `DEFAULT_RANGES`, or fields."""
         if isinstance(value, bool):
             return DEFAULT_RANGES if value else cls()
         return bounds.made("randomisation", value, cls, "True, False, or ")
 
     @property
     def longest_delay(self) -> int:
-        """Of the action, control steps."""
+        """Longest delay of the action, control steps."""
         return 0 if self.delay is None else int(self.delay[1])
 
     @property
     def farthest_shift(self) -> float:
-        """How far past its place a goal may be shifted, m."""
+        """Largest shift of the goal away from the ostium, m."""
         return max(0.0, max(self.goal_shift or (0.0,)))
 
     @property
     def farthest_insertion(self) -> float:
-        """How much farther in an episode may begin, m."""
+        """Largest insertion beyond the task's own start, m."""
         return 0.0 if self.start_insertion is None else self.start_insertion[1]
 
     def draw_in(self, random_state: RandomState, anatomies: int) -> tuple[int, Draw]:
-        """Draws the number of one of so many anatomies, then an episode in it."""
+        """Draws the index of one of `anatomies` anatomies, then an episode in it."""
         number = int(random_state.randint(anatomies)) if anatomies > 1 else 0
         return number, self.draw(random_state)
 
     def draw(self, random_state: RandomState) -> Draw:
-        """Draws an episode; what is None takes nothing from the source."""
+        """Draws an episode; a quantity that is None draws nothing from the source."""
 
         def value(name: str) -> float | None:
             chosen = getattr(self, name)
@@ -187,8 +187,8 @@ class Randomisation:
         return Draw(displacement, **given)
 
 
-# Friction and EI over what real devices and lubrication show (the friction that is
-# usually randomised is 0.02-0.15), the rest over what differs between two sessions.
+# Friction and EI span the values of real devices and lubrication (friction is usually
+# randomised over 0.02-0.15), the rest the differences between two sessions.
 DEFAULT_RANGES = Randomisation(
     friction=(0.02, 0.15),
     stiffness=(0.8, 1.25),
@@ -204,7 +204,7 @@ DEFAULT_RANGES = Randomisation(
 )
 
 
-# Fields of the model that what is drawn changes.
+# Fields of the model that each drawn quantity changes.
 _WRITTEN = {
     "friction": ["geom_friction"],
     "stiffness": ["jnt_stiffness", "actuator_gainprm", "dof_damping"],
@@ -222,7 +222,7 @@ class RandomisedModel(Effect):
         self.model_fields = tuple({field for n in drawn for field in _WRITTEN[n]})
 
     def bind(self, world: World) -> None:
-        """Finds the elements in the model, as it is without randomisation."""
+        """Finds the elements in the model, and their values without randomisation."""
         super().bind(world)
         model, chain = world.model, world.chain
         self._nominal = {
@@ -233,7 +233,7 @@ class RandomisedModel(Effect):
         self._dofs = model.jnt_dofadr[self._hinges]
         self._motors = ids(model, chain.tip_motors)
         self._base = world.index.links.start
-        # In a stack, it is written for each link.
+        # Coaxial devices have a ratio for each link, see `laws.coaxial.links`.
         self._ratio = 1.0 if chain.coaxial else chain.device.friction_ratio
         self._stiffness = model.jnt_stiffness[self._hinges].copy()
 
@@ -266,12 +266,12 @@ class RandomisedModel(Effect):
 
 
 class ActionDelay(Effect):
-    """Actions take effect as many control steps later as was drawn."""
+    """Delays actions by the drawn number of control steps."""
 
     state = ("_past", "_delay")
 
     def __init__(self, longest: int):
-        """Bounds the delay, control steps."""
+        """Takes the longest delay, control steps."""
         self._longest = longest
 
     def bind(self, world: World) -> None:
@@ -281,7 +281,7 @@ class ActionDelay(Effect):
         self._delay = np.zeros(world.num_simulations, dtype=int)
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
-        """Begins an episode of one simulation, with drives at rest."""
+        """Begins an episode of one simulation, whose past actions are 0."""
         self._past[index] = 0.0
         self._delay[index] = episode.delay
 

@@ -1,7 +1,7 @@
 """Quantities that a task reads from the simulator, for one simulation or for many.
 
-Arrays have the leading axes of their source, written `...` below: none of an
-`mujoco.MjData`, with arrays such as qpos (nq,), N of a `mujoco.batch.Batch`.
+Arrays have the leading axes of their source, written `...` below: none for an
+`mujoco.MjData`, whose arrays are such as qpos (nq,), and N for a `mujoco.batch.Batch`.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,9 +19,9 @@ from cathsim_dmc.physics import forces
 class Readings(NamedTuple):
     """State of the device after a control step.
 
-    Positions of joints and their velocities are those at the end of the step. All
-    other quantities are MuJoCo's of the last substep, which starts one physics step
-    (some 4 ms) earlier. World frame, SI units, float64. J joints, L links.
+    Positions and velocities of joints are those at the end of the step. MuJoCo derives
+    all other quantities at the start of the last substep, one physics step (some 4 ms)
+    earlier. World frame, SI units, float64. J joints, L links.
 
     Attributes:
         insertion: (...), slide of the base, m, 0 at the start of the stroke.
@@ -61,17 +61,17 @@ class CoaxialReadings(NamedTuple):
     """State of K devices after a control step, arrays with the leading axis N.
 
     Attributes:
-        insertion: (N, K), way of the end of each device from where the chain's end is
-            at zero insertion, m; negative for one that has been withdrawn farther.
+        insertion: (N, K), distance of each device's end beyond the chain's end at zero
+            insertion, m; negative for a device withdrawn farther.
         rotation: (N, K), of the rotary units, rad.
         tip_rotation: (N, K), of the ends of the devices, rad.
         points: (N, K, P, 3), points of each device `DEVICE_PLACES` from its end,
-            m, world frame, see `sliding`; the last one is its end.
+            m, world frame, see `device_points`; the last one is its end.
         leading_load: (N,), N, axial force in the device that reaches farthest where it
             leaves the others, positive when it is pushed forward; for one device alone,
             the push force.
-        lumen_friction: (N,), N, sum of the friction forces between the devices, which
-            stay when the devices stop.
+        lumen_friction: (N,), N, sum of the friction forces between the devices; they
+            persist when the devices stop.
         push: (N, K), N, force of each drive on its device, positive when it pushes it
             forward; their sum is the push force.
     """
@@ -86,7 +86,7 @@ class CoaxialReadings(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """The bodies in a physics step, arrays of MuJoCo's, world frame, SI units.
+    """The bodies in a physics step: MuJoCo's arrays, world frame, SI units.
 
     Attributes:
         xipos: (nbody, 3), centres of mass.
@@ -95,8 +95,8 @@ class Bodies(NamedTuple):
         cvel: (nbody, 6), rotational and translational velocity about the centre of mass
             of the kinematic tree.
         subtree_com: (nbody, 3), that centre is the row of the tree's first body.
-        xfrc_applied: (nbody, 6), force and torque on the centres of mass, N and N·m,
-            zeroed before the effects of a physics step, to be added to.
+        xfrc_applied: (nbody, 6), force and torque on the centres of mass, N and N·m.
+            Effects add to it; it is 0 before those of a physics step.
     """
 
     xipos: np.ndarray
@@ -108,7 +108,7 @@ class Bodies(NamedTuple):
 
 
 class ModelIndex:
-    """Places of a task's quantities in the arrays of a compiled model."""
+    """Indices of a task's quantities in the arrays of a compiled model."""
 
     # Fields of `mujoco.MjData` that `reader` uses, for a batch to bind beforehand.
     FIELDS = ("qpos", "qvel", "cinert", "cvel", "qfrc_actuator", "cfrc_ext", "xpos")
@@ -119,21 +119,21 @@ class ModelIndex:
         joints = ids(model, chain.joints)
         self.links = _as_slice(ids(model, chain.links))
         self.geoms = ids(model, chain.link_geoms)
-        # What touches the device and belongs to the world itself is the wall.
+        # The geoms of the world body that collide are the wall.
         world = (model.geom_bodyid == 0) & (model.geom_contype != 0)
         self.walls = np.flatnonzero(world)
         self.qpos = _as_slice(np.sort(model.jnt_qposadr[joints]))
         self.dofs = _as_slice(np.sort(model.jnt_dofadr[joints]))
         self._order = joints - joints.min()
-        # (n - 1, 2), of the hinges about x and y.
+        # (n - 1, 2), hinges about x and y.
         self.bends_qpos = model.jnt_qposadr[ids(model, chain.bends)].reshape(-1, 2)
         base = [each for each in (chain.insertion, chain.rotation) if each is not None]
         self.insertion_qpos, *turned = model.jnt_qposadr[ids(model, base)].tolist()
         self.rotation_qpos: int | None = turned[0] if turned else None
-        # Of the slide, along z of the handle, and of the first hinge, about its x.
+        # The slide is along z of the handle, the first hinge about its x.
         first = [chain.insertion, chain.bends[0]]
         self.handle_dofs = model.jnt_dofadr[ids(model, first)].tolist()
-        # Whole numbers of the size that numpy indexes with: others are cast each time.
+        # NumPy casts indices of another type than `intp` at each access.
         self.robot_qpos = model.jnt_qposadr[ids(model, robot.joints)].astype(np.intp)
         (self.head_site,) = ids(model, [chain.head]).tolist()
         self.push_force = sensor(model, chain.push_force.full_identifier)
@@ -152,13 +152,13 @@ class ModelIndex:
         return np.stack([x, np.cross(z, x), z], axis=-1)
 
     def reader(self, data) -> Callable[[], Readings]:
-        """Finds the readings in a simulator's arrays.
+        """Returns a function that reads the arrays of a simulator.
 
         Args:
             data: an `mujoco.MjData` or a `mujoco.batch.Batch` with `FIELDS` bound.
 
         Returns:
-            A function that takes the readings as they stand, as copies, as long as
+            Function that returns copies of the present readings; it is valid as long as
             `data` lives.
         """
         qpos, sensors = data.qpos, data.sensordata
@@ -195,30 +195,30 @@ class ModelIndex:
         return read
 
     def read(self, data) -> Readings:
-        """Takes the readings once, as copies; see `reader`."""
+        """Returns copies of the present readings; see `reader`."""
         return self.reader(data)()
 
     def contacts(self, sensordata: np.ndarray) -> forces.Contacts:
-        """Contacts with the wall from sensor rows (..., nsensordata)."""
+        """Contacts with the wall, from `sensordata` (..., nsensordata)."""
         return forces.Contacts.from_sensor(sensordata[..., self.wall_contacts])
 
 
 def part(measured: Any, rows: np.ndarray | slice | int) -> Any:
-    """Rows of all arrays of a named tuple, and of the tuples in it; None is kept."""
+    """Rows of all arrays of a named tuple and of nested ones; None is kept."""
     if measured is None or isinstance(measured, np.ndarray):
         return measured if measured is None else measured[rows]
     return type(measured)._make(part(value, rows) for value in measured)
 
 
 def copied(measured: Any) -> Any:
-    """A named tuple of copies of all arrays, and of those in tuples in it."""
+    """A copy of a named tuple, with copies of all arrays, nested ones included."""
     if hasattr(measured, "_fields"):
         return type(measured)._make(map(copied, measured))
     return array_rows.copied(measured) if np.ndim(measured) else measured
 
 
 def merged(old: Any, new: Any, rows: np.ndarray) -> Any:
-    """A named tuple with `new` in some rows of its arrays (N, ...); `old` stays."""
+    """A copy of `old` with `new` in some rows of its arrays (N, ...)."""
     if old is None or isinstance(old, np.ndarray):
         array = old if old is None else old.copy()
         if array is not None:
@@ -229,7 +229,7 @@ def merged(old: Any, new: Any, rows: np.ndarray) -> Any:
 
 
 def ids(model: mujoco.MjModel, elements: Sequence[Any]) -> np.ndarray:
-    """Numbers (n,) of MJCF elements in a model; ValueError if one is missing."""
+    """Ids (n,) of MJCF elements in a model; ValueError if one is missing."""
     kinds = mujoco.mjtObj.__members__
     found = [
         _id(model, kinds[f"mjOBJ_{each.spec.namespace.upper()}"], each.full_identifier)
@@ -246,7 +246,7 @@ def _id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
 
 
 def sensor(model: mujoco.MjModel, name: str) -> slice:
-    """Place of a sensor in `sensordata`; ValueError if the model has none."""
+    """Slice of a sensor in `sensordata`; ValueError if the model lacks the sensor."""
     index = _id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
     start = int(model.sensor_adr[index])
     return slice(start, start + int(model.sensor_dim[index]))

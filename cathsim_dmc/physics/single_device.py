@@ -20,10 +20,10 @@ from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 
 
 class Steering(NamedTuple):
-    """How motors are turned out of untwisted frames into those of links.
+    """Data to turn motor commands from untwisted frames into those of the links.
 
     Attributes:
-        places: (2 J,), of the hinges among MuJoCo's `qpos`, in the order of the chain.
+        places: (2 J,), indices of the hinges in `qpos`, in the order of the chain.
         bends: `laws.hinges.Bends`, scratch.
     """
 
@@ -32,11 +32,10 @@ class Steering(NamedTuple):
 
 
 class SingleDevice(Effect):
-    """One device, whose own motors move it.
+    """One device, moved by its own motors.
 
     Attributes:
-        slipped: (N, D), way by which the clamp of each of the drives has slipped in the
-            episode, m and rad.
+        slipped: (N, D), slip of the clamp of each drive in the episode, m and rad.
     """
 
     data_fields: tuple[str, ...] = ("act",)
@@ -48,11 +47,11 @@ class SingleDevice(Effect):
         """Takes the entity of the device.
 
         Args:
-            holds: Whether the hinges hold the links that are in the sheath, which then
-                has no bore that does.
+            holds: Whether stiff hinges hold the links in the sheath, instead of contact
+                with its bore.
         """
         self._device, self._holds = chain.device, holds
-        self._behind = BEHIND / float(chain.link_lengths[0])  # links
+        self._behind = BEHIND / float(chain.link_lengths[0])  # lengths of a link
         if self._device.tip_shape:
             self.parameters = Springs
             self.acts_in, self.adapter = "passive", "springs"
@@ -86,7 +85,7 @@ class SingleDevice(Effect):
         self._base = np.array([world.index.insertion_qpos, rotation])
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
-        """Holds the base of one simulation where it stands."""
+        """Holds the base of one simulation in place, and its links in the sheath."""
         self._drives.hold(index)
         if self.parameters is Springs:
             self.world.parameters.rest[index] = self._springs.rest
@@ -99,7 +98,7 @@ class SingleDevice(Effect):
 
     def _find_hinges(self, index: int) -> None:
         fields = held.fields_of(lambda name: self.world.field(index, name))
-        self._hinged[index] = fields  # what lies at their addresses stays
+        self._hinged[index] = fields  # keeps the arrays at these addresses alive
         self._sheathed.places[index] = held.addresses(fields)
 
     def _hold(self, index: int) -> None:
@@ -110,7 +109,7 @@ class SingleDevice(Effect):
         self._soften(slice(index, index + 1))
 
     def _soften(self, rows: slice) -> None:
-        """Writes the springs of a shaped device of which a part is in the sheath."""
+        """Writes the springs of pre-shaped devices that are partly in the sheath."""
         if self.parameters is Springs:
             free, out = self._free[rows, 0, :, 0], self._sheathed.out[rows]
             self.world.parameters.rest[rows] = self._springs.rest * out
@@ -118,7 +117,7 @@ class SingleDevice(Effect):
             self.world.parameters.compliance[rows] = 1 / stiffness
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
-        """Lets clamps slip, turns motors against the twist, and poses the robot."""
+        """Updates the drives, turns motors against the twist, and poses the robot."""
         from cathsim_dmc.physics import adapters  # late, as numba takes long
 
         load = state.push_force[:, None]
@@ -152,11 +151,11 @@ class SingleDevice(Effect):
     def courses(self, line: np.ndarray) -> list[tuple[Device, np.ndarray]]:
         """The devices and their points (N, n, 3) on a line (N, L + 1, 3), m.
 
-        From the innermost outwards, as far behind the base as X-rays meet them.
+        From the innermost outwards; the points begin `BEHIND` behind the base.
         """
         first = line[:, :1] + self._behind * (line[:, :1] - line[:, 1:2])
         return [(self._device, np.concatenate([first, line], axis=1))]
 
     def read(self, readings: Readings) -> CoaxialReadings | None:
-        """State of coaxial devices at some readings; None for one alone."""
+        """State of coaxial devices at some readings; None for a single device."""
         return None

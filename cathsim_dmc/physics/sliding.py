@@ -1,8 +1,8 @@
 """Coaxial devices of N simulations, moved by the actions.
 
-Once in a control step, coaxial devices are moved along and about their axis;
-`chain_fields` then writes the properties of the chain. Where each device is and how it
-is turned lies in MuJoCo's `userdata`, which is part of the state that is saved.
+Once per control step, coaxial devices are moved along and about their axis;
+`chain_fields` then writes the properties of the chain. Insertions and rotations of the
+devices lie in MuJoCo's `userdata`, which is part of the saved state.
 """
 
 from typing import Any, NamedTuple
@@ -36,19 +36,19 @@ from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.physics.single_device import SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
-# Way by which a device slides before the friction in the lumen acts in full, m.
+# Sliding distance over which the friction in the lumen builds up, m.
 _PRESLIDING = 40e-6
-# Way of a slipping clamp in a control step by the force beyond its largest, m/N. The
-# axial force of a stiff wire in a tight bend changes by 0.8 N/mm at most.
+# Slip of a clamp in a control step per force beyond its limit, m/N. The axial force of
+# a stiff wire in a tight bend changes by 0.8 N/mm at most.
 _GIVE = 1e-3
 
 
 class Positions(NamedTuple):
-    """Where K coaxial devices are, part of the state that is saved.
+    """Positions of K coaxial devices, part of the saved state.
 
     Attributes:
-        insertion: (K,), way of each device, m.
-        angles: (K, M + 1), rotations of its nodes, rad.
+        insertion: (K,), commanded insertion of each device, m.
+        angles: (K, M + 1), rotations of the nodes of each device, rad.
     """
 
     insertion: Any = Array("devices")
@@ -59,8 +59,8 @@ class SlidingDevices(SingleDevice):
     """Coaxial devices, each moved along and about its axis by its actions.
 
     Attributes:
-        slipped: (N, 2 K), way by which the clamps of each of the K devices have slipped
-            in the episode, along and about its axis, m and rad.
+        slipped: (N, 2 K), slip of the clamps of each of the K devices in the episode,
+            along and about its axis, m and rad.
     """
 
     data_fields = ("cfrc_int", "act", "qfrc_applied")
@@ -76,7 +76,7 @@ class SlidingDevices(SingleDevice):
         self._entity, self._stack, self._holds = stack, stack.stack, holds
 
     def bind(self, world: World) -> None:
-        """Finds the places in the model."""
+        """Finds the chain in the model and allocates the state of the devices."""
         super().bind(world)
         total, count = world.num_simulations, len(self._entity.devices)
         self.slipped = np.zeros((total, 2 * count))
@@ -103,15 +103,15 @@ class SlidingDevices(SingleDevice):
         # Factors of all stiffnesses, and of all loss factors.
         self._friction, self._factors = np.zeros(total), np.ones((total, 2))
         # Fraction of the friction between devices that acts, positive when the inner
-        # one has slid forward; that friction, and the forces of the drives but for the
-        # push force, which the leading device bears, N.
+        # one has slid forward; that friction, N; and the forces of the drives, N,
+        # without the push force, which the leading device bears.
         self._ways, self._drag = np.zeros((2, total, count - 1))
         self._axial = np.zeros((total, count))
 
     # The course of an episode.
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
-        """Puts the devices of one simulation to the start of the chain."""
+        """Places the devices of one simulation at the start."""
         self._drives.hold(index)
         gaps = self._entity.start_gaps
         self._insertion[index] = self._qpos[index, self._index.insertion_qpos] - gaps
@@ -137,8 +137,8 @@ class SlidingDevices(SingleDevice):
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Moves the devices and writes the properties of the chains.
 
-        The chain is driven to where the device will be that reaches farthest; the
-        others move as they are told. A device that leads is held up with the chain.
+        The chain is driven to the target of the leading device; the others move as
+        commanded. Where the chain is held up, so is the leading device.
 
         Args:
             action: (N, 2 K) in [-1, 1], translation and rotation of each device.
@@ -170,7 +170,10 @@ class SlidingDevices(SingleDevice):
         return command
 
     def _clamped(self, told: np.ndarray, leaders: np.ndarray) -> np.ndarray:
-        """Ways (N, K), m; the leading device's clamp slips in the physics steps."""
+        """Commanded travel (N, K), m, less the slip of the clamps.
+
+        The clamp of the leading device is left out: it slips in the physics steps.
+        """
         excess = np.abs(self._axial) - MAX_PUSH_FORCE
         excess[np.arange(len(excess)), leaders] = -1.0
         if (excess < 0.0).all():
@@ -180,7 +183,7 @@ class SlidingDevices(SingleDevice):
         return np.where(excess < 0.0, told, given)
 
     def _settle(self, rate: np.ndarray, lead: np.ndarray, state: Readings) -> None:
-        """Turns the devices, writes the chains, computes the forces of the drives."""
+        """Turns the devices, writes the chains and finds the forces of the drives."""
         nodes, turned = self._stack.nodes, MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
         gaps = gaps_of(np.ascontiguousarray(self._insertion))
         # The sheath is frictionless.
@@ -190,8 +193,8 @@ class SlidingDevices(SingleDevice):
         count = gaps.shape[1]
         load = np.zeros(len(gaps))
         if count > 1:
-            # What the wall does to the links beyond; forces within are not MuJoCo's
-            # state.
+            # Forces of the wall on all links beyond: MuJoCo's internal forces are not
+            # part of its state.
             beyond = -np.cumsum(outside[:, ::-1], axis=1)[:, ::-1]
             beyond = np.ascontiguousarray(beyond)
             sliding.leading_load(beyond, state.centreline, gaps, nodes, load)
@@ -200,7 +203,7 @@ class SlidingDevices(SingleDevice):
             self._axial[:] = axial.sum(axis=-1)
             self._axial[:, :-1] += self._drag
             self._axial[:, 1:] -= self._drag
-            # The drive of the leading device bears what the chain's does, and these.
+            # The leading device's drive bears the chain's load and these forces.
             leaders = np.argmin(gaps, axis=1)
             self._others[:] = -self._axial[np.arange(len(gaps)), leaders]
 
@@ -215,9 +218,10 @@ class SlidingDevices(SingleDevice):
         """Writes the chains of all simulations, or of one.
 
         Args:
-            gaps: (N, K), as are the others as in `laws.sliding`, with an axis N.
-            laid: Number of the one whose devices have just been laid and are not
-                turned.
+            gaps: (N, K), m; the others are those of `laws.sliding.Loads`, with an axis
+                N.
+            laid: Index of the simulation to write, whose devices are at the start of an
+                episode and are not turned; None for all simulations.
 
         Returns:
             Axial forces (N, K, J) at the joints, N.
@@ -239,7 +243,7 @@ class SlidingDevices(SingleDevice):
 
         def settle(own: slice) -> None:
             tables, live = self._stack.tables, self._live
-            if len(gaps) >= rows.MANY:  # others settle at the same time
+            if len(gaps) >= rows.MANY:  # threads settle at the same time
                 live = live._replace(
                     scratch=stack_memory.settling(tables),
                     chain=stack_memory.chain(tables),
@@ -252,10 +256,13 @@ class SlidingDevices(SingleDevice):
             settle(slice(laid, laid + 1))
         return axial
 
-    # What others may read.
+    # Readings.
 
     def _pushed(self, reached: np.ndarray | None = None) -> np.ndarray:
-        """Insertion (N, K) at which the devices come to rest, m, the chain at (N,)."""
+        """Insertions (N, K) at which the devices come to rest, m.
+
+        `reached` (N,) is that of the chain; None for that of its drive.
+        """
         place = self._drives.resting()[:, 0] if reached is None else reached
         place = np.ascontiguousarray(place)
         told = np.ascontiguousarray(self._insertion)
@@ -264,15 +271,14 @@ class SlidingDevices(SingleDevice):
         return where
 
     def pose_robot(self) -> None:
-        """Poses the robot that holds the outer and the inner device.
+        """Poses the robot, which holds the outermost and the innermost device.
 
-        Of more than two devices it holds the outermost and the innermost; of one, both
-        units work on the same.
+        Both units hold a single device.
         """
         self._pose(self._pushed())
 
     def _pose(self, pushed: np.ndarray) -> None:
-        """Poses the robot where devices come to rest at (N, K), m."""
+        """Poses the robot for devices that come to rest at insertions (N, K), m."""
         reached = self._qpos[:, self._index.insertion_qpos]
         pushed = reached[:, None] - gaps_of(pushed)
         turned = self._angles[..., 0]
@@ -282,7 +288,7 @@ class SlidingDevices(SingleDevice):
     def read(self, readings: Readings) -> CoaxialReadings:
         """State of the devices at readings of the same control step."""
         gaps, nodes = gaps_of(self._pushed()), self._stack.nodes
-        # In motion the chain is behind its command, with all devices in it.
+        # In motion the chain lags its command, and all devices with it.
         insertion, push = readings.insertion[:, None] - gaps, self._axial.copy()
         push[np.arange(len(gaps)), gaps.argmin(axis=1)] += readings.push_force
         line, load = readings.centreline, readings.push_force.copy()
@@ -306,7 +312,7 @@ class SlidingDevices(SingleDevice):
 
 
 def devices_at(entity: DeviceStack) -> sliding.Devices:
-    """What the law of a control step takes of devices and of their drives."""
+    """Devices of an entity and limits of their drives, for `laws.sliding`."""
     stack = entity.stack
     return sliding.Devices(
         tables=stack.tables,
@@ -320,7 +326,7 @@ def devices_at(entity: DeviceStack) -> sliding.Devices:
 
 
 def devices_of(chain: Chain, holds: bool = True) -> SingleDevice:
-    """The effect by which actions move the devices of a chain; see `SingleDevice`."""
+    """Returns the effect that moves the devices of a chain; see `SingleDevice`."""
     if isinstance(chain, DeviceStack):
         return SlidingDevices(chain, holds)
     return SingleDevice(chain, holds)

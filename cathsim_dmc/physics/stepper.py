@@ -1,4 +1,4 @@
-"""The physics steps of a control step, for N simulations and whoever runs them.
+"""The physics steps of a control step, for N simulations of any engine.
 
 `SingleStepper` adapts the simulation that composer steps to `Stepper`,
 `simulation.batch` those of `mujoco.batch`.
@@ -28,18 +28,17 @@ class Stepper(abc.ABC):
     """Steps N simulations of one compiled scene.
 
     Attributes:
-        arrays: Views of the state, with MuJoCo's names and a leading axis N;
-            `readings.ModelIndex.FIELDS` says which are there. `qpos`, `ctrl` and
-            `userdata` are written.
-        warnings: (N, ...) int, how often MuJoCo has warned, a view.
-        before: (N, nstate), states before the physics steps of the last control step,
-            with its control, mjSTATE_INTEGRATION.
-        repeated: (N,) int, control steps done again in shorter physics steps.
-        deepest: Depth of a contact, m, from which a control step is done again; None
-            for `forces.DEEPEST`.
+        arrays: Views of the state, with MuJoCo's names and a leading axis N, among them
+            `readings.ModelIndex.FIELDS`. `qpos`, `ctrl` and `userdata` are written.
+        warnings: (N, ...) int, numbers of MuJoCo's warnings, a view.
+        before: (N, nstate), mjSTATE_INTEGRATION, states before the physics steps of the
+            last control step, with its control.
+        repeated: (N,) int, number of control steps repeated in shorter physics steps.
+        deepest: Contact depth, m, above which a control step is repeated; None for
+            `forces.DEEPEST`.
         num_simulations: N.
         substeps: S, physics steps in a control step.
-        has_snapshots: Whether `kept` and `put_back` work.
+        has_snapshots: Whether `kept` and `put_back` are supported.
     """
 
     arrays: Any
@@ -47,10 +46,10 @@ class Stepper(abc.ABC):
     has_snapshots = False
 
     def __init__(self, model: mujoco.MjModel, num_simulations: int, substeps: int):
-        """Finds the wall, its sensor and what touches it in the compiled scene."""
+        """Finds the wall, its sensor and the links that may touch it in the scene."""
         self.num_simulations, self.substeps = num_simulations, substeps
         self.repeated = np.zeros(num_simulations, np.int64)
-        self._shortened = False  # whether a time step has ever been
+        self._shortened = False  # whether any time step has been shortened
         self.deepest: float | None = None
         self._contacts = readings.sensor(model, "wall_contacts")
         self.before = self._warnings_before = np.empty(0)
@@ -63,7 +62,7 @@ class Stepper(abc.ABC):
         """The model that one simulation runs on."""
 
     def field(self, index: int, name: str) -> np.ndarray:
-        """A field of the model that one simulation has for itself, to be written."""
+        """A field of one simulation's own model, to be written."""
         return getattr(self._model_of(index), name)
 
     @abc.abstractmethod
@@ -85,7 +84,7 @@ class Stepper(abc.ABC):
 
     @abc.abstractmethod
     def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
-        """Does S * parts physics steps, and keeps the contacts of every last part.
+        """Does S * parts physics steps; keeps the contacts of every `parts`-th one.
 
         Returns:
             Rows (K, S * parts, M * 14) of the wall's sensor in all of them.
@@ -93,7 +92,7 @@ class Stepper(abc.ABC):
 
     @abc.abstractmethod
     def _keep_still(self, indices: np.ndarray) -> None:
-        """Keeps the contacts as they stand, without a physics step."""
+        """Keeps the present contacts, without a physics step."""
 
     @abc.abstractmethod
     def _forward(self, indices: np.ndarray) -> None:
@@ -114,11 +113,11 @@ class Stepper(abc.ABC):
         self._warnings_before = self.warnings.copy()
 
     def end(self) -> tuple[forces.WallForce, np.ndarray]:
-        """Ends a control step, done again in shorter steps where it was too coarse.
+        """Ends a control step, repeated in shorter steps where it was too coarse.
 
         Returns:
-            Force on the wall over it, and whether MuJoCo has warned in it, (N,) bool;
-            in shorter steps, too, where it did.
+            Force on the wall over the control step, and whether MuJoCo has warned in
+            it, (N,) bool; where it is repeated, whether in the last repetition.
         """
         warned, (force, depth) = self._warned(), self._forces()
         limit = forces.DEEPEST if self.deepest is None else self.deepest
@@ -134,18 +133,18 @@ class Stepper(abc.ABC):
                 break
             indices = np.flatnonzero(coarse)
             self.repeated[indices] += 1
-            # A warning resets the data, and with them the number of warnings, to one.
+            # A warning resets the data and sets the number of warnings to one.
             self.warnings[indices] = self._warnings_before[indices] = 0
             finer, _ = forces.wall_force(self._refine(indices, parts))
             again.append((indices, finer))
             warned, (force, depth) = self._warned(), self._forces()
-        for indices, finer in again:  # all shorter steps count, not only those kept
+        for indices, finer in again:  # all shorter steps count, not only kept ones
             for whole, each in zip(force, finer, strict=True):
                 whole[indices] = each
         return force, warned
 
     @functools.cached_property
-    def _motion(self) -> deep_links.Motion:  # a batch looks for each of them every time
+    def _motion(self) -> deep_links.Motion:  # a batch looks a field up at each access
         return deep_links.Motion._make(
             getattr(self.arrays, name) for name in deep_links.Motion._fields
         )
@@ -160,7 +159,7 @@ class Stepper(abc.ABC):
         return self.contact_rows[:, -1]
 
     def still(self, indices: np.ndarray) -> forces.WallForce:
-        """Force on the wall where some simulations have not moved yet."""
+        """Force on the wall, where simulations `indices` have not moved yet."""
         self._keep_still(indices)
         force, _ = self._forces()
         force.mean_sum[indices] = force.sum[indices]
@@ -174,7 +173,7 @@ class Stepper(abc.ABC):
             self._change(indices, "timestep", lambda _: self._timestep)
 
     def kept(self, indices: np.ndarray, fields: Sequence[str]) -> dict[str, np.ndarray]:
-        """What some simulations (K,) go on from, arrays (K, ...) by name.
+        """State that some simulations (K,) resume from, arrays (K, ...) by name.
 
         Args:
             fields: Names of fields of the model that differ between simulations.
@@ -191,7 +190,7 @@ class Stepper(abc.ABC):
         return np.stack([self.field(index, name) for index in indices.tolist()])
 
     def put_back(self, indices: np.ndarray, kept: Mapping[str, np.ndarray]) -> None:
-        """Puts some simulations (K,), with their cases loaded, to `kept` arrays."""
+        """Restores simulations (K,) from `kept` arrays; their cases must be loaded."""
         self.restore(indices)
         for name, values in kept.items():
             if name.startswith("field_"):
@@ -204,11 +203,11 @@ class Stepper(abc.ABC):
         self._put_contacts(indices, kept["contacts"])
 
     def _put_contacts(self, indices: np.ndarray, rows: np.ndarray) -> None:
-        """Writes the last of `contact_rows` (K, M * 14) of some simulations."""
+        """Writes the last of `contact_rows`, (K, M * 14), of some simulations."""
         raise NotImplementedError
 
     def forward_unactuated(self, indices: np.ndarray) -> None:
-        """What dm_control does at a reset, when there is no control yet."""
+        """Forward pass with actuators off, as dm_control does at a reset."""
         try:
             self._change(indices, "disableflags", lambda flags: flags | _ACTUATION)
             self._forward(indices)
@@ -218,16 +217,16 @@ class Stepper(abc.ABC):
     def _way(
         self, peak: np.ndarray, depth: np.ndarray, limit: float
     ) -> tuple[np.ndarray, bool]:
-        """Largest way (N,) m of places of the devices in the last physics step.
+        """Largest displacement (N,) m of the devices in the last physics step.
 
         Args:
             peak: (N,), largest force of a contact in the control step, N.
-            depth: (N,), m, of the deepest contact in it.
+            depth: (N,), depth of the deepest contact in it, m.
             limit: Depth above which a control step is too coarse, m.
 
         Returns:
-            The way but along the devices themselves, and whether any of the control
-            steps was too coarse, or may end too deep.
+            The displacement, without its part along the devices, and whether any of the
+            control steps was too coarse, or may end too deep.
         """
         limits, way = (forces.HARDEST, limit, self._timestep), np.empty_like(depth)
         if len(way) < rows.MANY:
@@ -249,10 +248,10 @@ class Stepper(abc.ABC):
     def _depth_at_end(
         self, depth: np.ndarray, way: np.ndarray, warned: np.ndarray, limit: float
     ) -> np.ndarray:
-        """Depth (N,) m of the deepest contact in a control step, and at its end.
+        """Depth (N,) m of the deepest contact in a control step, its end included.
 
-        Contacts are looked for once more where a link may have gone too deep on its
-        way (N,) m of the last physics step.
+        Contacts are computed once more where the displacement `way` (N,) m in the last
+        physics step may have moved a link too deep.
         """
         suspect = (depth + way > limit) & (depth <= limit) & ~warned
         indices = np.flatnonzero(suspect)
@@ -268,7 +267,7 @@ class Stepper(abc.ABC):
         return depth
 
     def _refine(self, indices: np.ndarray, parts: int) -> np.ndarray:
-        """Does the control step of some simulations again, in steps so much shorter."""
+        """Repeats the control step of simulations, in steps `parts` times shorter."""
         self.set_states(indices, self.before[indices])
         self._shortened = True
         try:
@@ -305,7 +304,7 @@ class SingleStepper(Stepper):
         self.warnings = data.warning.number[None]
         self._case: Any = None
         self._sensor = data.sensordata[self._contacts]
-        # Of each physics step; 0 where there is no contact.
+        # Contacts of each physics step; 0 where there is none.
         self._rows = np.zeros((substeps, len(self._sensor)))
         self._substep, self._size = 0, mujoco.mj_stateSize(model, _STATE)
         self._stopped, self._known_warnings = False, b""  # of the control step
@@ -317,7 +316,7 @@ class SingleStepper(Stepper):
         self._known_warnings = self._warnings_before.tobytes()
 
     def keep(self) -> None:
-        """Keeps the contacts of the physics step that has just been done."""
+        """Keeps the contacts of the last physics step."""
         self._rows[self._substep] = self._sensor
         self._substep += 1
 
@@ -330,12 +329,12 @@ class SingleStepper(Stepper):
         return self._model
 
     def load(self, index: int, case: Any) -> None:
-        """Puts an anatomy into the model; the data begin anew."""
+        """Writes a case into the model and resets the data."""
         if case is not self._case:
-            self._case = None  # until it is written whole
+            self._case = None  # until the case is written completely
             case.write(self._model)
             self._case = case
-        # Without what a pass in the last anatomy has left.
+        # Clears the results of a pass in the last anatomy.
         mujoco.mj_resetData(self._model, self._data)
 
     def states(self, indices: np.ndarray | slice = _ALL) -> np.ndarray:
@@ -360,7 +359,7 @@ class SingleStepper(Stepper):
         self._substep = self.substeps
 
     def _advance(self, row: np.ndarray) -> None:
-        """Does a physics step; none after a warning, where a batch stops, too."""
+        """Does a physics step; none after a warning, as in a batch."""
         if not self._stopped:
             mujoco.mj_step(self._model, self._data)
             self._stopped = self.warnings.tobytes() != self._known_warnings

@@ -23,7 +23,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-# Figures of a vessel that lives.
+# Names of the figures of a living vessel.
 INFO = ("heart_phase", "breath_phase", "blood_speed", "indentation", "wall_work")
 
 
@@ -31,12 +31,12 @@ class VesselReadings(NamedTuple):
     """State of the vessels of N simulations at the end of a control step.
 
     Attributes:
-        heart_phase: (N,), 0 to 1, at the heart.
+        heart_phase: (N,), phase of the pulse at the heart, 0 to 1.
         breath_phase: (N,), 0 to 1; 0 is the end of expiration.
         blood_velocity: (N, 3), at the head, m/s, world frame.
-        indentation: (N,), of the wall under the deepest contact, m.
-        wall_work: (N,), ½ Σ f r of the contacts, the work that presses the wall in as
-            far as it is, J.
+        indentation: (N,), indentation of the wall under the deepest contact, m.
+        wall_work: (N,), ½ Σ f r over the contacts with normal force f and depth r, the
+            work of the indentation, J.
     """
 
     heart_phase: np.ndarray
@@ -46,7 +46,7 @@ class VesselReadings(NamedTuple):
     wall_work: np.ndarray
 
     def info(self) -> dict[str, np.ndarray]:
-        """Figures (N,) for `tasks.step.Step.info`, of `INFO`."""
+        """Figures (N,) by the names in `INFO`, for `tasks.step.Step.info`."""
         speed = np.sqrt((self.blood_velocity**2).sum(axis=-1))
         phases = self.heart_phase, self.breath_phase
         values = *phases, speed, self.indentation, self.wall_work
@@ -56,11 +56,11 @@ class VesselReadings(NamedTuple):
 def read(
     effects: Sequence[Effect], time: np.ndarray, state: Readings, rows: np.ndarray
 ) -> VesselReadings | None:
-    """State of the vessels at times (N,), s; None where none of them lives.
+    """State of the vessels at times (N,), s; None if they are not living.
 
     Args:
-        effects: Of the task.
-        rows: (N, M * 14), of the wall's sensor.
+        effects: Effects of the task.
+        rows: (N, M * 14), rows of the wall's sensor.
     """
     if not any(isinstance(effect, Flow) for effect in effects):
         return None
@@ -83,7 +83,7 @@ class VesselOptions:
     Attributes:
         flow: Options of the flow of blood.
         wall: Options of a compliant wall.
-        motion: Options of a vessel that moves.
+        motion: Options of the motion of the vessel.
     """
 
     flow: FlowOptions | None = None
@@ -101,7 +101,7 @@ class VesselOptions:
 
     @classmethod
     def make(cls, value: Any) -> "VesselOptions":
-        """From the name of a preset or a mapping of parts; ValueError if wrong."""
+        """Builds it from a preset's name or a mapping; ValueError if invalid."""
         if isinstance(value, VesselOptions):
             return value
         if isinstance(value, str):
@@ -112,11 +112,11 @@ class VesselOptions:
 
     @property
     def living(self) -> bool:
-        """Whether there is anything to observe of it."""
+        """Whether the vessel has a flow, a compliant wall or a motion."""
         return not self.flow == self.wall == self.motion
 
     def effects(self) -> tuple[StillBlood, list[Effect]]:
-        """The effect of the blood, and those of the wall."""
+        """Returns the effect of the blood, and those of the wall."""
         if not self.living:
             return StillBlood(), []
         moving = None if self.motion is None else Moving(self.motion)
@@ -130,11 +130,11 @@ class VesselOptions:
 
     @property
     def deepest(self) -> float | None:
-        """Depth of a contact that asks for shorter steps, m; None for the usual one."""
+        """Contact depth above which steps are repeated, m; None for the default."""
         return None if self.wall is None else STIFFENING
 
     def check(self, anatomy: Anatomy) -> None:
-        """Raises ValueError if an anatomy cannot do what the options ask for."""
+        """Raises ValueError if an anatomy does not support the options."""
         if self.flow is not None:
             anatomy.circulation.check(anatomy.name, anatomy.tree, anatomy.ends)
         if self.motion is not None:

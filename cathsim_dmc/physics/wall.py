@@ -1,8 +1,8 @@
-"""Compliant wall: contacts as springs of the stiffness of the vessel where they are.
+"""Compliant wall: contacts are springs with the local stiffness of the vessel.
 
-`laws.compliance` has the law. The contact of each link is set once a control step. It
-obeys the rule of `entities.contact`, α(1 + m) < 2; what is stiffer than the
-contact with the rigid wall has that contact's law.
+`laws.compliance` has the law. The contact parameters of each link are set once per
+control step. They obey the rule of `entities.contact`, α(1 + m) < 2. Where the vessel
+is stiffer than the contact with the rigid wall, the law of the rigid wall applies.
 """
 
 import dataclasses
@@ -25,12 +25,12 @@ from cathsim_dmc.physics.flow import Flow
 from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
 from cathsim_dmc.physics.readings import Readings
 
-STIFFENING = 3e-3  # m, indentation from which the wall is as stiff as it gets
+STIFFENING = 3e-3  # m, indentation from which the stiffness is largest
 SOLIMP = (0.7, 0.95, STIFFENING, 0.5, 4)
 RELAXATION = 8e-3  # s, as that of the rigid wall
 RIGID = Law(np.array(CONTACT_SOLREF), np.array(CONTACT_SOLIMP, float), 0.0)
 COMPLIANT = Law(np.zeros(2), np.array(SOLIMP), RELAXATION)
-# The secant of the rigid wall's law under this load, N, is its stiffness.
+# Load, N, at which the secant stiffness of the rigid wall is taken.
 _LOAD = 0.1
 
 _LIMITS = {
@@ -47,10 +47,10 @@ class WallOptions:
     Attributes:
         modulus: Young's modulus, Pa, 1e4 to 1e9: 0.45e6 of an aorta, 0.52e6 of
             silicone.
-        thickness: m, 1e-4 to 5e-3; None for a tenth of the radius of the lumen and
-            0.6 mm at least, an artery's.
-        support: 1 for a vessel held by what surrounds it, 0 for one free to become
-            oval, or between.
+        thickness: m, 1e-4 to 5e-3; None for that of an artery, a tenth of the radius of
+            the lumen and at least 0.6 mm.
+        support: 0 to 1: 1 for a vessel that its surroundings keep round, 0 for one that
+            may become oval.
     """
 
     modulus: Drawn = 0.45e6
@@ -62,7 +62,7 @@ class WallOptions:
 
 
 def rigid_stiffness(weight: np.ndarray) -> np.ndarray:
-    """Secant stiffness (n,) N/m of the rigid wall's contact with such links."""
+    """Secant stiffness (n,) N/m of the rigid wall for inverse weights (n,), 1/kg."""
     depth = np.geomspace(1e-7, 2e-4, 400)
     first, last, width, middle, power = CONTACT_SOLIMP
     share = depth / width
@@ -74,14 +74,14 @@ def rigid_stiffness(weight: np.ndarray) -> np.ndarray:
 
 
 class Wall(Effect):
-    """Sets the contact of each link by the vessel where it is."""
+    """Sets the contact parameters of each link from the vessel around it."""
 
     acts_in, adapter, parameters = "contact", "compliance", Sharing
     model_fields = step_fields = ("geom_solref", "geom_solimp")
     state = ("_radius", "_material")
 
     def __init__(self, options: WallOptions, blood: Flow):
-        """Takes the options of the task, and the blood, which holds the vessels."""
+        """Takes the options of the task, and the blood, which has the radii."""
         self._options, self._blood = options, blood
 
     def bind(self, world: World) -> None:
@@ -90,10 +90,10 @@ class Wall(Effect):
         model, links, count = world.model, world.index.geoms, world.num_simulations
         weight = model.body_invweight0[model.geom_bodyid[links], 0]
         self._links = Links(links, weight, rigid_stiffness(weight))
-        # Of the lumen around each link, 0 where it has never been in one.
+        # Radius of the last lumen around each link, 0 before it has been in one.
         self._radius = np.zeros((count, len(links)))
         self._material = np.ones((count, len(_LIMITS)))
-        # Where the fields of each simulation lie, 0 where there is no episode yet.
+        # Addresses of the fields of each simulation, 0 before its first episode.
         self._fields: list[Any] = [None] * count
         self._places = np.zeros((count, len(self.model_fields)), np.int64)
 
@@ -116,7 +116,7 @@ class Wall(Effect):
         adapters.press(self._places[own], radius, material, self._links, laws)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
-        """Takes the radius of the vessel around each link."""
+        """Writes the contacts for the radius of the vessel around each link."""
         radius = self._blood.radius
         np.copyto(self._radius, radius, where=radius > 0.0)
         rows.each(len(radius), self._write)
@@ -124,6 +124,6 @@ class Wall(Effect):
 
 
 def soften(chain: Chain) -> None:
-    """Lets the contacts of a chain's links decide over those of the wall."""
+    """Gives the contact parameters of a chain's links priority over the wall's."""
     for geom in chain.link_geoms:
         geom.priority = 1

@@ -1,6 +1,6 @@
-"""Looking at a state or an episode in one call, without OpenGL.
+"""Pictures of a state or an episode in one call, without OpenGL.
 
-Everything here takes the environment that `cathsim_dmc.suite.load` returns.
+The functions take the environment that `cathsim_dmc.suite.load` returns.
 `cathsim_dmc` itself offers `show`, `record`, `plot`, `forces` and `fluoroscopy`, so
 that `import cathsim_dmc` is enough in a notebook.
 """
@@ -64,8 +64,8 @@ def show(
         The figure; a notebook draws it, `.savefig(path)` writes it.
 
     Raises:
-        TypeError: it is no environment of this package, or there is no such option.
-        ValueError: the episode was recorded in an anatomy that the environment has not.
+        TypeError: `env` is no environment of this package, or an option does not exist.
+        ValueError: the environment does not have the anatomy of the episode.
         RuntimeError: no episode is given, and none has begun.
     """
     from cathsim_dmc.pictures.figure import scene_figure
@@ -100,7 +100,7 @@ def plot(episode: "Episode") -> "Picture":
 
 
 def fluoroscopy(env: Any, *, seed: int = 0, **options: Any) -> np.ndarray:
-    """The X-ray image of an environment's present state.
+    """Render the X-ray image of an environment's present state.
 
     Args:
         env: What `cathsim_dmc.suite.load` returns, after a reset.
@@ -112,7 +112,7 @@ def fluoroscopy(env: Any, *, seed: int = 0, **options: Any) -> np.ndarray:
         (rows, columns) uint8, dark = opaque.
 
     Raises:
-        TypeError: it is no environment of this package, or there is no such option.
+        TypeError: `env` is no environment of this package, or an option does not exist.
         ValueError: an option's value is not possible.
         RuntimeError: no episode has begun.
     """

@@ -22,14 +22,14 @@ VIEWS = {
     "left": ("from the left", (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), _Y, _Z),
     "below": ("from below", (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), _X, _BELOW),
 }
-# Of vessels: the colours of all figures, then those of matplotlib's maps Dark2, tab10
+# Colours of vessels: those of all figures, then those of matplotlib's maps Dark2, tab10
 # and tab20b that differ most from them and from the wall.
 VESSEL_COLOURS = (*COLOURS, "#66a61e", "#e7298a", "#8c564b", "#9467bd", "#d62728")
 VESSEL_COLOURS += ("#a6761d", "#393b79")
 _COLUMNS = 7  # of the legend
 _GOAL_RADIUS_MM = 8.0  # the published task's
 GOAL_COLOUR, GOAL_LIGHT = "#12805c", "#5fd7ac"
-LETTERING_IN = 1.2  # high: titles, labels of the axes and a caption
+LETTERING_IN = 1.2  # height of titles, axis labels and a caption, inches
 
 
 class Picture(Figure):
@@ -58,7 +58,7 @@ class Picture(Figure):
 def background(
     surface: Any, view: str, size: int, rest: Any = None
 ) -> tuple[ParallelProjection, Glass]:
-    """A vessel as glass, `size` pixels long, in a view of `VIEWS` centred on `rest`."""
+    """Draws a vessel as glass, `size` pixels long, in a view centred on `rest`."""
     _, right, up, *_ = VIEWS[view]
     middle = (rest or surface).vertices
     projection = ParallelProjection.of(middle, right, up, size=size)
@@ -68,7 +68,7 @@ def background(
 def anatomy_figure(anatomy: Anatomy) -> Picture:
     """Draw lumen, centrelines, goals and inlet of an anatomy from three sides.
 
-    Of a scan that is not seen to stand upright the sides are not named.
+    The sides of a scan are not named unless it is known to be upright.
     """
     x, y, z = np.ptp(anatomy.surface.vertices, axis=0)
     heights = np.array([z, z, y])
@@ -81,7 +81,7 @@ def anatomy_figure(anatomy: Anatomy) -> Picture:
     for axes, view in zip(panels, VIEWS, strict=True):
         draw_anatomy(axes, anatomy, view)
     lines = figure.axes[0].get_legend_handles_labels()[0]
-    # It is filled by columns, and read by rows.
+    # matplotlib fills a legend by columns, and it is read by rows.
     rows = [line for column in range(_COLUMNS) for line in lines[column::_COLUMNS]]
     place = {"loc": "outside lower center", "ncols": _COLUMNS}
     figure.legend(handles=rows, fontsize=8, **place)

@@ -21,12 +21,12 @@ from cathsim_dmc.recording.episode import Episode
 
 FRAMES = 90
 _SHORTEST, _LONGEST = 2.0, 12.0  # s of a film, without its last pause
-# The last frame stays for so long before it begins again, ms.
+# Time that the last frame stays before the film begins again, ms.
 _HOLD_MS = 1500
 _TICK_MS = 20  # browsers do not show frames that are shorter
 _DPI, _NARROWEST = 100, 64  # px
-# Width of the scene per height; beside a wider one, as of a scan that lies, the X-ray
-# image would be too small to see.
+# Largest width of the scene per height: beside a wider one, as of a scan that lies, the
+# X-ray image would be too small to see.
 _WIDEST = 1.6
 _MARGIN = 8e-3  # around the vessel, m
 _FORCE_COLOUR = "#b3202c"
@@ -91,7 +91,7 @@ def animate(
 
 
 def _one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
-    """The pictures in 256 colours that all of them share."""
+    """Reduces pictures to 256 colours that all of them share."""
     both = pictures[len(pictures) // 2], pictures[-1]
     sample = np.hstack([np.asarray(picture) for picture in both])
     palette = Image.fromarray(sample).quantize(256, Image.Quantize.MEDIANCUT)
@@ -102,7 +102,7 @@ def _one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
 def _frames(
     episode: Episode, surface: Any, width: int, steps: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """RGB pictures (rows, columns, 3) uint8 of some states of an episode."""
+    """Yields RGB pictures (rows, columns, 3) uint8 of some states of an episode."""
     rough = ParallelProjection.of(surface.vertices, margin=_MARGIN).no_wider(_WIDEST)
     left = rough.shape[1] / rough.shape[0]  # width of the scene per height
     height = width / (left + 0.66)

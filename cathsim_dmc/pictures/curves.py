@@ -21,10 +21,10 @@ _SIZE_IN = 9.0, 7.2
 
 
 def phases(episode: Episode) -> list[tuple[str, int, int]]:
-    """What the base of the device does, in the order of time.
+    """Phases of the motion of the device's base, in order of time.
 
     Args:
-        episode: The episode; of coaxial devices the leading one counts.
+        episode: The episode; with coaxial devices, the phases are of the leading one.
 
     Returns:
         (phase of `PHASES`, first, last) for each phase: the numbers of the states

@@ -25,8 +25,8 @@ from cathsim_dmc.pictures.translucent import Glass, ParallelProjection
 from cathsim_dmc.recording.geometry import force_colours, force_text
 
 DEVICE_COLOUR, DEVICE_LIGHT = "#173a63", "#7fb2e5"
-# Of coaxial devices from the innermost outwards, over and over: a wire, and what a
-# single device has for the catheter around it.
+# Dark and light colour of coaxial devices from the innermost outwards, repeated; the
+# second pair is that of a single device.
 DEVICES = (
     ("#0b6b5a", "#7fe0c8"),
     (DEVICE_COLOUR, DEVICE_LIGHT),
@@ -34,8 +34,8 @@ DEVICES = (
 )
 HEAD_COLOUR = "#ffb000"
 PATH_COLOUR = "#c77f00"
-# An arrow of the largest force is this long, mm; weaker ones are in proportion, down
-# to a length that can be seen.
+# Length of the arrow of the largest force, mm; weaker ones are in proportion, but not
+# shorter than the second.
 ARROW_MM, ARROW_LEAST_MM = 22.0, 5.0
 # Below this, N, a contact is drawn as a dot without an arrow.
 ARROW_LEAST_N = 1e-4
@@ -43,8 +43,8 @@ _PIECES = 6  # of the drawn curve in each link
 # Percentiles of an image that are shown as black and white.
 WINDOW = (0.02, 99.5)
 _HEIGHT_IN = 6.0
-# A scan that lies is wider than high: its figure is no wider than this and less high,
-# apart from titles, axes and caption.
+# Largest width of a figure, inches: that of a scan that lies is lower instead, apart
+# from titles, axes and caption.
 _WIDEST_IN = 16.0
 
 
@@ -64,7 +64,9 @@ def scene_figure(
     """Draw a moment of an episode, without OpenGL.
 
     Args:
-        fluoroscopy: Whether to put the X-ray image beside them.
+        views: Names of views, see `anatomies.VIEWS`.
+        fluoroscopy: Whether to draw the X-ray image beside the views.
+        pixels: Length of the longer side of a view, pixels.
 
     Raises:
         ValueError: if a view does not exist, or there is nothing to draw.
@@ -73,7 +75,7 @@ def scene_figure(
     if unknown or not (views or fluoroscopy):
         raise ValueError(f"views are {views!r}; give some of {', '.join(VIEWS)}")
     moved = moment.surface is not moment.rest
-    draw = background.__wrapped__ if moved else background  # which keeps what it drew
+    draw = background.__wrapped__ if moved else background  # only the latter is cached
     drawn = [draw(moment.surface, v, pixels, moment.rest) for v in views]
     ratios = [p.shape[1] / p.shape[0] for p, _ in drawn] + [1.0] * fluoroscopy
     size = _HEIGHT_IN * 0.84 * sum(ratios) + 1.6, _HEIGHT_IN
@@ -125,7 +127,7 @@ def _draw_device(axes: Any, moment: Moment, projection: ParallelProjection) -> N
     way, last = arc_lengths(joints), len(joints) - 1
     fine = np.interp(np.linspace(0, last, last * _PIECES + 1), np.arange(last + 1), way)
     line = projection.flat_mm(CubicSpline(way, joints)(fine))
-    # Thicker than in truth, by half: as printed it would be two points wide.
+    # Half as thick again as in reality, which would be two points wide in print.
     height = 72.0 * axes.get_position().height * axes.figure.get_figheight()  # points
     width = 3e3 * np.repeat(moment.radius, _PIECES) * height / np.ptp(axes.get_ylim())
     pieces = np.stack([line[:-1], line[1:]], axis=1)
@@ -166,7 +168,7 @@ def _draw_forces(axes: Any, moment: Moment, projection: ParallelProjection) -> N
     )  # fmt: skip
     top = int(magnitude.argmax())
     end = place[top] + (along[top] if strong[top] else 0)
-    # What stands beside the axes hides text on their right.
+    # Text to the right of the axes would be hidden by what is beside them.
     side, shift = ("right", -5) if end[0] > np.mean(axes.get_xlim()) else ("left", 5)
     box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75}
     axes.annotate(

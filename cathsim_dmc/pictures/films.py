@@ -1,4 +1,4 @@
-"""Files of films: their formats, and the encoder of MP4."""
+"""Formats of film files, and the encoder of MP4."""
 
 import contextlib
 import errno
@@ -12,8 +12,8 @@ from cathsim_dmc.files import atomic_path
 
 MP4 = ".mp4"  # needs the extra `video`
 SUFFIXES = (".gif", ".webp", MP4)
-# Constant rate factor of H.264: 0 keeps everything, 23 is the default; letters stay
-# sharp at 20.
+# Constant rate factor of H.264: 0 is lossless, 23 is the default; letters stay sharp at
+# 20.
 _RATE_FACTOR = "20"
 
 
@@ -57,7 +57,7 @@ def write_mp4(path: Path, pictures: Sequence[np.ndarray], tick: int, hold: int) 
 
 
 def _require_whole(path: Path, count: int) -> None:
-    """Raise OSError unless a film has so many pictures; its encoder says nothing."""
+    """Raise OSError unless a film has `count` pictures; the encoder does not check."""
     import imageio_ffmpeg
 
     try:

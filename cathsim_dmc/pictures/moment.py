@@ -22,22 +22,22 @@ class Moment:
     """State of one simulation; lengths in metres, forces in newtons, world frame.
 
     Attributes:
-        surface: Lumen surface with `vertices` (V, 3) and `faces` (F, 3), as it is.
-        rest: The same where nothing moves it, which views are centred on.
+        surface: Lumen surface with `vertices` (V, 3) and `faces` (F, 3), as moved.
+        rest: The surface at rest, on which views are centred.
         device: (L + 1, 3) joints of the device from base to head.
         radius: (L,) radii of its links.
         outermost: (L,) number of the outermost of coaxial devices on each link, 0 for
-            the innermost; None for a device alone.
+            the innermost; None for a single device.
         ends: (K, 3) ends of coaxial devices, from the innermost outwards.
         goal: (3,) centre of the goal.
         goal_radius: Radius of the goal.
         position: (K, 3) contacts with the wall.
         force: (K, 3) force of the device on the wall at each.
         force_scale: Force of the last colour of the scale.
-        path: (P, 3) where the head has been, or (0, 3).
+        path: (P, 3) past places of the head, or (0, 3).
         title: Text above the picture.
-        x_ray: How X-rays show the episode.
-        shadows: The devices as X-rays meet them.
+        x_ray: Fluoroscopy options, machine's deviation and devices of the episode.
+        shadows: X-ray shadows of the devices.
         upright: Whether the sides of the patient are known, see `is_upright`.
     """
 
@@ -127,12 +127,16 @@ class Moment:
 
 
 def _first(shadows: Sequence[Shadow]) -> list[Shadow]:
-    """Shadows of the first of some states."""
+    """Shadows of the first state of a batch."""
     return [dataclasses.replace(each, points=each.points[0]) for each in shadows]
 
 
 def on_screen(options: FluoroscopyOptions, **changes: Any) -> FluoroscopyOptions:
-    """Options of a task as a picture shows them: an arch fills it."""
+    """Options for a picture: one plane without noise, zoomed in on an arch.
+
+    Args:
+        changes: Fields that differ from this.
+    """
     zoom = max(options.magnification, 1.0 if options.centre else 1.3)
     looks = {"size": 400, "noise": False, "biplane": None, "magnification": zoom}
     return dataclasses.replace(options, **(looks | changes))
@@ -142,12 +146,12 @@ _machine = functools.lru_cache(maxsize=8)(Angiograph)  # each holds some megabyt
 
 
 def fluoroscope_of(moment: Moment, options: FluoroscopyOptions) -> Fluoroscope:
-    """The frontal plane of the episode's machine before the vessel at rest."""
+    """The frontal plane of the episode's machine, with the vessel at rest."""
     return _machine(moment.rest, options).planes(moment.x_ray.deviation)[0]
 
 
 def xray(moment: Moment, options: FluoroscopyOptions, seed: int = 0) -> np.ndarray:
-    """The X-ray image (rows, columns) uint8 of a moment; `seed` of its noise."""
+    """Renders the X-ray image (rows, columns) uint8 of a moment; `seed` of noise."""
     state = np.random.RandomState(seed) if options.noise else None
     fluoroscope = fluoroscope_of(moment, options)
     if moment.surface is not moment.rest:

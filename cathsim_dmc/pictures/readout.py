@@ -9,7 +9,7 @@ from cathsim_dmc.physics.forces import PEAK_NOTE
 from cathsim_dmc.recording.recorder import begun_task_of
 
 # Contacts below this, N, are left out: a table in mN would show them as 0.00. A link
-# within 0.1 mm of the wall has a contact that bears nothing.
+# within 0.1 mm of the wall has a contact without force.
 LEAST_FORCE = 5e-6
 
 
@@ -17,9 +17,9 @@ LEAST_FORCE = 5e-6
 class ForceReadout:
     """Contacts and forces at the end of a control step; newtons, world frame (LPS).
 
-    Contacts, `wall_sum` and `wall_max` are those of the last physics step, the means
-    those of all physics steps of the control step; the peaks are the largest of any of
-    them, and depend on their length.
+    Contacts, `wall_sum` and `wall_max` are those of the last physics step. Means are
+    over the physics steps of the control step; peaks are the largest of any physics
+    step, and depend on its length.
 
     Attributes:
         position: (K, 3) places of contact with the wall, m, where the force reaches

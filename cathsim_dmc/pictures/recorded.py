@@ -42,7 +42,7 @@ def record(
             observation to the action.
         path: File to write: `.rrd` (Rerun), `.npz` (arrays), `.gif`, `.webp` or
             `.mp4` (moving picture); None writes none.
-        seed: Seed of the episode; None goes on from the environment's random state.
+        seed: Seed of the episode; None continues the environment's random state.
         max_steps: Number of control steps after which the episode is cut off.
         task_name: Name of the task in the record; that of the environment otherwise.
 
@@ -50,7 +50,7 @@ def record(
         The episode.
 
     Raises:
-        TypeError: the environment or the policy is none.
+        TypeError: `env` is no environment of this package, or `policy` no policy.
         ValueError: the policy's name or the file's kind does not exist, or the policy
             returns no action of the environment.
         OSError: the file's folder does not exist or is read-only.
@@ -66,7 +66,7 @@ def record(
 
 
 def _checked(path: str | os.PathLike[str]) -> Path:
-    """The path, if a file of its kind can be written there."""
+    """Returns the path; raises if no file of its kind can be written there."""
     target = Path(path)
     if target.suffix not in FORMATS:
         raise ValueError(
@@ -81,7 +81,12 @@ def _checked(path: str | os.PathLike[str]) -> Path:
 def as_function(
     policy: AnyPolicy, env: Any, seed: int | None = None
 ) -> Callable[[Any], np.ndarray]:
-    """A policy as a function of the timestep; ValueError or TypeError for others."""
+    """Converts a policy to a function from the time step to the action (A,).
+
+    Raises:
+        ValueError: if a name does not exist.
+        TypeError: if `policy` is no policy.
+    """
     named = isinstance(policy, str)
     if named and policy in policies.POLICIES:
         policy = policies.make_policy(policy, seed or 0)
@@ -108,7 +113,7 @@ def write(
         fluoroscopy: Whether a Rerun file has X-ray images.
 
     Raises:
-        ValueError: it was recorded in an anatomy that the environment has not.
+        ValueError: the environment does not have the anatomy of the episode.
     """
     target = _checked(path)
     if target.suffix == ".npz":
@@ -132,7 +137,10 @@ def write(
 
 
 def surface_of(episode: Episode, env: Any) -> Surface:
-    """The lumen in which an episode was recorded, of an anatomy of the environment."""
+    """Lumen surface of the environment's anatomy in which an episode was recorded.
+
+    ValueError if the environment does not have that anatomy.
+    """
     task, name = navigation_of(env), episode.meta.get("anatomy")
     for anatomy in (task.scene.anatomy, *task.anatomies):
         if name in (anatomy.name, None):
@@ -148,20 +156,20 @@ def surface_of(episode: Episode, env: Any) -> Surface:
 def xray_film(
     episode: Episode, surface: Any, options: FluoroscopyOptions
 ) -> np.ndarray:
-    """X-ray images of all states of an episode, with the contrast of a screen.
+    """X-ray images of all states of an episode, stretched to all grey levels.
 
     Args:
         surface: Lumen surface, `anatomy.surface`.
 
     Returns:
         (T + 1, rows, columns, planes) uint8, the frontal plane first. The darkest and
-        the brightest of each plane's grey levels are black and white. A vessel that
-        moves is drawn anew in every fourth state.
+        the brightest grey level of each plane are black and white. A vessel that moves
+        is updated in every fourth state.
     """
     record, states = VesselRecord.of(episode), episode.steps + 1
     x_ray = XRayRecord.of(episode)
     moved = None if record is None or record.motion is None else record
-    # Few at a time: images of thousands of states take gigabytes while they are drawn.
+    # In small parts: rendering thousands of states at once takes gigabytes.
     span = MESH_EVERY if moved else _TOGETHER
     parts = [slice(first, first + span) for first in range(0, states, span)]
     planes = Angiograph(surface, options).planes(x_ray.deviation)

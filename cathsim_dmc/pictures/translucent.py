@@ -1,7 +1,8 @@
 """A vessel as translucent glass, drawn by numpy: no OpenGL, no window.
 
-Painted one over the other, translucent triangles show their seams: all hits of pixels
-are sorted by depth first. Glass is denser along the line of sight, at the outline.
+All hits of a pixel are sorted by depth, because translucent triangles painted one over
+the other would show their seams. Glass is more opaque at the outline, where the line of
+sight runs along the wall.
 """
 
 from collections.abc import Sequence
@@ -17,10 +18,10 @@ WALL_COLOUR = np.array([0.80, 0.36, 0.33])
 LIGHT = np.array([-0.35, 0.55, 0.76])
 # Opacity of one layer of the wall: seen straight on, and along the surface.
 FACING, GRAZING = 0.08, 0.70
-# Opacity of the nearest wall over a device inside, as a share of that.
+# Opacity of the nearest wall over a device inside, as a share of the wall's opacity.
 GLAZE = 0.45
 _SAMPLES = 2  # samples along each side of a pixel
-_LAYERS = 16  # walls behind each other; further ones are hidden by these
+_LAYERS = 16  # largest number of walls that are drawn in a pixel
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class ParallelProjection:
         return cls(axes[0], axes[1], low, high, size / (high - low).max())
 
     def no_wider(self, ratio: float) -> "ParallelProjection":
-        """The view with room above and below if it is wider than `ratio` heights."""
+        """Adds room above and below if the view is wider than `ratio` heights."""
         width, height = self.high - self.low
         room = np.array([0.0, max(width / ratio - height, 0.0) / 2])
         return replace(self, low=self.low - room, high=self.high + room)

@@ -1,7 +1,7 @@
 """Many simulations of one navigation task on a thread pool.
 
-Bit-identical to as many composer environments with the same seeds and actions: the
-same compiled model, the same `mj_step`, the same `Rollout`.
+Bit-identical to N composer environments with the same seeds and actions: the same
+compiled model, the same `mj_step`, the same `Rollout`.
 """
 
 import copy
@@ -26,8 +26,8 @@ from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.tasks.step import Step
 
-# What composer calls on a task; the batch steps the rollout instead, so a task that
-# overrides one of these would mean something else here.
+# Hooks that composer calls on a task. The batch steps the rollout instead, so it
+# refuses a task that overrides one of these.
 _HOOKS = (
     "initialize_episode_mjcf", "initialize_episode", "before_step", "before_substep",
     "after_substep", "after_step", "get_reward", "get_discount",
@@ -49,8 +49,8 @@ if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
 class BatchSimulation:
     """N simulations of one task.
 
-    A simulation that has ended must be reset before the next step; stepping it on is
-    allowed and goes on with the state as it is.
+    A simulation whose episode has ended is to be reset before the next step. Without a
+    reset, `step` continues from its present state.
 
     Attributes:
         task: The task that all simulations run.
@@ -73,13 +73,14 @@ class BatchSimulation:
         """Compiles the task's model and starts the threads.
 
         Args:
-            task: Task that no environment owns; the batch takes it over.
+            task: Task that belongs to no environment; from now on it is the batch's.
             num_simulations: N.
             num_threads: Number of worker threads, 0 for one per core.
-            seeds: Seeds of the simulations, or of the first, the others counting up.
+            seeds: Seeds of the simulations, or of the first; the others count up.
 
         Raises:
-            ValueError: if the task overrides what composer calls, or a number is wrong.
+            ValueError: if the task overrides a hook of composer, or a number is not
+                allowed.
         """
         num_simulations = bounds.whole(
             "num_simulations", num_simulations, 1, bounds.MOST_SIMULATIONS
@@ -104,7 +105,7 @@ class BatchSimulation:
         kind = _PoolStepper if self.task.num_anatomies > 1 else _BatchStepper
         task, model = self.task, self._model
         if rehearsal.is_due(task.config):
-            # Arrays of several simulations are not of the type of those of one.
+            # Two stand for all: arrays of one simulation have another numba type.
             own = copy.copy(model)
             stepper = kind(task, own, min(num_simulations, 2), 1)
             rollout = task.make_rollout(own, stepper)
@@ -113,17 +114,17 @@ class BatchSimulation:
 
     @property
     def batch(self) -> mujoco_batch.Batch:
-        """The simulations; `expand` gives model fields of their own to each."""
+        """MuJoCo's batch; `expand` gives each simulation its own model fields."""
         return self.stepper.batch
 
     def seed(self, seeds: Sequence[int] | int) -> None:
         """Gives each simulation its own source of randomness.
 
         Args:
-            seeds: Seeds of the simulations, or of the first, the others counting up.
+            seeds: Seeds of the simulations, or of the first; the others count up.
 
         Raises:
-            ValueError: if a seed is none that `numpy.random.RandomState` takes.
+            ValueError: if `numpy.random.RandomState` does not take one of the seeds.
         """
         seeds = bounds.seeds("seeds", seeds, self.num_simulations)
         self._random_states = [np.random.RandomState(seed) for seed in seeds]
@@ -140,10 +141,10 @@ class BatchSimulation:
             indices: (K,) numbers of the simulations to reset, K > 0; None for all.
 
         Returns:
-            All simulations as they stand.
+            State of all simulations.
 
         Raises:
-            ValueError: if the indices are no such numbers.
+            ValueError: if an index is not the number of a simulation.
             RuntimeError: if the process has forked.
         """
         self._refuse_fork()
@@ -160,11 +161,14 @@ class BatchSimulation:
         """Advances every simulation by one control step.
 
         Args:
-            action: (N, A) in [-1, 1]; what lies outside is clipped.
+            action: (N, A) in [-1, 1]; entries outside are clipped.
+
+        Returns:
+            State of all simulations.
 
         Raises:
             ValueError: if the action has the wrong shape or is not finite, or the
-                objective's outcome is none.
+                objective returns no valid outcome.
             RuntimeError: if a simulation has not been reset, an error has interrupted
                 its last step, or the process has forked.
         """
@@ -181,14 +185,14 @@ class BatchSimulation:
         return _own(step)
 
     def snapshot(self, indices: np.ndarray | None = None) -> Snapshot:
-        """The state between two steps, from which episodes go on bit for bit.
+        """Returns the state between two steps; episodes continue from it bit for bit.
 
         Args:
             indices: (K,) numbers of the simulations, K > 0, in ascending order; None
                 for all.
 
         Raises:
-            ValueError: if the indices are no such numbers.
+            ValueError: if the indices are not such numbers.
             RuntimeError: if one of them has not been reset, or an error has interrupted
                 its last step.
             NotImplementedError: if these simulations have no snapshots.
@@ -198,19 +202,19 @@ class BatchSimulation:
         return self.rollout.snapshot(indices)
 
     def restore(self, snapshot: Snapshot, indices: np.ndarray | None = None) -> Step:
-        """Puts simulations to a snapshot, in place of a reset.
+        """Restores a snapshot; replaces a reset.
 
         Args:
-            snapshot: Of K simulations of the same task, batched or composer's, perhaps
-                of another process.
+            snapshot: Snapshot of K simulations of the same task; it may come from a
+                composer environment or another process.
             indices: (K,) numbers of the simulations, in ascending order; None for all.
 
         Returns:
-            All simulations as they stand.
+            State of all simulations.
 
         Raises:
             ValueError: if the snapshot is of another task, or of another number of
-                simulations, or the indices are no such numbers.
+                simulations, or the indices are not such numbers.
             RuntimeError: if the process has forked.
             NotImplementedError: if these simulations have no snapshots.
         """
@@ -241,7 +245,7 @@ class BatchSimulation:
             )
 
     def close(self) -> None:
-        """Lets the memory of a GPU go, where one simulates."""
+        """Frees GPU memory; does nothing on the CPU."""
 
     def contacts(self) -> forces.Contacts:
         """Contacts with the wall in the last physics step, arrays (N, K, ...)."""
@@ -269,7 +273,7 @@ class _BatchStepper(Stepper):
         self._copy, self._own_fields = copy.copy(model), set[str]()
 
     def reset(self, indices: np.ndarray) -> None:
-        # Without a pass at the default pose, whose solution would warm-start ours.
+        # No forward pass at the default pose: its solution would be a warm start.
         self.batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
 
     def run(self) -> None:
@@ -328,10 +332,10 @@ class _BatchStepper(Stepper):
 
 
 class _PoolStepper(_BatchStepper):
-    """Simulations each in the anatomy that it has drawn.
+    """Simulations on a thread pool, each in the anatomy that it has drawn.
 
-    Where episodes write into a model each simulation has its own; those that have
-    drawn one anatomy share one otherwise.
+    If effects write model fields, each simulation has its own model. Otherwise
+    simulations in the same anatomy share a model.
     """
 
     def __init__(self, task: Navigation, *arguments):
@@ -349,7 +353,7 @@ class _PoolStepper(_BatchStepper):
     def load(self, index: int, case: Case) -> None:
         if self._own:
             if self._loaded.get(index) is not case:
-                self._loaded.pop(index, None)  # until it is written whole
+                self._loaded.pop(index, None)  # until the write is complete
                 case.write(self._models[index])
                 self._loaded[index] = case
             return
@@ -369,9 +373,9 @@ class _PoolStepper(_BatchStepper):
 
 
 def _own(step: Step) -> Step:
-    """Observations as the caller's own, as composer's buffers make them.
+    """Copies observations, readings and forces, so that the caller may change them.
 
-    So are the readings and forces, which the next control step goes on from.
+    composer's buffers copy observations too; the next control step uses the readings.
     """
     copies = {key: rows.copied(value) for key, value in step.observation.items()}
     state = readings.copied(step.readings), readings.copied(step.wall_force)

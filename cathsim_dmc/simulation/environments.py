@@ -26,14 +26,14 @@ def make_env(
     task_kwargs: Mapping[str, Any] | None = None,
     device: str = "cpu",
 ) -> envs.EnvBase:
-    """A seeded environment of batch size [num_envs] whose observations are standard.
+    """Makes a seeded environment of batch size [num_envs] with standard observations.
 
     Args:
         num_envs: Number of simulations; simulation i draws from seed + i.
         num_threads: Number of threads of the batched simulation, None for one per
             core.
         seed: Seed of each simulation, or of the first.
-        device: Of the simulation, see `torchrl.BatchedEnv`.
+        device: Device of the simulation, see `torchrl.BatchedEnv`.
 
     Returns:
         An environment with "observation_vector" (num_envs, n) float32 and/or
@@ -52,9 +52,9 @@ def make_env(
 
 
 def record_errors(env: envs.EnvBase, folder: str | Path) -> None:
-    """Has the simulations of an environment write physics errors to a folder.
+    """Makes the simulations of an environment write physics errors to a folder.
 
-    Environments of other packages write none.
+    It does nothing for environments of other packages.
     """
     base = getattr(env, "base_env", env)
     if hasattr(base, "record_errors"):
@@ -64,12 +64,16 @@ def record_errors(env: envs.EnvBase, folder: str | Path) -> None:
 def standard(
     entries: Mapping[str, torch.Tensor], batch_dims: int
 ) -> dict[str, torch.Tensor]:
-    """An observation as networks read it, with VECTOR and/or PIXELS.
+    """Converts an observation to inputs of a network, VECTOR and/or PIXELS.
 
     Args:
         entries: Entries by name, in any order: numbers (*batch, ...) are flattened,
-            images (*batch, h, w, c) uint8 get their channels first. Either are joined
-            in the order of their names.
+            images (*batch, h, w, c) uint8 get their channels first. Both are
+            concatenated in the order of their names.
+        batch_dims: Number of batch axes.
+
+    Raises:
+        ValueError: if images differ in size.
     """
     named = [entries[name] for name in sorted(entries)]
     images = [one.movedim(-1, -3) for one in named if one.dtype == torch.uint8]
@@ -94,7 +98,7 @@ def standard(
 
 
 class StandardObservation(envs.Transform):
-    """Replaces entries of the observation of an environment as `standard` does."""
+    """Replaces the entries of an environment's observation by those of `standard`."""
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         entries = {key: next_tensordict.get(key) for key in self.in_keys}
@@ -121,10 +125,10 @@ class StandardObservation(envs.Transform):
 
 
 def standard_observations(env: envs.EnvBase) -> envs.TransformedEnv:
-    """An environment whose observation is VECTOR and/or PIXELS, see `standard`.
+    """Wraps an environment so that it observes VECTOR and/or PIXELS, see `standard`.
 
-    Nested entries (forces and other information) are no part of the observation and
-    stay as they are; double precision becomes single.
+    Nested entries (forces and other information) are not part of the observation and do
+    not change; double precision becomes single.
     """
     spec, batch = env.observation_spec, len(env.batch_size)
     keys = [name for name, leaf in spec.items() if not isinstance(leaf, Composite)]

@@ -1,4 +1,4 @@
-"""The loop of an episode: demonstrations, recordings and measurements play with it."""
+"""The loop of an episode, for demonstrations, recordings and measurements."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -16,9 +16,9 @@ class Turn(NamedTuple):
 
     Attributes:
         action: Actions (N, A); None at the start.
-        state: State after it.
-        running: (N,) bool, the simulations whose first episode has this step. Entries
-            that are cleared end an episode early.
+        state: State after the step.
+        running: (N,) bool, the simulations whose first episode has this step. The
+            caller clears an entry to end that episode early.
     """
 
     action: np.ndarray | None

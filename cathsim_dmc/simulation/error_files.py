@@ -1,6 +1,6 @@
 """Files of physics errors: the state before the control step, its action, the task.
 
-`cathsim replay-error FILE` does the control step again.
+`cathsim replay-error FILE` repeats the control step.
 """
 
 import contextlib
@@ -38,14 +38,15 @@ class PhysicsError:
     """A control step in which the physics failed.
 
     Attributes:
-        reason: What went wrong, of `tasks.physics_errors`.
+        reason: Physics error, one of `tasks.physics_errors`.
         task: Name of the task.
-        options: Of the task, JSON-able.
-        whole: Whether the options make the task again; objects among them, such as
-            effects, are kept as texts only.
-        snapshot: State of the simulation before the step. Its source of randomness is
-            that after it: images and tracking alone draw in a step.
-        action: (A,) in [-1, 1], of the step.
+        options: Options of the task, JSON-able.
+        whole: Whether the options suffice to make the task; objects among them, such as
+            effects, are kept only as texts.
+        snapshot: State of the simulation before the step, except for the source of
+            randomness, which is that after the step: only images and tracking noise
+            draw from it in a step.
+        action: (A,) in [-1, 1], action of the step.
     """
 
     reason: str
@@ -74,7 +75,7 @@ class PhysicsError:
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: if the file is damaged or something else.
+            ValueError: if the file is damaged or holds no physics error.
         """
         meta, arrays = read_arrays(path, _KIND)
         with files.refused(
@@ -86,16 +87,17 @@ class PhysicsError:
             return cls(meta["reason"], name, options, meta["whole"], snapshot, action)
 
     def replay(self, num_threads: int = 1) -> Step:
-        """Does the control step again, in a new simulation of the task.
+        """Repeats the control step in a new simulation of the task.
 
         Args:
             num_threads: Number of threads of the simulation.
 
         Returns:
-            State of the one simulation after it; its `errors` say what went wrong.
+            State of the simulation after the step; `errors` has the physics error.
 
         Raises:
-            ValueError: if the task cannot be made again, or is another one now.
+            ValueError: if the options do not suffice to make the task, or the task has
+                changed.
         """
         if not self.whole:
             raise ValueError(
@@ -113,7 +115,7 @@ class ErrorFiles:
     """Writes the first physics error of each episode of N simulations to a folder.
 
     Attributes:
-        folder: Of the files, the last `KEPT`; made with the first one.
+        folder: Folder of the last `KEPT` files; made with the first file.
     """
 
     def __init__(
@@ -122,7 +124,7 @@ class ErrorFiles:
         task: str,
         options: Mapping[str, Any] | None = None,
     ):
-        """Takes the name and options of the task, which make it again."""
+        """Takes the task's name and options, from which a replay makes it."""
         self.folder, self._task = Path(folder), task
         self._options, objects = bounds.as_json(options or {})
         self._options |= json.loads(json.dumps(objects, default=repr))
@@ -135,13 +137,13 @@ class ErrorFiles:
     def after(
         self, before: Snapshot, action: np.ndarray, step: Step, rollout: Rollout
     ) -> None:
-        """Writes what has failed in the control step; a full disk is logged.
+        """Writes the episodes' first errors in the control step; logs an OSError.
 
         Args:
-            before: Of `before`.
-            action: (N, A) of the step.
-            step: State after it.
-            rollout: Of the simulations.
+            before: Snapshot of `before`.
+            action: (N, A), actions of the step.
+            step: State after the step.
+            rollout: Rollout of the simulations.
         """
         old = before.arrays["rollout._errors"].tolist()
         pairs = enumerate(zip(step.errors, old, strict=True))

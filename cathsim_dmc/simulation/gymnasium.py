@@ -22,7 +22,7 @@ VERSION = 0  # of the ids
 
 
 def space(spec: specs.Array, dtype: np.dtype) -> gymnasium.spaces.Box:
-    """Box of an array; numbers as `dtype`, pictures as they are."""
+    """Box of an array; numbers as `dtype`, images as uint8."""
     if spec.dtype == np.uint8:
         return gymnasium.spaces.Box(0, 255, spec.shape, np.uint8)
     if isinstance(spec, specs.BoundedArray):
@@ -71,9 +71,8 @@ class CathSimEnv(gymnasium.Env):
     """One simulation of a task.
 
     `reset(seed=s)` starts the same episode as the suite's `random=s`. The observation
-    is a dictionary, whatever it holds. `terminated` is success, with
-    `info["physics_error"]` an error of physics, or `give_up`; `truncated` is the end
-    of the time.
+    is always a dictionary. `terminated` is success, a physics error
+    (`info["physics_error"]`) or `give_up`; `truncated` is the time limit.
 
     Attributes:
         environment: The composer environment.
@@ -95,11 +94,11 @@ class CathSimEnv(gymnasium.Env):
 
         Args:
             render_mode: "rgb_array" renders fluoroscopy, which needs no OpenGL.
-            dtype: of the numbers observed and of the action, float32 or float64.
+            dtype: type of the observed numbers and of the action, float32 or float64.
             **task_kwargs: options of the task, such as `observation`.
         """
         self.render_mode = _render_mode(render_mode)
-        if "frameskip" in task_kwargs:  # TorchRL goes on without it
+        if "frameskip" in task_kwargs:  # TorchRL catches this and repeats frames itself
             raise TypeError("unexpected keyword argument 'frameskip'")
         self._dtype = _float_type(dtype)
         self.environment = suite.load(suite.DOMAIN, task, task_kwargs)
@@ -110,7 +109,7 @@ class CathSimEnv(gymnasium.Env):
         self._closed = False
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Starts an episode; see `gymnasium.Env.reset`. `options` has no meaning."""
+        """Starts an episode; see `gymnasium.Env.reset`. `options` is ignored."""
         _require_open(self._closed)
         super().reset(seed=seed)
         if seed is not None:
@@ -138,10 +137,10 @@ class CathSimEnv(gymnasium.Env):
         return self.environment.snapshot()
 
     def restore(self, snapshot: Snapshot):
-        """Puts the environment to a snapshot of one simulation of its task.
+        """Restores a snapshot of one simulation of the environment's task.
 
         Returns:
-            Observation and figures, as `reset` does.
+            Observation and info, as `reset` does.
 
         Raises:
             ValueError: if the snapshot is of another task, or of several simulations.
@@ -173,8 +172,8 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
     """N simulations of a task in one batch.
 
     Simulation i gives what `CathSimEnv` gives for its seed and actions, bit for bit.
-    Episodes that have ended begin anew as `autoreset_mode` says; infos are arrays
-    (N, ...) with a mask "_name" (N,) each, as those of Gymnasium's `SyncVectorEnv`.
+    `autoreset_mode` decides when an ended episode is reset. Infos are arrays (N, ...)
+    with a mask "_name" (N,) each, as those of Gymnasium's `SyncVectorEnv`.
 
     Attributes:
         autoreset_mode: When the next episode begins.
@@ -196,7 +195,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         Args:
             num_envs: N.
             render_mode: "rgb_array" renders fluoroscopy of each, without OpenGL.
-            dtype: Of the numbers observed and of the action, float32 or float64.
+            dtype: Type of the observed numbers and of the action, float32 or float64.
             num_threads: Number of worker threads, 0 for one per core.
             autoreset_mode: "NextStep" as Gymnasium's wrappers of observations expect,
                 "SameStep", or "Disabled", where `reset(options={"reset_mask": mask})`
@@ -241,9 +240,9 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             seed: Seed of the first simulation, from which the others count up, or one
-                seed, or None, for each; None goes on from their random states.
-            options: {"reset_mask": mask} resets simulations where the mask (N,) bool
-                is true; the others stay.
+                seed, or None, for each; None keeps their random states.
+            options: {"reset_mask": mask} resets only the simulations where the mask
+                (N,) bool is true.
         """
         _require_open(self.closed)
         mask = _reset_mask(options, self.num_envs)
@@ -260,9 +259,9 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
     def step(self, actions: np.ndarray):
         """Advances all by one control step; see `gymnasium.vector.VectorEnv.step`.
 
-        The last observation and the figures of an episode that has ended are in
-        "final_obs" (N objects) and "final_info" of infos, where the next one begins in
-        the same step ("SameStep").
+        In the mode "SameStep", the next episode begins in the step in which one ends;
+        the last observation and info of the ended one are in "final_obs" (N objects)
+        and "final_info" of the infos.
         """
         _require_open(self.closed)
         waiting = self._ended
@@ -271,7 +270,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
                 f"the episodes of {np.flatnonzero(waiting).tolist()} have ended; call "
                 'reset(options={"reset_mask": mask})'
             )
-        # Those that wait for their next episode are stepped too, and draw nothing.
+        # Simulations that wait for a reset are stepped too; their random states stay.
         states = self.simulation.random_states
         kept = {i: states[i].get_state() for i in np.flatnonzero(waiting)}
         step = self.simulation.step(actions)
@@ -296,9 +295,9 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         return self.simulation.snapshot()
 
     def restore(self, snapshot: Snapshot):
-        """Puts all simulations to a snapshot of as many.
+        """Restores a snapshot of N simulations.
 
-        Episodes that had ended wait for their reset, as `autoreset_mode` says.
+        Episodes that had ended wait for their reset, see `autoreset_mode`.
 
         Returns:
             Observations and infos, as `reset` does.
@@ -343,7 +342,7 @@ def _seeds(seed: Any, count: int) -> Sequence[int | None]:
 
 
 def _reset_mask(options: Mapping[str, Any] | None, count: int) -> np.ndarray:
-    """The simulations (count,) bool that "reset_mask" names, all without it."""
+    """Mask (count,) bool of the option "reset_mask"; all true without it."""
     mask = (options or {}).get("reset_mask")
     if mask is None:
         return np.ones(count, bool)
@@ -368,7 +367,7 @@ def _final(
     info: Mapping[str, np.ndarray],
     mask: np.ndarray,
 ) -> dict[str, Any]:
-    """The ends of episodes as Gymnasium puts them into infos."""
+    """Entries of infos for ended episodes, in Gymnasium's format."""
     last = np.full(len(mask), None, dtype=object)
     for i in np.flatnonzero(mask):
         last[i] = {name: value[i] for name, value in observation.items()}
@@ -382,7 +381,7 @@ def _final(
 
 
 def env_spec(task: str, **options: Any) -> EnvSpec:
-    """Spec that makes an environment again, without wrappers."""
+    """Spec from which Gymnasium makes the environment, without wrappers."""
     return EnvSpec(
         id=f"{suite.DOMAIN}/{task}-v{VERSION}",
         entry_point=f"{__name__}:{CathSimEnv.__name__}",

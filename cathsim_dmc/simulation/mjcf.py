@@ -1,7 +1,7 @@
 """A task as files: the scene as MJCF, and what another program needs to run it.
 
-MuJoCo's viewer, its WebAssembly build and other engines read the scene; the page in
-the browser is one of them.
+MuJoCo's viewer, its WebAssembly build (as on the page in the browser) and other engines
+read the scene.
 """
 
 import itertools
@@ -40,15 +40,15 @@ def write_mjcf(
 ) -> Path:
     """Write the scene of a task and the start of one of its episodes.
 
-    `scene.xml` is a file of plain MuJoCo: convex pieces stand for the wall, and boxes
-    for the bore of the sheath, whose fields only this package knows. Stepped with the
-    same actions it moves nearly as the task does. The keyframe "start" is the start of
-    the episode. `task.json` says the rest, see `describe`.
+    `scene.xml` is a file of plain MuJoCo: convex pieces replace the wall, and boxes the
+    bore of the sheath, whose fields only this package can read. With the same actions
+    it moves nearly as the task does. The keyframe "start" is the start of the episode.
+    `task.json` has the rest, see `describe`.
 
-    Devices that slide in each other are one chain whose fields change in every control
-    step; the file has those of the start, and so their combined chain. A wall that
-    yields or moves is rigid in the file, at rest, and its blood stands still; delays of
-    the action and effects of one's own are left out.
+    Coaxial devices are one chain whose model fields change in every control step; the
+    file has the fields at the start. A compliant or moving wall is rigid and at rest in
+    the file, and its blood does not flow; delays of the action and a user's own effects
+    are left out.
 
     Args:
         directory: Directory to write, which must not exist.
@@ -72,7 +72,7 @@ def write_mjcf(
     options = bounds.options("task_kwargs", task_kwargs)
     options["random"] = bounds.seed("seed", seed)
     if options.get("sheath_clearance") is None:
-        # A bare `mj_step` does not write the hinges that hold a device in the sheath.
+        # A bare `mj_step` does not update the hinges that hold a device in the sheath.
         options["sheath_clearance"] = CLEARANCE
     env = suite.load(suite.DOMAIN, task, options)
     if env.task.num_anatomies > 1:
@@ -93,10 +93,10 @@ def write_mjcf(
 
 
 def describe(env: Any) -> dict[str, Any]:
-    """What a program needs to run a task as the suite does; JSON-able, SI units.
+    """Describes a task for a program that runs it as the suite does, in SI units.
 
     Args:
-        env: What `suite.load` returns, at the start of an episode.
+        env: Environment of `suite.load`, at the start of an episode.
 
     Returns:
         "qpos" (the start, at rest), "control_timestep" and "substeps" (`mj_step` with
@@ -146,7 +146,7 @@ def describe(env: Any) -> dict[str, Any]:
 
 
 def _at_its_start(path: Path, physics: Any, chain: str) -> None:
-    """Writes the fields of a chain as they stand, and the state as a keyframe.
+    """Writes the present model fields of a chain, and the state as a keyframe.
 
     Args:
         chain: Prefix of the names of its elements.
@@ -184,10 +184,10 @@ def _at_its_start(path: Path, physics: Any, chain: str) -> None:
 
 
 def _in_one_file(path: Path, scene: Scene, wall: str) -> None:
-    """Writes meshes and convex walls into the scene, drops what older versions refuse.
+    """Writes meshes and convex walls into the scene; drops classes of textures.
 
-    MuJoCo up to 3.14 refuses a defaults class of textures. Nothing is lost: PyMJCF
-    names a class in every element, and has none of textures.
+    MuJoCo up to 3.14 refuses a defaults class of textures. PyMJCF names a class in
+    every element but defines none for textures, so nothing is lost.
     """
     tree = etree.parse(str(path))
     for texture in tree.iter("texture"):
@@ -223,7 +223,7 @@ def _in_one_file(path: Path, scene: Scene, wall: str) -> None:
 
 
 def _text(values: np.ndarray, digits: int = 9) -> str:
-    """Numbers as text; nine digits tell every float32, 17 every float64."""
+    """Numbers as text; nine digits are exact for float32, 17 for float64."""
     return " ".join(f"{x:.{digits}g}" for x in np.ravel(values).tolist())
 
 

@@ -48,7 +48,7 @@ class BatchedEnv(EnvBase):
         Args:
             num_envs: N.
             num_threads: Number of threads of the simulation, None for one per core.
-            seed: Seed of each simulation, or of the first, the others counting up.
+            seed: Seed of each simulation, or of the first; the others count up.
             observation: Name or names of observations.
             task_kwargs: Other options of the task.
             device: "cpu"; "cuda" or "cuda:1" for MuJoCo Warp on a GPU, where the
@@ -57,7 +57,7 @@ class BatchedEnv(EnvBase):
 
         Raises:
             ImportError: if the device needs an extra that is not installed.
-            NotImplementedError: if the task has what is not simulated on the device.
+            NotImplementedError: if the device does not support an option of the task.
             ValueError: an option is not allowed.
         """
         options = bounds.options("task_kwargs", task_kwargs)
@@ -100,10 +100,10 @@ class BatchedEnv(EnvBase):
         return self.simulation.snapshot(indices)
 
     def restore(self, snapshot: Snapshot) -> TensorDictBase:
-        """Puts all simulations to a snapshot of as many; returns what `reset` does.
+        """Restores a snapshot of N simulations; returns what `reset` does.
 
-        Where the environment is within transforms, `env.reset(snapshot=snapshot)` puts
-        it there and they see it.
+        With transforms, call `reset(snapshot=snapshot)` of the transformed environment,
+        so that they process the observation.
 
         Raises:
             ValueError: if the snapshot is of another task or number of simulations.
@@ -111,7 +111,7 @@ class BatchedEnv(EnvBase):
         return self.reset(snapshot=snapshot)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Lets the memory of a GPU go."""
+        """Closes the environment and frees GPU memory."""
         self.simulation.close()
         super().close(raise_if_closed=raise_if_closed)
 
@@ -136,7 +136,7 @@ class BatchedEnv(EnvBase):
         chosen = None
         if tensordict is not None and "_reset" in tensordict.keys():
             mask = tensordict["_reset"].reshape(self.batch_size).cpu().numpy()
-            if not mask.any():  # TorchRL keeps what it has of all
+            if not mask.any():  # TorchRL then keeps its present entries of all
                 return self.observation_spec.zero()
             chosen = np.flatnonzero(mask)
         return self._tensors(self.simulation.reset(chosen))
@@ -160,7 +160,7 @@ class BatchedEnv(EnvBase):
         return TensorDict(entries, **here)
 
     def _columns(self, info: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
-        """Figures as (N, 1); the numbers go to the device together."""
+        """Figures as tensors (N, 1); numbers go to the device in one transfer."""
         numbers = [key for key, value in info.items() if value.dtype != np.bool_]
         together = self._tensor(np.stack([info[key] for key in numbers]))
         found = dict(zip(numbers, together.unbind(), strict=True))
@@ -170,7 +170,7 @@ class BatchedEnv(EnvBase):
         }
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
-        """On the device; numbers as float32."""
+        """Tensor on the device; numbers become float32."""
         if values.dtype not in (np.uint8, np.bool_):
             values = rows.copied(values, np.float32)
         return torch.as_tensor(values).to(self.device)
@@ -180,7 +180,7 @@ class BatchedEnv(EnvBase):
 
     @property
     def action_groups(self) -> tuple[int, ...]:
-        """Number of the group of each action: motors that bend about one axis."""
+        """Group number of each action; the tip motors of one bending axis share one."""
         return self.simulation.task.scene.catheter.action_groups
 
 
@@ -196,7 +196,7 @@ def _spec(spec: specs.Array, batch: torch.Size) -> TensorSpec:
 def _simulation(
     task: Navigation, num_envs: int, device: str, **options: Any
 ) -> BatchSimulation:
-    """Simulations on a device."""
+    """Makes the simulations on a device."""
     if device == "cpu":
         return BatchSimulation(task, num_envs, **options)
     from cathsim_dmc.simulation.warp.simulation import WarpSimulation  # an extra

@@ -11,7 +11,7 @@ from cathsim_dmc.tasks import placement
 # Goals in the branches of an arch.
 BRANCHES = ("bca", "rcca", "lcca", "lsa", "rsa")
 GOALS = (*BRANCHES, "rva", "lva")  # with the vertebral arteries of a neck
-POOL = 16  # arches that an episode draws from, unless one says otherwise
+POOL = 16  # default number of arches that an episode draws from
 
 
 def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> Anatomy:
@@ -22,7 +22,7 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> An
             "descending"; an anatomy or a directory has its own inlet.
 
     Raises:
-        ValueError: if there is none, or an access is given that it has not.
+        ValueError: if there is no such anatomy, or it has no such access.
     """
     if not isinstance(anatomy, str | Path | Anatomy):
         bounds.refuse("anatomy", anatomy, "an Anatomy, a name or a directory")
@@ -49,11 +49,14 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> An
 
 
 def arch_numbers(options: Mapping[str, Any]) -> tuple[int, ...]:
-    """Numbers in their set of the arches that options of `load_arches` name.
+    """Returns the numbers in their set of the arches that options choose.
+
+    Args:
+        options: Options of `load_arches`.
 
     Raises:
-        ValueError: if there is no such set, it has no such arches, or numbers stand
-            beside a pool or a first one, or are none.
+        ValueError: if the set or an arch does not exist, or `numbers` is empty or given
+            together with `pool` or `first`.
     """
     from cathsim_dmc.anatomy.arch import arch  # late, as in `load_anatomy`
 
@@ -91,12 +94,12 @@ def load_arches(
         pool: Number of arches; building one takes about a second and a half.
         first: Number of the first one in the set.
         numbers: Numbers of the arches in the set, in place of pool and first.
-        access: Where the device enters, "ascending" or "descending"; "any" for one and
-            the other in turn, by the number in the set.
+        access: Where the device enters, "ascending" or "descending"; "any" alternates
+            by the number in the set, and takes the other one if no sheath fits.
 
     Raises:
-        ValueError: if there is no such set, it has no such arches, or one of them
-            cannot be entered.
+        ValueError: if the set or an arch does not exist, or no sheath fits before the
+            inlet of an arch.
     """
     from cathsim_dmc.anatomy.arch import arch
     from cathsim_dmc.anatomy.builder import ACCESSES
@@ -126,11 +129,15 @@ def load_arches(
 def load_arches_to(
     goal: str | Sequence[str], options: Mapping[str, Any]
 ) -> tuple[list[Anatomy], list[str]]:
-    """Random arches by options of `load_arches`, and the name of the goal in each.
+    """Returns the random arches that options choose, and the name of each one's goal.
+
+    Args:
+        goal: See `goals_for`.
+        options: Options of `load_arches`.
 
     Raises:
-        ValueError: see `load_arches` and `goals_for`, which is asked before any arch is
-            built.
+        ValueError: see `load_arches` and `goals_for`; goals are checked before any arch
+            is built.
     """
     numbers = arch_numbers(options)
     each = goals_for(goal, numbers)
@@ -139,10 +146,10 @@ def load_arches_to(
 
 
 def goals_for(goal: str | Sequence[str], numbers: Sequence[int]) -> list[str]:
-    """The option `goal` for each arch: a name or "any" for all, or one for each.
+    """Expands the option `goal` to a list with one name or "any" for each arch.
 
     Raises:
-        ValueError: if it is something else, or not as many as there are arches.
+        ValueError: if a name does not exist, or there are not as many as arches.
     """
     if isinstance(goal, str) or not isinstance(goal, Sequence):
         each = [goal] * len(numbers)
@@ -159,7 +166,7 @@ def goals_for(goal: str | Sequence[str], numbers: Sequence[int]) -> list[str]:
 
 
 def goal_of(anatomy: Anatomy, goal: str, number: int) -> str:
-    """Name of a goal; "any" is one branch after the other, by the arch's number."""
+    """Returns the name of a goal; "any" cycles through the branches by `number`."""
     if goal != "any":
         return goal
     branches = [name for name in GOALS if name in anatomy.goals]

@@ -1,7 +1,7 @@
-"""What two X-ray planes show of N simulations, in the terms of the route's observation.
+"""The route's observation, reconstructed from two X-ray planes in N simulations.
 
-Device, goal and route are reconstructed from the images (`imaging.biplane`); beside
-them, the frame of the tip needs the orientation of the handle, which its drive knows.
+Device, goal and route are reconstructed from the images (`imaging.biplane`). The frame
+of the tip also needs the orientation of the handle, which is known from its drive.
 """
 
 import functools
@@ -19,26 +19,26 @@ from cathsim_dmc.imaging.options import NO_ERRORS, RoadmapErrors
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
 from cathsim_dmc.tasks.route import Route, into_frame, locate, look_ahead
 
-# A device with fewer points counts as lost.
+# Fewest points of a reconstructed device; with fewer it counts as lost.
 _FEWEST = 7
-# The direction of the head is that of the chord to this point behind the marker.
+# The direction of the head is that of the chord from this point to the marker.
 _CHORD = 2
-_OUT = -1e-3  # m from the outline; behind, the device is in its sheath
-# The middle and the lumen of a narrow branch, and so the head's place in it, have the
-# errors of the outlines: there, deviations from the route count in this radius, m.
+_OUT = -1e-3  # m, depth outside the outline from which the device is in its sheath
+# Errors of the outlines shift centreline and radius of a narrow branch, and so the
+# deviation of the head, which is therefore divided by at least this radius, m.
 _LEAST_TUBE = 10e-3
 
 
 class BiplaneSight:
-    """Reconstructs what the planes show; remembers each simulation's episode."""
+    """Reconstructs device, goal and route; keeps each simulation's device and route."""
 
     state = ("_routes", "_lines")  # see `snapshot`
 
     def __init__(self, num_simulations: int, errors: RoadmapErrors = NO_ERRORS):
-        """Begins with nothing seen of N simulations.
+        """Prepares N simulations, of which no image has been seen.
 
         Args:
-            errors: Of the roadmaps; each episode draws its own.
+            errors: Sizes of the errors of the roadmaps; each episode draws its own.
         """
         self._errors = errors
         if errors.any:
@@ -49,7 +49,7 @@ class BiplaneSight:
         self._machines: dict[int, Biplane] = {}
 
     def changed(self, numbers: np.ndarray) -> None:
-        """Takes other planes before some simulations (K,) from now on."""
+        """Drops the machines of some simulations (K,), whose planes have changed."""
         for number in numbers.tolist():
             self._machines.pop(number, None)
 
@@ -69,19 +69,18 @@ class BiplaneSight:
         fresh: bool,
         last: np.ndarray,
     ) -> dict[str, np.ndarray]:
-        """Entries of the observation, and "place", for some simulations.
+        """Returns the entries of the observation, and "place", of K simulations.
 
         "place" (K, 1) is the arc length of the heads' places on their routes, m.
 
         Args:
-            planes: Of each of the K simulations: the two planes, and views of further
-                roadmaps.
+            planes: For each simulation, its two planes and its further roadmaps.
             images: (K, rows, columns, 2) uint8, live images.
             pixels: (K, 2, 2), goal marker in each plane, (column, row).
             handles: (K, 3, 3), orientation of the handle, its axes in columns.
             numbers: (K,) of the simulations.
             fresh: Whether they begin an episode.
-            last: (K,), places of the heads to stay near, see `route.locate`.
+            last: (K,), last arc lengths of the heads, m, see `route.locate`.
         """
         rows = []
         for k, number in enumerate(numbers.tolist()):
@@ -95,7 +94,7 @@ class BiplaneSight:
                 self._lines[number] = line
             line = self._lines[number]
             if len(line) < _FEWEST:
-                # Lost in the first image: a device along the handle.
+                # Lost in the first image: assume a straight device along the handle.
                 line = _along(handles[k], line, machine)
             goal = machine.point(pixels[k])
             if fresh or self._routes[number] is None:
@@ -111,14 +110,14 @@ _machine = functools.lru_cache(maxsize=64)(Biplane)
 
 
 def _along(handle: np.ndarray, line: np.ndarray, machine: Biplane) -> np.ndarray:
-    """A straight line behind the first point, or behind the isocentre."""
+    """A straight device behind its first point, or behind the isocentre, (n, 3), m."""
     first = line[0] if len(line) else machine.isocentre
     ways = biplane.TRACE_SPACING * np.arange(_FEWEST)
     return first - ways[:, None] * handle[:, 2]
 
 
 def _route(machine: Biplane, line: np.ndarray, goal: np.ndarray) -> Route:
-    """The route from where the device enters the vessel."""
+    """The route to the goal from the point where the device enters the vessel."""
     out = np.flatnonzero(machine.depth(line) < _OUT)
     first = max(int(out[0]) - 1, 0) if len(out) else len(line) - 1
     points = machine.route(line[first], goal)
@@ -139,7 +138,7 @@ def _seen(
     head = line[0] + biplane.MARKER_TO_HEAD * direction
     frame = loops.carried(np.ascontiguousarray(handle), line, direction)
     places = TRACKED_PLACES[:-1] - biplane.MARKER_TO_HEAD
-    # Where it has been lost, it is straight.
+    # Behind the last point that is seen, the device is taken as straight.
     beyond = np.maximum(places - ways[-1], 0.0)[:, None]
     back = (line[-1] - line[-2]) / biplane.TRACE_SPACING
     device = interpolate(places, ways, line) + beyond * back

@@ -14,18 +14,18 @@ from cathsim_dmc.imaging.options import VIEW_ANGLE
 from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.stepper import Stepper
 
-# Of `scene.Scene`, and of the head of the device, see `Cameras`.
+# Two cameras of `scene.Scene`, and one in the head of the device, see `Cameras`.
 NAMES = ("top", "side", "tip")
 KINDS = ("rgb", "depth")  # names of observations
-# Planes between which a camera sees, m: a wall that the head touches is a radius of
-# the device away, and the top view stands 0.7 m off.
+# Near and far clipping plane, m: a wall that the head touches is a radius of the device
+# away, and the top view 0.7 m.
 NEAREST, FARTHEST = 0.3e-3, 10.0
-_OUT_OF_SIGHT = 1e3  # m; a geom without opacity would still be in the depth
+_OUT_OF_SIGHT = 1e3  # m; a transparent geom would still be in the depth image
 
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """What `rgb` and `depth` show.
+    """Options of the observations `rgb` and `depth`.
 
     Attributes:
         names: of the cameras: "top" as published, "side", and "tip", an endoscope.
@@ -46,10 +46,10 @@ class CameraOptions:
 
 
 class Cameras:
-    """The cameras of one compiled model, on a context of their own.
+    """MuJoCo's cameras of one compiled model, with their own OpenGL context.
 
-    They look at joint positions, so that composer and batches show the same. The
-    endoscope looks ahead from the head of the device, which it does not show.
+    They render the pose of `qpos`, so composer and batches give the same images. The
+    endoscope "tip" looks ahead from the head of the device and does not show it.
     """
 
     _renderer: Any = None
@@ -65,9 +65,9 @@ class Cameras:
         """Opens the context.
 
         Args:
-            kinds: What they take, of `KINDS`.
+            kinds: Kinds of images, of `KINDS`.
             links: Numbers of the geoms of the device.
-            resized: Whether the sizes of these differ between simulations.
+            resized: Whether the sizes of these geoms differ between simulations.
 
         Raises:
             ValueError: if OpenGL does not start.
@@ -78,7 +78,7 @@ class Cameras:
         self._links = set(links.tolist())
         self._model = model = copy.copy(model)
         model.vis.global_.offheight, model.vis.global_.offwidth = rows, columns
-        model.stat.extent = 1.0  # the unit of the two planes
+        model.stat.extent = 1.0  # unit of `znear` and `zfar`
         model.vis.map.znear, model.vis.map.zfar = NEAREST, FARTHEST
         self._data, self._options = mujoco.MjData(model), mujoco.MjvOption()
         self._options.sitegroup[:] = 0
@@ -95,7 +95,7 @@ class Cameras:
             ) from error
 
     def __del__(self):
-        # MuJoCo frees what lies in whichever context is current, perhaps another's.
+        # MuJoCo frees objects of the current context, which may be another one.
         context = getattr(self._renderer, "_gl_context", None)
         if context is not None:
             context.make_current()
@@ -133,10 +133,10 @@ class Cameras:
         return {kind: np.concatenate(each, axis=-1) for kind, each in seen.items()}
 
     def _aim(self, name: str, head: np.ndarray, axes: np.ndarray) -> None:
-        """Puts the scene before a camera; x and y of the head are right and down."""
+        """Updates the scene for a camera; "tip" has x of the head right and y down."""
         model, data, inside = self._model, self._data, name == "tip"
         camera = model.camera(NAMES[0] if inside else name)
-        if inside:  # another place of the top view, until it is put back
+        if inside:  # moves the top camera, whose pose is restored below
             kept = data.cam_xpos[camera.id].copy(), data.cam_xmat[camera.id].copy()
             angle = float(model.cam_fovy[camera.id])
             data.cam_xpos[camera.id], model.cam_fovy[camera.id] = head, VIEW_ANGLE
@@ -162,6 +162,6 @@ def opened(
     links: np.ndarray,
     resized: bool,
 ) -> Cameras | None:
-    """The cameras that observations of these names need, see `Cameras`, if any."""
+    """Returns the cameras that observations of these names need; None without need."""
     kinds = [kind for kind in KINDS if kind in names]
     return Cameras(model, options, kinds, links, resized) if kinds else None

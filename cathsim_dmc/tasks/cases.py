@@ -1,7 +1,7 @@
 """Cases of a task: anatomies that share one compiled model.
 
-All anatomies are compiled once. What differs between their models is kept and written
-into the model of the first, and everything that was bound to that stays bound.
+Each anatomy is compiled once. A case keeps the fields in which its model differs from
+that of the first anatomy, and writes them into that model, so all bindings stay valid.
 """
 
 import dataclasses
@@ -20,17 +20,18 @@ from cathsim_dmc.tasks.objectives import Objective
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.start import StartPosture
 
-# Of mjStatistic; the mean inertia scales the tolerance of the solver.
+# Fields of mjStatistic; the mean inertia scales the tolerance of the solver.
 _STATISTICS = ("meaninertia", "meanmass", "meansize", "extent", "center")
-# Arrays of texts, and of the mesh of the surface, which is that of the first anatomy;
-# and of the tree of its triangles, which follows those of the bodies.
+# Prefixes of fields that are not compared: texts, and the mesh of the surface, which
+# only the first anatomy has; and of bounding volume trees, in which the tree of that
+# mesh comes last.
 _APART, _TREES = ("_", "name", "path", "text", "mesh_"), "bvh_"
 
 Fields = dict[str, np.ndarray]
 
 
 class Case:
-    """One anatomy of a task, as an episode needs it."""
+    """One anatomy of a task, with objective, start posture and model fields."""
 
     def __init__(
         self,
@@ -40,7 +41,7 @@ class Case:
         config: NavigationConfig,
         fields: Fields | None = None,
     ):
-        """Lets the device settle; `write` writes the fields into a model."""
+        """Settles the device; `fields` are the model fields that `write` copies."""
         self.scene, self.objective = scene, objective
         index = ModelIndex(model, scene.catheter, scene.robot)
         if isinstance(scene.catheter, DeviceStack):
@@ -51,19 +52,19 @@ class Case:
         self._statistics = {n: np.copy(getattr(model.stat, n)) for n in _STATISTICS}
 
     def write(self, model: mujoco.MjModel) -> None:
-        """Puts the anatomy into a model of the task, in place of the one in it."""
+        """Writes the anatomy into a model of the task; replaces the present one."""
         self.write_statistics(model)
         for name, value in self.fields.items():
             getattr(model, name)[: len(value)] = value
 
     def write_statistics(self, model: mujoco.MjModel) -> None:
-        """Puts what MuJoCo derives from the whole anatomy into a model of the task."""
+        """Writes MuJoCo's statistics of this anatomy into a model of the task."""
         for name, value in self._statistics.items():
             setattr(model.stat, name, value)
 
     @functools.cached_property
     def angiograph(self) -> Angiograph:
-        """The angiography machine before this anatomy."""
+        """Angiography machine that images this anatomy."""
         return Angiograph(self.scene.anatomy.surface, self._fluoroscopy)
 
 
@@ -73,15 +74,15 @@ def compile_together(
     """Compiles scenes so that any of them can be written into a model of the first.
 
     Args:
-        scenes: Scenes of one device, not compiled yet, with success and reward in each;
-            the first one alone is drawn.
+        scenes: Scenes of one device, not compiled yet, with their objectives; only the
+            first one has the mesh of the lumen's surface, see `Scene.build`.
         config: Options of the task.
 
     Raises:
         ValueError: if the scenes differ in more than wall and places.
     """
     found: list[Case] = []
-    sizes: dict[str, int] = {}  # of all that differs in any of them
+    sizes: dict[str, int] = {}  # lengths of the fields that differ in any case
     first, host = None, None
     for scene, objective in scenes:
         root = scene.arena.mjcf_model
@@ -94,7 +95,7 @@ def compile_together(
             fields = _differences(host, model, scene, first)
             sizes |= {name: len(value) for name, value in fields.items()}
         case = Case(scene, objective, model, config, fields)
-        # The entities of the first, in this anatomy.
+        # The case shares the entities of the first scene, to which the model belongs.
         own = {"anatomy": scene.anatomy, "goal": scene.goal}
         case.scene = dataclasses.replace(first, placement=scene.placement, **own)
         scene.anatomy.lumen.release()
@@ -108,7 +109,7 @@ def compile_together(
 def _differences(
     host: mujoco.MjModel, model: mujoco.MjModel, scene: Scene, first: Scene
 ) -> Fields:
-    """What of a model differs from the host, and its statistics."""
+    """Returns copies of the model's fields that differ from those of the host."""
     names = f"{scene.anatomy.name!r} cannot share a model with {first.anatomy.name!r}"
     fields: Fields = {}
     for name in dir(host):

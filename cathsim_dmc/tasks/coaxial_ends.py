@@ -1,7 +1,7 @@
-"""How the pre-shaped ends of coaxial devices lie to places ahead of them.
+"""Directions from the pre-shaped ends of coaxial devices to points ahead.
 
-A pre-shaped end leads to one side of its device, so what counts is the direction in the
-frame in which the device lies before that end, and the rotation of the end.
+A pre-shaped end leads to one side of its device. How to turn it depends on the
+direction in the frame of the link proximal to that end, and on its rotation.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ class CoaxialEnds:
 
     Attributes:
         shaped: (K,), length of the pre-shaped end of each device, m.
-        nodes: (L + 1,), ends of the links from the end of the chain, m.
+        nodes: (L + 1,), distances of the link ends from the end of the chain, m.
     """
 
     shaped: np.ndarray
@@ -29,7 +29,7 @@ class CoaxialEnds:
 
     @classmethod
     def of(cls, chain: Chain) -> Self:
-        """Reads off the entity of coaxial devices."""
+        """Returns the shaped ends of a `DeviceStack`."""
         assert isinstance(chain, DeviceStack)
         shapes = [[arc.length for arc in one.tip_shape] for one in chain.devices]
         return cls(np.array([sum(one) for one in shapes]), chain.stack.nodes)
@@ -37,11 +37,11 @@ class CoaxialEnds:
     def directions(
         self, readings: Readings, insertion: np.ndarray, targets: np.ndarray
     ) -> np.ndarray:
-        """Ways (N, K, 3), m, to places, in the frames before the shaped ends.
+        """Vectors (N, K, 3), m, to targets, in the frames proximal to the shaped ends.
 
         Args:
-            readings: Of the chains.
-            insertion: (N, K), of the devices, m.
+            readings: State of the N chains.
+            insertion: (N, K), insertions of the devices, m.
             targets: (N, K, 3), m, world frame.
         """
         behind_first = gaps(insertion)
@@ -59,12 +59,18 @@ class CoaxialEnds:
 
 
 def gaps(insertion: np.ndarray) -> np.ndarray:
-    """By how much the ends (N, K) of coaxial devices are behind the first, m."""
+    """Distances (N, K) of the ends of coaxial devices behind the leading one, m."""
     return insertion.max(axis=1, keepdims=True) - insertion
 
 
 def before(frame: np.ndarray, joints: np.ndarray, number: int) -> np.ndarray:
-    """Frames (N, 3, 3) of the links before given ones, `number`-th from the end."""
+    """Frames (N, 3, 3) of the links proximal to given ones.
+
+    Args:
+        frame: (N, 3, 3), frames of the links, axes in columns.
+        joints: (N, J), joint positions of the chains.
+        number: Number of these links from the distal end, beginning with 1.
+    """
     place = joints.shape[1] // 2 - number  # of the joint; two slides precede it
     for axis in (1, 0) if posture.x_first(place) else (0, 1):
         frame = turned(frame, axis, -joints[:, -2 * number + axis])
@@ -82,13 +88,14 @@ def turned(frame: np.ndarray, axis: int, angle: np.ndarray) -> np.ndarray:
 
 
 def sides(ways: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """What a policy sees (N, K, 5) of ways (N, K, 3) of `CoaxialEnds.directions`.
+    """Entries (N, K, 5) of the observation for vectors of `CoaxialEnds.directions`.
 
     Args:
-        rotation: (N, K), of the ends, rad.
+        ways: (N, K, 3), the vectors.
+        rotation: (N, K), rotations of the ends, rad.
 
     Returns:
-        Cosine and sine of the rotation, and the direction along the x, y and z that are
+        Cosine and sine of the rotation, then x, y and z of the unit vector in the frame
         turned with the end.
     """
     ways = ways / np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-9)
@@ -99,14 +106,15 @@ def sides(ways: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 def turns(ways: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What is left to turn (N, K) to ways (N, K, 3), and their bends (N, K), rad.
+    """Remaining rotations (N, K) of the ends to vectors, and bend angles (N, K), rad.
 
     Args:
-        rotation: (N, K), of the ends, rad.
+        ways: (N, K, 3), vectors of `CoaxialEnds.directions`.
+        rotation: (N, K), rotations of the ends, rad.
 
     Returns:
-        Rotation of a way about the axis of the device less that of its end, and the
-        angle between the way and this axis.
+        Azimuth of each vector about the axis of the device minus the rotation of the
+        end, and angle between the vector and this axis.
     """
     x, y, z = np.moveaxis(ways, -1, 0)
     return np.arctan2(y, x) - rotation, np.arctan2(np.hypot(x, y), z)

@@ -1,8 +1,8 @@
-"""The device as observations show it, whatever length of it is simulated.
+"""The device as observations show it, independent of the simulated length.
 
-A task simulates what can leave the sheath. Observations show a device of
-`COMMON_LENGTH`, so they have one shape: behind the simulated links the device is
-straight and moves with its base.
+A task simulates only what can leave the sheath. Observations show a device of
+`COMMON_LENGTH`, so their shape is the same in all tasks: proximal to the simulated
+links, the device is straight and moves with its base.
 """
 
 from typing import NamedTuple
@@ -36,11 +36,11 @@ class CommonChain:
 
     Attributes:
         num_links: L, number of links that observations show.
-        num_joints: J, number of joints that they show.
+        num_joints: J, number of joints that observations show.
     """
 
     def __init__(self, chain: Chain, shaft_link: float):
-        """Finds the simulated joints and links; `shaft_link` is the longest, m."""
+        """Finds the joints and links shown; `shaft_link` is the shaft's longest, m."""
         tip = max(device.tip_length for device in chain.devices)
         whole = Discretisation(max(COMMON_LENGTH, 2 * tip), shaft_link)
         self.num_links = len(whole.link_lengths(*chain.devices))
@@ -52,22 +52,23 @@ class CommonChain:
         others = [place for place in range(len(names)) if place not in bends]
         shown = 2 * (self.num_links - 1)
         missing = max(shown - len(bends), 0)
-        # Places in the simulated joints, any for those that are missing.
+        # Indices of the simulated joints; arbitrary for missing ones, which read 0.
         self._joints = np.array([*others, *[0] * missing, *bends[-shown:]])
         self._missing = slice(len(others), len(others) + missing)
         self.num_joints = len(self._joints)
 
         nodes = np.append(np.cumsum(lengths[::-1])[::-1], 0.0)
-        # The link that each place lies on; the first one continues behind the base.
+        # The link of each tracked point; the first link extends behind the base.
         after = np.sum(nodes[1:-1, None] > TRACKED_PLACES + 1e-9, axis=0)
         share = (nodes[after] - TRACKED_PLACES) / (nodes[after] - nodes[after + 1])
         self._after = after
         self._share = np.round(share, 9)[:, None]  # without rounding errors at joints
 
     def joints(self, values: np.ndarray) -> np.ndarray:
-        """Values (..., J) of the joints shown, of those (..., j) of the chain.
+        """Maps values (..., j) of the chain's joints to those (..., J) of joints shown.
 
-        Base and torsion come first, then the bending hinges, 0 behind the simulated.
+        Base and torsion come first, then the bending hinges; hinges that are not
+        simulated read 0.
         """
         taken = values.take(self._joints, axis=-1)
         taken[..., self._missing] = 0.0
@@ -77,8 +78,8 @@ class CommonChain:
         """Inertia (N, L, 10), velocity and force (N, L, 6) of the links shown.
 
         They are MuJoCo's `cinert`, `cvel` and `cfrc_ext`, about the centre of mass of
-        the whole device. Links behind the simulated ones continue the first of these;
-        nothing touches them.
+        the whole device. Links proximal to the simulated ones extend the first of these
+        and have no contacts.
 
         Args:
             state: readings of N simulations.

@@ -30,8 +30,8 @@ from cathsim_dmc.tasks.cameras import CameraOptions
 MAX_STEPS = 2000  # published
 WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
 _FRICTION = (0.0, 2.0, "")  # Coulomb coefficient
-# Least and largest numbers. A link is longer than its radius and shorter than the
-# diameter of a large vessel.
+# Allowed ranges (low, high, unit). A link of the shaft is longer than its radius and
+# shorter than the diameter of a large vessel.
 _NUMBERS = {
     "lead": (0.0, 0.3, "m"),
     "lumen_friction": _FRICTION,
@@ -44,9 +44,9 @@ _NUMBERS = {
 # Range in which the physics holds (docs/physics.md); the library stays within it.
 _LONGEST_TIMESTEP = 5e-3  # s
 _STIFFEST = 5e-3  # N·m², EI
-# Composer does the last two of them itself.
+# Least and largest number of physics steps in a control step.
 _SUBSTEPS = (2, 1000)
-_REPLACED = "device", "rotation"  # by devices
+_REPLACED = "device", "rotation"  # options that `devices` replaces
 
 
 def refuse_replaced(given: Mapping[str, Any], devices: Any) -> None:
@@ -119,7 +119,7 @@ class NavigationConfig:
     physics_timestep: float = PHYSICS_TIMESTEP
     solver_tolerance: float = SOLVER_TOLERANCE
     outside_range: bool = False
-    # What makes an object is given; the object is here after validation.
+    # These fields accept what `__post_init__` converts to an object of options.
     fluoroscopy: Any = FluoroscopyOptions()
     endoluminal_size: Any = (128, 128)
     cameras: Any = CameraOptions()
@@ -152,7 +152,7 @@ class NavigationConfig:
             bounds.refuse("effects", self.effects, "a list of physics.effects.Effect")
 
     def effects_on(self, chain: Chain) -> list[Effect]:
-        """The effects of one rollout, in the order in which they act."""
+        """Returns new effects for one rollout, in the order in which they act."""
         own = [copy.copy(effect) for effect in self.effects]
         delay = ActionDelay(self.randomisation.longest_delay)
         model = RandomisedModel(self.randomisation)
@@ -231,7 +231,7 @@ class NavigationConfig:
             warnings.warn(fault, stacklevel=4)
 
     def _check_views(self):
-        """Check that the C-arms are possible at the largest deviations of the view."""
+        """Check that the C-arms exist at the largest deviations of the view."""
         view = self.randomisation.view
         ends = view if isinstance(view, Sequence) else (0.0,)
         for deviation in {round(end) for end in ends}:
@@ -245,7 +245,7 @@ class NavigationConfig:
 
 
 def _check_fields(own: Sequence[Effect], devices: Effect, coaxial: bool) -> None:
-    """Refuses (ValueError) fields of effects that the devices write over."""
+    """Raise ValueError if an effect writes a field that the devices overwrite."""
     for effect in own:
         written = effect.model_fields if coaxial else effect.step_fields
         if lost := sorted({*written} & {*devices.step_fields}):

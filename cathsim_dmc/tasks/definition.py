@@ -1,4 +1,4 @@
-"""What a task of the suite is made of."""
+"""Definition of a task of the suite."""
 
 import dataclasses
 import inspect
@@ -8,7 +8,7 @@ from typing import Any
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.tasks.objectives import Cannulation, Objective
 
-OF_ARCHES = "arches", "pool", "first", "numbers"  # what chooses random arches
+OF_ARCHES = "arches", "pool", "first", "numbers"  # options that choose random arches
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,9 +24,9 @@ class TaskDefinition:
             options of the task. An option `farthest_shift` receives the largest shift
             of the goal by randomisation, m.
         options: fields of `NavigationConfig` that differ from their defaults.
-        random_arch: whether each episode draws a random arch, from those that the
-            task's options `arches`, `pool`, `first` and `numbers` name; there is no
-            `anatomy` then.
+        random_arch: whether each episode draws one of the random arches that the
+            task's options `arches`, `pool`, `first` and `numbers` choose; `anatomy` is
+            None then.
     """
 
     description: str

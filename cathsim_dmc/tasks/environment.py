@@ -10,10 +10,10 @@ from cathsim_dmc.tasks.snapshot import Snapshot
 
 
 class Environment(composer.Environment):
-    """`composer.Environment`, but for the first reset and the loop of physics steps.
+    """`composer.Environment` that compiles once and runs physics steps in one loop.
 
-    Composer compiles at construction and once more at the first reset. Where nothing
-    changes the MJCF model in between, the first model is kept.
+    Composer compiles at construction and once more at the first reset. The second
+    compilation is skipped if no hook changes the MJCF model.
     """
 
     def reset(self):
@@ -22,7 +22,7 @@ class Environment(composer.Environment):
         Returns:
             The first time step.
         """
-        self._reset_next_step = True  # until it has ended
+        self._reset_next_step = True  # also if this reset raises
         before = self._hooks._initialize_episode_mjcf  # noqa: SLF001
         changes = _overridden(self.task, "initialize_episode_mjcf")
         if not (changes or before.entity_hooks or before.extra_hooks):
@@ -30,13 +30,13 @@ class Environment(composer.Environment):
         return super().reset()
 
     def step(self, action):
-        """Does a control step, its physics steps in one loop where nobody watches them.
+        """Does a control step; its physics steps run in one loop if no hook needs them.
 
-        Composer calls hooks, looks for MuJoCo's warnings and schedules observables
-        around each physics step. The stepper looks for warnings, too.
+        Composer calls hooks, checks MuJoCo's warnings and schedules observables around
+        each physics step. The stepper checks the warnings itself.
 
         Returns:
-            The time step; the first of an episode after the last of one.
+            The time step; the first one of a new episode if the last one has ended.
         """
         enabled = self._observation_updater._enabled_structure  # noqa: SLF001
         self._watched, plain = self._is_watched(), isinstance(enabled, dict)
@@ -57,7 +57,7 @@ class Environment(composer.Environment):
         return self._time_step(observation)
 
     def _time_step(self, observation) -> dm_env.TimeStep:
-        """What a control step that has been done returns."""
+        """Returns the time step of a completed control step."""
         task, physics = self.task, self._physics_proxy
         reward, discount = task.get_reward(physics), task.get_discount(physics)
         ends = task.should_terminate_episode(physics)
@@ -66,7 +66,7 @@ class Environment(composer.Environment):
         return dm_env.TimeStep(kind, reward, discount, observation)
 
     def _is_watched(self) -> bool:
-        """Whether anything acts between physics steps, or after a warning in one."""
+        """Whether a hook or composer's handling of warnings needs each physics step."""
         hooks = self._hooks
         before, after = hooks._before_substep, hooks._after_substep  # noqa: SLF001
         return bool(
@@ -80,17 +80,17 @@ class Environment(composer.Environment):
         )
 
     def _substep(self, action):
-        """Does a physics step, by composer's own function where somebody watches it."""
+        """Does a physics step; with composer's own function if a hook needs it."""
         if self._watched:
             super()._substep(action)
         else:
             self.task.stepper.step()
 
     def snapshot(self) -> Snapshot:
-        """The state between two steps, from which an episode goes on bit for bit.
+        """Returns the state between two steps; an episode continues from it exactly.
 
-        Observables of one's own with a delay, buffer or corruptor of composer begin
-        anew.
+        A user's observables with a delay, buffer or corruptor of composer are not part
+        of it.
 
         Raises:
             RuntimeError: if no episode has begun, or an error has interrupted its last
@@ -99,14 +99,14 @@ class Environment(composer.Environment):
         return self.task.snapshot()
 
     def restore(self, snapshot: Snapshot) -> dm_env.TimeStep:
-        """Puts the environment to a snapshot, in place of a reset.
+        """Restores a snapshot; replaces a reset.
 
         Args:
-            snapshot: Of one simulation of the same task, perhaps of a batch or of
-                another process.
+            snapshot: Snapshot of one simulation of the same task; it may come from a
+                batch or another process.
 
         Returns:
-            The time step that was the last one when the snapshot was taken.
+            The time step after which the snapshot was taken.
 
         Raises:
             ValueError: if the snapshot is of another task, or of several simulations.
@@ -131,9 +131,9 @@ class Environment(composer.Environment):
 
 
 def _is_plain(enabled: Any) -> bool:
-    """Whether an enabled observable is what its function returns after a control step.
+    """Whether an observable equals the value of its function after a control step.
 
-    It has no delay, buffer, interval and aggregator then.
+    This holds without a delay, buffer, update interval and aggregator.
     """
     if enabled.observable.aggregator or enabled.buffer._has_buffer_dim:  # noqa: SLF001
         return False

@@ -22,10 +22,10 @@ class ImageSensors:
     """Captures the images that the observations ask for, of N simulations.
 
     Attributes:
-        planes: Of the machine before each simulation; none without fluoroscopy.
-        thirds: Views of a third roadmap of each, empty without one.
+        planes: Planes of each simulation's machine; empty without fluoroscopy.
+        thirds: Plane of each simulation's third roadmap, an empty tuple without one.
         images: The last images (N, ...) by name; "past_1" is the one before "past_0".
-        sight: What two planes show, over an episode.
+        sight: Reconstruction from two planes.
     """
 
     state = ("images",)  # see `snapshot`
@@ -64,18 +64,19 @@ class ImageSensors:
         around: Callable[[angiographs.Planes, int], angiographs.Planes],
         last: np.ndarray,
     ) -> None:
-        """Captures the next images; there are `planes`.
+        """Captures the next images; requires `planes`.
 
         Args:
             rows: (K,) numbers of the simulations whose images are captured.
-            begins: Whether they begin an episode: the images fill their history. All
-                are captured otherwise.
+            begins: Whether they begin an episode, so that the images fill their
+                history. If not, the images of all N are captured.
             points: Centrelines of the chains (N, n, 3), tracked points of coaxial
                 devices (N, m, 3), and goals (N, 3), m.
             handles: (N, 3, 3), orientation of the handles, axes in columns.
-            random_states: N sources of quantum noise, None for images without.
-            around: Moves the vessel before the machine of a simulation.
-            last: (N,), places of the heads on their routes to stay near, see
+            random_states: N sources of quantum noise, None for images without noise.
+            around: Function from a simulation's planes and its number to the planes
+                with its vessel as moved.
+            last: (N,), last arc lengths of the heads on their routes, m, see
                 `BiplaneSight.see`.
         """
         planes = [self.planes[index] for index in rows]
@@ -115,7 +116,7 @@ class ImageSensors:
             self.hold("pixels", pixels, rows)
 
     def hold(self, name: str, image: np.ndarray, rows: np.ndarray) -> None:
-        """Keeps images (K, ...) of some simulations (K,)."""
+        """Stores images (K, ...) of some simulations (K,)."""
         if name not in self.images:
             shape = (self._count, *image.shape[1:])
             self.images[name] = np.zeros(shape, dtype=image.dtype)

@@ -1,4 +1,4 @@
-"""What goes in and out of a task, as tables that JSON holds: for programs outside."""
+"""Actions and observations of a task as JSON-able tables, for other programs."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ def action_table(chain: Chain) -> list[dict[str, Any]]:
 
     Returns:
         A dictionary for each of the A entries: "name", "low", "high", "meaning", and
-        "scale", what 1 stands for, in "unit".
+        "scale", the value that 1 stands for, in "unit".
     """
     motors = {one.name: one for one in getattr(chain, "tip_motors", ())}
     rows = []

@@ -39,16 +39,15 @@ class Navigation(composer.Task):
     `rotation=True`, the rotation of the base (1 = 3.14 rad/s about the device).
     Entries outside are clipped; NaN and infinity are refused.
 
-    Reward and success come from the objective alone: a subclass that overrides
-    `get_reward` would be another task on the batched path, which refuses it.
+    Reward and success come from the objective alone. The batched path does not call
+    these hooks, so it refuses a subclass that overrides one, such as `get_reward`.
 
     Attributes:
         config: Options.
-        options: What `suite.make_task` was given; empty for a task made without it.
+        options: Options given to `suite.make_task`; empty for a task made without it.
         num_actions: A, entries of an action.
-        rollout: The course of the episode; there once an environment has compiled the
-            model, as is
-        stepper: which does its physics steps.
+        rollout: State of the episode; set when an environment compiles the model.
+        stepper: Does the rollout's physics steps; set likewise.
     """
 
     rollout: Rollout
@@ -63,20 +62,21 @@ class Navigation(composer.Task):
         others: Iterable[tuple[Scene, Objective]] | None = None,
         name: str | None = None,
     ):
-        """Takes over the scene.
+        """Makes a task of a scene and an objective.
 
         Args:
-            scene: Entities, attached to the arena, and where they stand.
+            scene: Entities, attached to the arena, and their placement.
             config: Options; those that shape the scene must be the scene's.
             random: Seed or source of randomness of the environment.
-            others: Scenes that are not drawn, and objectives, beside the first, if each
-                episode is to draw one of them: another anatomy, with the same device
-                and goals of the same names. All are compiled here, one after the other.
-            name: Name of the task for people; None takes the class's.
+            others: Further scenes with their objectives; each episode then draws one
+                of all scenes. They have other anatomies, the same device and goals of
+                the same names, and no mesh (`drawn=False`). All are compiled here.
+            name: Name of the task in texts; None for the name of the class.
 
         Raises:
-            ValueError: if the objective cannot do what the randomisation asks for, or
-                the scenes differ in more than their anatomies.
+            ValueError: if the objective does not support the randomisation, the scenes
+                differ in more than their anatomies, or MuJoCo's cameras are observed in
+                several anatomies or a vessel that moves.
         """
         self.name = name or type(self).__name__
         self.options: dict[str, Any] = {}
@@ -125,7 +125,7 @@ class Navigation(composer.Task):
         self._step: Step | None = None
 
     def make_rollout(self, model: mujoco.MjModel, stepper: Stepper) -> Rollout:
-        """The course of the task's episodes; see `Rollout`."""
+        """Returns a rollout of the task in the simulations of a stepper."""
         chosen = self._cases or [
             cases.Case(self._scene, self._objective, model, self.config)
         ]
@@ -133,7 +133,7 @@ class Navigation(composer.Task):
 
     @property
     def effects(self) -> list[Effect]:
-        """What changes the simulation, in order; new ones for each rollout."""
+        """Effects on the simulation, in their order; new objects at each access."""
         return self.config.effects_on(self._scene.catheter)
 
     @property
@@ -143,7 +143,7 @@ class Navigation(composer.Task):
         return (*readings.ModelIndex.FIELDS, *own)
 
     def __repr__(self) -> str:
-        """Name, anatomy, goal, device and what is observed."""
+        """Name, anatomy, goal, device and names of the observations."""
         scene = self.scene
         anatomy = (
             f"{self.num_anatomies} anatomies"
@@ -174,7 +174,7 @@ class Navigation(composer.Task):
 
     @property
     def observation(self) -> Mapping[str, np.ndarray]:
-        """Arrays (1, ...) of the last control step, or of the start."""
+        """Observation after the last control step or at the start, arrays (1, ...)."""
         return self._current().observation
 
     @property
@@ -211,7 +211,7 @@ class Navigation(composer.Task):
         )
 
     def after_compile(self, physics, random_state):
-        """Starts a rollout on the new model."""
+        """Makes the stepper and the rollout of the compiled model."""
         del random_state
         model = physics.model.ptr
         data, fields = physics.data.ptr, self.data_fields
@@ -225,7 +225,7 @@ class Navigation(composer.Task):
         self._compiled, self._step = True, None
 
     def initialize_episode(self, physics, random_state):
-        """Draws what differs between episodes and puts the device to its start."""
+        """Draws the episode and lays the device in its start posture."""
         self._step = None
         self.rollout.begin(_ONLY, [random_state])
         self._place_goal(physics)
@@ -237,8 +237,8 @@ class Navigation(composer.Task):
         return self.rollout.snapshot(_ONLY)
 
     def restore(self, physics, snapshot: Snapshot, random_state) -> None:
-        """Puts the episode to a snapshot; see `Environment.restore`."""
-        self._current()  # measures the start where nothing has been observed
+        """Restores a snapshot; see `Environment.restore`."""
+        self._current()  # measures the start if no observable has done so
         self._step = self.rollout.restore(_ONLY, snapshot, [random_state])
         self._place_goal(physics)
 
@@ -250,7 +250,7 @@ class Navigation(composer.Task):
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
         del physics, random_state
-        self._current()  # measures the start where nothing has been observed
+        self._current()  # measures the start if no observable has done so
         self.rollout.command(bounds.actions(action, (self.num_actions,))[None])
 
     @property
@@ -269,7 +269,7 @@ class Navigation(composer.Task):
         self._step = self.rollout.finish()
 
     def _current(self) -> Step:
-        """The last control step, or the start of the episode, looked at once."""
+        """Returns the last control step, or measures the start of the episode once."""
         if self._step is None:
             self._step = self.rollout.start(_ONLY)
         return self._step
@@ -280,7 +280,7 @@ class Navigation(composer.Task):
         return float(self._current().outcome.reward[0])
 
     def get_discount(self, physics) -> float:
-        """0 at success, an error of physics or `give_up`; the time limit keeps 1."""
+        """0 at success, physics error or `give_up`; 1 otherwise, also at time-out."""
         del physics
         return 0.0 if self._current().terminated[0] else 1.0
 
@@ -289,14 +289,14 @@ class Navigation(composer.Task):
         del physics
         return self.termination is not None
 
-    # What others may read.
+    # State of the task.
 
     @property
     def scene(self) -> Scene:
-        """Entities and where they stand, in the anatomy of this episode.
+        """Entities and their placement, in the anatomy of this episode.
 
-        Where episodes draw their anatomy, a batch has another scene in each
-        simulation: see `Rollout.case`. This is the first one then.
+        In a batch that draws anatomies, each simulation has its own scene, see
+        `Rollout.case`; this is the scene of the task's first anatomy.
         """
         return self.rollout.case().scene if self._compiled else self._scene
 
@@ -333,7 +333,7 @@ class Navigation(composer.Task):
 
     @property
     def devices(self) -> CoaxialReadings | None:
-        """State of coaxial devices, without a leading axis; None for one alone."""
+        """State of coaxial devices, without a leading axis; None for a single one."""
         self._current()
         return part(self.rollout.devices, 0)
 
@@ -351,7 +351,7 @@ class Navigation(composer.Task):
 
     @property
     def error(self) -> str | None:
-        """What went wrong with the physics, if the episode ended by that."""
+        """Physics error of the last control step, or None."""
         return None if self._step is None else self._step.errors[0]
 
     def info(self) -> dict[str, Any]:
@@ -362,8 +362,8 @@ class Navigation(composer.Task):
         """Contacts with the wall in the last physics step."""
         return self.rollout.index.contacts(physics.data.ptr.sensordata)
 
-    # TorchRL seeds a dm_control environment by replacing `task._random`; composer
-    # draws from a RandomState of its own. Both are this one.
+    # TorchRL seeds a dm_control environment by replacing `task._random`, and composer
+    # draws from a RandomState of its own; both use this source.
 
     @property
     def random(self) -> np.random.RandomState:

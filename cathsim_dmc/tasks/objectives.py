@@ -18,7 +18,7 @@ from cathsim_dmc.physics.readings import part
 
 _NOTHING = np.zeros(())
 GOAL_RADIUS = 8e-3  # m, δ of the published task
-_FARTHEST = 1.0  # m; a larger δ is one in millimetres
+_FARTHEST = 1.0  # m; a larger δ is taken for one given in millimetres
 GENTLE = 0.1  # N, sum of all contacts above which a push counts as hard
 # Weights of the published reward: minus the distance in metres, or 10 at success.
 PUBLISHED_REWARD: Mapping[str, float] = MappingProxyType(
@@ -60,7 +60,7 @@ class Outcome(NamedTuple):
 
 
 def straight(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Straight distances (...) between places (..., 3), m."""
+    """Euclidean distances (...) between points (..., 3), m."""
     way = end - start
     return np.sqrt(np.vecdot(way, way))
 
@@ -75,7 +75,8 @@ class Objective(Protocol):
         goal_radius: distance from the goal that counts as reached, m.
         terms: names of the reward terms of every outcome.
 
-    An objective that can do more derives from `Shiftable` or `Routed`.
+    An objective whose goal can be shifted derives from `Shiftable`, one with a route
+    from `Routed`.
     """
 
     @property
@@ -92,7 +93,7 @@ class Objective(Protocol):
         ...
 
     def path_distance(self, head: np.ndarray) -> np.ndarray:
-        """Way (...) from heads (..., 3) at the start to the goal along the route, m."""
+        """Length (...) of the route from heads (..., 3) at the start to the goal, m."""
         ...
 
 
@@ -103,13 +104,13 @@ Groups = Sequence[tuple[Objective, np.ndarray | slice]]
 def judge(
     groups: Groups, measurement: Measurement, failed: np.ndarray | None = None
 ) -> Outcome:
-    """Asks objectives about a control step of N simulations and checks their answers.
+    """Judges a control step of N simulations and checks the objectives' outcomes.
 
     Args:
         groups: Objectives with the rows of their simulations; all have the same terms.
-        measurement: What there is to judge, arrays (N, ...).
-        failed: (N,) bool, where the physics failed: there the reward and its terms are
-            0 and there is no success. None for nowhere.
+        measurement: Measurement of the control step, arrays (N, ...).
+        failed: (N,) bool, simulations whose physics failed: their reward, terms and
+            success are 0. None for no failure.
 
     Raises:
         ValueError: if an outcome has a wrong type or shape, or is not finite.
@@ -160,7 +161,7 @@ def _refuse(objective: Objective, given: str) -> NoReturn:
 
 
 class Shiftable(abc.ABC):
-    """An objective whose goal randomisation can move along its branch."""
+    """An objective with a goal that randomisation can shift along its branch."""
 
     @abc.abstractmethod
     def shifted(self, shift: np.ndarray) -> Objective:
@@ -183,8 +184,8 @@ class Cannulation(Shiftable, Routed):
 
     Success: the head is within `goal_radius` of the goal and inside the lumen of the
     branch, past its ostium. The reward is the sum of the weighted `TERMS` and of
-    "success". At success the terms of `UNTIL_SUCCESS` count nothing: with the
-    published weights the last reward is 10, and minus the distance before.
+    "success". At success the terms of `UNTIL_SUCCESS` are 0: with the published
+    weights the reward is minus the distance before success and 10 at success.
 
     Attributes:
         goal: (3,) or, if it differs between simulations, (N, 3), m, world frame.
@@ -193,7 +194,8 @@ class Cannulation(Shiftable, Routed):
         route: centreline from the inlet to the goal.
         goal_radius: δ, m.
         weights: reward term to its weight; terms without one are not computed.
-        goal_arc_length: () or (N,), of the goal on the route, m; None for its end.
+        goal_arc_length: () or (N,), of the goal on the route, m; None for the route's
+            end.
         lumen: shortest paths in the lumen to the end of the route; None without the
             term `path`.
     """
@@ -272,7 +274,7 @@ class Cannulation(Shiftable, Routed):
             reward: Weights of the reward terms.
             goal_radius: Distance from the goal that counts as reached, m; by default
                 8 mm, or what a short branch has room for.
-            farthest_shift: How far past the goal its place may be shifted, m.
+            farthest_shift: Largest shift of the goal away from the ostium, m.
         """
         vessel = anatomy.tree.vessel(goal.vessel)
         if goal_radius is None:
@@ -327,21 +329,22 @@ class Cannulation(Shiftable, Routed):
         return (place.distance <= place.radius) & (place.arc_length >= self.ostium)
 
     def lumen_distance(self, head: np.ndarray) -> np.ndarray:
-        """Shortest way (...) from heads (..., 3) to the goal inside the lumen, m.
+        """Shortest distance (...) inside the lumen from heads (..., 3) to the goal, m.
 
-        From a head in another branch it leads back through the parent vessel.
+        From a head in another branch, the path leads back through the parent vessel.
+        ValueError if the objective has no `lumen`.
         """
         if self.lumen is None:
             raise ValueError(
                 "the objective has no ways through the lumen; make it with "
                 "Cannulation.to and a reward with the term 'path'"
             )
-        # The goal lies on the way to the end of the route or at it.
+        # Paths are measured to the end of the route; the goal lies on them or at it.
         left = self.lumen(head) - self.lumen(self.goal)
         return np.maximum(left, self.distance(head))
 
     def path_distance(self, head: np.ndarray) -> np.ndarray:
-        """Way (...) along the route to the goal plus distance from the route, m."""
+        """Distance (...) along the route to the goal plus that from the route, m."""
         place = self.route.project_rows(head)
         if self.goal_arc_length is None:
             return self.route.length - place.arc_length + place.distance

@@ -1,4 +1,4 @@
-"""What the table of observations is made of: rows, their arrays and specs."""
+"""Rows of the table of observations, with their arrays and specs."""
 
 import dataclasses
 import math
@@ -36,7 +36,7 @@ class Frame(NamedTuple):
             `imaging.angiograph.masks`; (..., P, K + 1, 2) "pixels" of tracked points
             and goal, (column, row); endoluminal views; "rgb" and "depth".
         ahead: route ahead of the tip; None where no observation needs it.
-        devices: state of coaxial devices; None for a device alone.
+        devices: state of coaxial devices; None for a single device.
         vessel: state of the vessel; None for a rigid one with blood at rest.
         retry: (..., K), memory of the attempts, see `retry.shown`; None where no
             observation needs it.
@@ -56,7 +56,7 @@ class Frame(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """What the shapes of observations depend on.
+    """Sizes that the shapes of observations depend on.
 
     Attributes:
         actions: entries of an action.
@@ -65,7 +65,7 @@ class Sizes:
         devices: coaxial devices; 0 for a single device.
         fluoroscopy: set-up of the angiography machine.
         endoluminal: (rows, columns) of endoluminal views.
-        cameras: which of MuJoCo's are shown, and the size of their images.
+        cameras: names of MuJoCo's cameras that are shown, and size of their images.
     """
 
     actions: int = 0
@@ -122,7 +122,7 @@ class Entry:
 
 # Keys of TorchRL and of the environments, beside the observation.
 _RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "next")
-# What a row of the table may need.
+# Requirements of a row of the table, see `ObservationKind.needs`.
 FLUOROSCOPY, BIPLANE = "fluoroscopy", "fluoroscopy with two planes"
 ROUTE, OPENGL = "a route", "OpenGL"
 COAXIAL, LIVING = "coaxial devices", "a living vessel (option vessel)"
@@ -148,7 +148,7 @@ class ObservationKind:
 
 
 def flat(array: np.ndarray, axes: int) -> np.ndarray:
-    """Joins the last `axes` axes."""
+    """Flattens the last `axes` axes into one."""
     return array.reshape(array.shape[:-axes] + (-1,))
 
 
@@ -156,7 +156,10 @@ class ObservationTable(dict[str, ObservationKind]):
     """Observations by name."""
 
     def row(self, *entries: Entry, **options) -> Callable:
-        """Puts the decorated function into the table under its own name."""
+        """Returns a decorator that adds a function to the table under its own name.
+
+        ValueError if a key of an entry or the name is reserved or taken.
+        """
 
         def add(function: Callable[[Frame], Observation]):
             name = function.__name__
@@ -184,16 +187,16 @@ class ObservationTable(dict[str, ObservationKind]):
         coaxial: bool | None = None,
         living: bool | None = None,
     ) -> tuple[str, ...]:
-        """Names of the rows of an observation.
+        """Checks names of rows; returns them, followed by their `joined` rows.
 
         Args:
-            coaxial: Whether the devices are coaxial, so that the rows that they add
-                follow; None where that is not known, and none follow.
-            living: Whether the vessel lives; None where that is not known.
+            coaxial: Whether the devices are coaxial, which adds the joined rows; None
+                if that is not known, which adds none.
+            living: Whether the vessel is living; None if that is not known.
 
         Raises:
-            ValueError: if a name is unknown or comes twice, if there is none, or if one
-                needs coaxial devices or a vessel that lives.
+            ValueError: if there is no name, a name is unknown or repeated, or a row
+                needs coaxial devices or a living vessel, which the task lacks.
         """
         listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
         chosen = cast(tuple[str, ...], tuple(names) if listed else (names,))
@@ -223,7 +226,7 @@ class ObservationTable(dict[str, ObservationKind]):
     def check(
         self, observation: Observation, wanted: Mapping[str, specs.Array]
     ) -> None:
-        """Refuse arrays (N, ...) that are not as the specs of one simulation say."""
+        """Raise ValueError if arrays (N, ...) do not have a simulation's specs."""
         for key in sorted(observation.keys() | wanted.keys()):
             found = observation[key].shape[1:] if key in observation else None
             spec = wanted[key].shape if key in wanted else None

@@ -36,7 +36,7 @@ _actions, _joints, _devices = map(attrgetter, ("actions", "joints", "devices"))
 
 
 def _fluoroscopic(key: str, channels: int, unit: str, meaning: str) -> Entry:
-    """An image with so many channels for each plane."""
+    """Entry of a fluoroscopic image with `channels` channels for each plane."""
 
     def shape(sizes: Sizes) -> tuple[int, ...]:
         return (*sizes.fluoroscopy.resolution, sizes.fluoroscopy.planes * channels)
@@ -45,7 +45,7 @@ def _fluoroscopic(key: str, channels: int, unit: str, meaning: str) -> Entry:
 
 
 def _shown(entry: Entry, held: str = "", needs: str = "") -> None:
-    """Adds a row of one image, which the sensors hold under its key or another one."""
+    """Adds a row of one image; sensors hold it as `held`, or under the entry's key."""
     key, source = entry.key, held or entry.key
     OBSERVATIONS[key] = ObservationKind(
         lambda frame: {key: frame.images[source]}, (entry,), needs
@@ -213,7 +213,7 @@ route_observations.add_to(OBSERVATIONS)
     Entry("goal_from_head", 3, "m", "from the head to the goal, world frame"),
 )
 def goal(frame: Frame) -> Observation:
-    """Where the goal is, in the world and from the head."""
+    """Position of the goal in the world frame, and relative to the head."""
     head = frame.readings.head
     return {
         "goal_position": np.broadcast_to(frame.goal, head.shape),
@@ -255,7 +255,7 @@ def force(frame: Frame) -> Observation:
     needs=LIVING,
 )
 def vessel(frame: Frame) -> Observation:
-    """Heart, blood and wall of a vessel that lives."""
+    """Heart and breathing phase, blood velocity and indentation of a living vessel."""
     state = frame.vessel
     assert state is not None
     phases = 2 * np.pi * np.stack([state.heart_phase, state.breath_phase])
@@ -307,7 +307,7 @@ for _key, _unit, _seen, _planes, _high, _dtype in (
     needs=COAXIAL,
 )
 def drives(frame: Frame) -> Observation:
-    """How far the operator has pushed and turned each coaxial device."""
+    """Insertion and rotation of each coaxial device."""
     state = frame.devices
     assert state is not None
     return {"device_insertion": state.insertion, "device_rotation": state.rotation}
@@ -332,7 +332,7 @@ def drives(frame: Frame) -> Observation:
     needs=COAXIAL,
 )
 def devices(frame: Frame) -> Observation:
-    """Shape of each coaxial device and the load on it."""
+    """Tip rotations and points of the coaxial devices, and the loads on them."""
     state = frame.devices
     assert state is not None
     return {

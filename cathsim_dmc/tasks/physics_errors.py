@@ -32,13 +32,13 @@ def escaped(
 
     Args:
         centreline: (..., n, 3), nodes of the devices, m, world frame.
-        along: (3,) unit vector of the sheath, which need not stand as the vessel does.
-        indentation: Of a compliant wall, from which control steps are repeated, m; None
-            for a rigid one.
+        along: (3,) unit vector of the sheath, which may be tilted against the inlet.
+        indentation: Depth in a compliant wall from which control steps are repeated, m;
+            None for a rigid wall.
 
     Returns:
-        (...) bool: some node past the inlet lies more than 2 mm outside the lumen, in a
-        compliant wall more than the indentation and 1 mm.
+        (...) bool: a node past the inlet is more than 2 mm outside the lumen, or, in a
+        compliant wall, more than `indentation` + 1 mm.
     """
     deep = _ESCAPE_DEPTH
     if indentation is not None:
@@ -56,19 +56,19 @@ def found(
     force: np.ndarray,
     indentation: float | None = None,
 ) -> tuple[str | None, ...]:
-    """What went wrong in the last control step of N simulations, None for nothing.
+    """Physics error of each of N simulations in the last control step, or None.
 
     Args:
-        case: Gives the case of a simulation by its number.
+        case: Function from the number of a simulation to its case.
         steps: (N,), control steps of the episodes.
-        nodes: (N, n, 3), nodes of the devices where they are in the vessel at rest, m.
+        nodes: (N, n, 3), nodes of the devices, mapped to the vessel at rest, m.
         warned: (N,) bool, whether MuJoCo has warned.
         force: (N,), largest contact force in any physics step, N.
         indentation: See `escaped`.
     """
     errors: list[str | None] = [None] * len(steps)
     due: dict[Case, list[int]] = {}
-    # Of few simulations, plain numbers take less time than arrays.
+    # With few simulations, plain numbers are faster than arrays.
     ends = zip(steps.tolist(), warned.tolist(), force.tolist(), strict=True)
     for index, (step, has_warned, hardest) in enumerate(ends):
         if has_warned:

@@ -16,22 +16,23 @@ from cathsim_dmc.tasks.config import WORKING_LENGTHS
 # The steerable tip starts free of the sheath wherever the way to the first branching
 # is long enough.
 _FREE_LENGTH = 0.005  # m of shaft out of the sheath behind the tip
-# At the start the head has come no further than this part of the way to the first
-# branching, to the end of the vessel and to the goal, so that all of them lie ahead.
+# Largest start depth, as a fraction of the distance to the first branching, the end of
+# the vessel and the goal, so that all of them lie ahead.
 _LARGEST_SHARE = 0.5
-# Way beyond the goal that the stroke leaves for detours and wrong branches: half a turn
-# along the outer wall of an arch of 14 mm radius is 41 mm longer than its centreline.
-# The expert arrives with 4 to 33 mm less than the route to the goal.
+# Stroke beyond the goal, for detours and wrong branches: half a turn along the outer
+# wall of an arch of 14 mm radius is 41 mm longer than its centreline. The insertion of
+# the expert at the goal is 4 to 33 mm less than the length of the route.
 _SPARE_STROKE = 0.04  # m
 _BASE_LENGTH = 0.02  # m of device that never leaves the sheath
-# Length of the device that observations show, see `common_chain`. It is divided into
-# links; a task simulates as many of the distal ones as can leave the sheath.
+# Length of the device that observations show, see `common_chain`. A task simulates only
+# those of its distal links that can leave the sheath.
 COMMON_LENGTH = 0.34  # m
 _LINE_SPACING = 1e-3  # m
-# The wall is 4 mm thick; nearer to the inlet the sheath touches the inlet's own.
+# Least distance of the sheath's axis from any lumen, m: the wall is 4 mm thick. Nearer
+# to the inlet than `_NEAR_INLET` the sheath touches the inlet's own wall.
 _CLEAR_OF_LUMEN = 5.5e-3  # m
 _NEAR_INLET = 0.015  # m
-# Within this way of the plane of the inlet, m, the sheath holds the device.
+# Distance from the plane of the inlet within which the sheath holds the device, m.
 _MOUTH = 2e-3
 # Tilts of the sheath that are tried where the straight one crosses a vessel; the first
 # 40 arches of the set "test" need 17.5 degrees at most.
@@ -47,11 +48,11 @@ class Placement:
         inlet: (3,), mouth of the sheath in the plane of the inlet.
         direction: (3,), unit vector of insertion at the inlet, see `sheath_direction`.
         quaternion: (4,) wxyz, turns +z into the direction of insertion.
-        start_depth: way of the tip past the inlet at zero insertion, m.
+        start_depth: distance of the tip past the inlet at zero insertion, m.
         stroke: longest insertion, m.
         working_length: simulated length of the device, m.
-        line: (k, 3), m, frame of the base at zero insertion: way of the device from its
-            base through the sheath, and on along the vessel's centreline.
+        line: (k, 3), m, frame of the base at zero insertion: path of the device from
+            its base through the sheath, then along the vessel's centreline.
     """
 
     inlet: np.ndarray
@@ -74,9 +75,10 @@ class Placement:
 
 
 def resolve_goal(anatomy: Anatomy, goal: "str | Goal | Sequence[float]") -> Goal:
-    """The goal, by name, as given, or at a place (3,) of the anatomy's file.
+    """Returns a goal given by name, as a `Goal`, or as a position (3,).
 
-    ValueError if it is outside the lumen, or a place past which a device starts.
+    The position has unit and frame of the anatomy's file, see `Anatomy.goal_at`.
+    ValueError if it is outside the lumen, or a device would start past it.
     """
     if isinstance(goal, str):
         goal = anatomy.goal(goal)
@@ -103,17 +105,17 @@ def place_device(
     working_length: float | None = None,
     farthest_shift: float = 0.0,
 ) -> Placement:
-    """Puts a device to the inlet of an anatomy.
+    """Places a device at the inlet of an anatomy.
 
     Args:
         goal: Goal that the device must be able to reach.
-        device: Device; the length of its tip decides how far it starts inside.
+        device: Device; the length of its tip limits the start depth.
         working_length: Simulated length, m; None for what the goal needs.
-        farthest_shift: How far past its place the goal may be shifted, m.
+        farthest_shift: Largest shift of the goal past its place, m.
 
     Raises:
-        ValueError: if `working_length` is shorter than the tip and its start need, or
-            longer than any device is.
+        ValueError: if `working_length` is too short for the tip and the start depth, or
+            longer than any device.
     """
     inlet = anatomy.inlet
     route = anatomy.route(goal, farthest_shift)
@@ -135,12 +137,12 @@ def place_device(
             "most"
         )
     direction = sheath_direction(anatomy)
-    if direction is None:  # what lies in the way is refused once the device is there
+    if direction is None:  # `start.StartPosture` refuses a device that stands in a wall
         direction = np.array(inlet.direction)
     quaternion = _frame(direction)
     matrix = _matrix(quaternion)
     outside = np.array([0.0, 0.0, working_length - start_depth])
-    # Longer than the device lies in, whose links are chords of the line.
+    # Longer than the inserted part of the device, whose links are chords of the line.
     ahead = np.arange(0.0, route.length, _LINE_SPACING)
     inside = (route.at(ahead).position - inlet.position) @ matrix
     # The first point of the route is the inlet; the sheath ends there, straight.
@@ -157,7 +159,7 @@ def place_device(
 
 
 def _whole_links(length: float, device: devices.Device) -> float:
-    """The length, or a little more, that whole links of the common chain have, m."""
+    """Rounds a length, m, up to whole links of the common chain."""
     common = devices.Discretisation(max(COMMON_LENGTH, 2 * device.tip_length))
     link = common.link_lengths(device)[0]
     count = math.ceil(round((length - device.tip_length) / link, 6))
@@ -167,14 +169,13 @@ def _whole_links(length: float, device: devices.Device) -> float:
 def sheath_direction(anatomy: Anatomy) -> np.ndarray | None:
     """Direction (3,) of insertion that keeps the sheath outside all vessels.
 
-    It is the inlet's own wherever a straight sheath fits behind the inlet. Where the
-    aorta bends back on itself, that line may cross another part of it, and the device
-    would stand in a wall before it begins: the sheath is then tilted about its mouth,
-    by as little as it takes.
+    It is the inlet's own direction if a straight sheath fits behind the inlet. If a
+    vessel crosses that line, as where the aorta bends back on itself, the sheath is
+    tilted about its mouth by the smallest angle that clears it.
 
     Returns:
-        Unit vector, or None if the sheath crosses a vessel at any tilt that a device
-        can be expected to enter with.
+        Unit vector, world frame; None if the sheath crosses a vessel at every tilt up
+        to 30 degrees.
     """
     inlet = anatomy.inlet
     along = np.asarray(inlet.direction, dtype=float)
@@ -200,7 +201,7 @@ def _clear(anatomy: Anatomy, directions: np.ndarray) -> np.ndarray:
 
 
 def _way_to_branching(anatomy: Anatomy) -> float:
-    """Way from the inlet to the nearest branching or far end of its vessel, m."""
+    """Distance from the inlet to the nearest branching or end of its vessel, m."""
     tree, inlet = anatomy.tree, anatomy.inlet
     vessel = tree.vessel(inlet.vessel)
     start = float(vessel.centreline.project(inlet.position).arc_length)
@@ -240,10 +241,10 @@ def _frame(direction: np.ndarray) -> np.ndarray:
 
 
 def past_sheath(anatomy: Anatomy, nodes: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Which nodes (..., n, 3) of devices, m, world frame, are in the vessel.
+    """Finds the nodes (..., n, 3) of devices, m, world frame, that are past the sheath.
 
     Args:
-        along: (3,) unit vector of the sheath, which need not stand as the vessel does.
+        along: (3,) unit vector of the sheath, which may be tilted against the inlet.
 
     Returns:
         (..., n) bool: False in the sheath and within 2 mm of its mouth.

@@ -1,4 +1,4 @@
-"""Where N heads are on their routes, and what is remembered of their attempts."""
+"""Places of N heads on their routes, and the memory of their attempts."""
 
 from collections.abc import Mapping, Sequence
 
@@ -29,19 +29,19 @@ class Progress:
 
     Attributes:
         shown: Whether policies observe the memory.
-        ends: Whether episodes end where it gives up.
-        settings: Of the memory.
-        memory: Arrays (N,); None where neither task nor policy needs it.
+        ends: Whether episodes end when the memory gives up.
+        settings: Settings of the retries.
+        memory: Arrays (N,); None if neither task nor policy needs it.
     """
 
     def __init__(
         self, names: Sequence[str], cases: Sequence[Case], count: int, ends: bool
     ):
-        """Prepares what observations of these names and the end of episodes need.
+        """Prepares routes and memory, as far as observations or `ends` need them.
 
         Raises:
             ValueError: if an objective is not `Routed`, two memories are observed, or
-                what is left to turn without the memory that it follows from.
+                `route_turns` is observed without `route_retry`.
         """
         self._cases, self._count, self.ends = cases, count, ends
         shown = [name for name in _SHOWN if name in names]
@@ -68,14 +68,14 @@ class Progress:
         self._routes: list[Route] = []
         if self._observed:
             self._routes = [Route.of(case.objective) for case in cases]
-        # A memory that a policy alone has asked for is no part of the task.
+        # A memory that only a policy needs is not part of the state.
         self.state = ("memory",) if self.shown or ends else ()  # see `snapshot`
         if self.state:
             self._prepare()
 
     def _prepare(self) -> None:
-        """A memory of nothing yet, and what it needs to know of the routes."""
-        if not self._of_images:  # otherwise a policy does not know them
+        """Makes an empty memory, and finds what it needs of the routes."""
+        if not self._of_images:  # a policy of images does not know the routes
             self._routes = self._routes or [Route.of(c.objective) for c in self._cases]
         routes = [] if self._of_images else self._routes
         least = _ROOM * self._radius
@@ -83,7 +83,7 @@ class Progress:
         last = len(self.settings.pattern.leads) - 1
         blunt = [retry.blunt(self.settings, route) for route in routes]
         self._tight, self._first = tight, last * np.array(blunt, int)
-        alone = np.inf, False  # one device follows to no take-off
+        alone = np.inf, False  # for a single device, no take-off counts as close
         ends = [take_offs.followed(r) if self._coaxial else alone for r in routes]
         self._ostium = np.array([end if close else np.inf for end, close in ends])
         far = take_offs.last_apart if self._coaxial else lambda route: np.inf
@@ -92,11 +92,11 @@ class Progress:
         self.memory = Memory.at(nowhere, np.zeros(self._count))
 
     def remember(self, chosen: np.ndarray, state: Readings | None) -> Memory:
-        """The memory; it begins now if there was none.
+        """Returns the memory; makes it at the first call if there is none.
 
         Args:
             chosen: (N,) int, number of the anatomy of each simulation.
-            state: Of the devices in the vessel at rest; None before any episode.
+            state: Readings mapped to the vessel at rest; None before any episode.
 
         Raises:
             ValueError: if an objective is not `Routed`.
@@ -110,11 +110,11 @@ class Progress:
 
     @property
     def given_up(self) -> np.ndarray | bool:
-        """(N,) bool, whose episodes end because the memory gives up."""
+        """(N,) bool, or False: whether an episode ends because the memory gives up."""
         return self.ends and self.memory is not None and self.memory.given_up
 
     def steady(self, rows: np.ndarray, begins: bool) -> np.ndarray:
-        """(N,) m, places to stay near, see `route.locate`; NaN where there are none.
+        """Last arc lengths (N,), m, for `route.locate`; NaN where there is none.
 
         Args:
             rows: (K,) numbers of the simulations that are observed anew.
@@ -138,13 +138,13 @@ class Progress:
         """Begins or advances the memory, if there is one, after a control step.
 
         Args:
-            rows: (K,) numbers of the simulations that begin, otherwise of all; none
-                where nothing has moved.
+            rows: (K,) numbers of the simulations that begin an episode, or of all;
+                empty if nothing has moved.
             begins: Whether they begin an episode.
             chosen: (N,) int, number of the anatomy of each simulation.
-            state: Of the devices as policies see them, in the vessel at rest.
-            images: What sensors see, with "biplane_place" and "biplane_deviation"
-                where the memory is of the route through both roadmaps.
+            state: Readings as policies see them, mapped to the vessel at rest.
+            images: Images of the sensors, with "biplane_place" and "biplane_deviation"
+                if the memory is that of `biplane_retry`.
         """
         if self.memory is None or not len(rows):
             return
@@ -165,12 +165,12 @@ class Progress:
             )  # fmt: skip
 
     def restart(self, rows: np.ndarray, chosen: np.ndarray, state: Readings) -> None:
-        """Begins a memory that is no part of the task, where heads are put elsewhere.
+        """Restarts a memory that is not part of the state, after a restore.
 
         Args:
             rows: (K,) numbers of the simulations.
             chosen: (N,) int, number of the anatomy of each simulation.
-            state: Of the devices, in the vessel at rest.
+            state: Readings mapped to the vessel at rest.
         """
         if self.memory is not None and not self.state:
             place = locate_each(self._routes, chosen, state.head)
@@ -206,12 +206,14 @@ class Progress:
     def ahead(
         self, chosen: np.ndarray, state: Readings, devices: CoaxialReadings | None
     ) -> Ahead | None:
-        """The route ahead, from the place in the memory where that is observed.
+        """Returns the route ahead of the heads; None if no observation needs it.
+
+        It starts at the memory's places of the heads if `route_retry` is observed.
 
         Args:
             chosen: (N,) int, number of the anatomy of each simulation.
-            state: Of the devices as policies see them, in the vessel at rest.
-            devices: Of coaxial devices; None for one alone.
+            state: Readings as policies see them, mapped to the vessel at rest.
+            devices: State of coaxial devices; None for a single one.
         """
         if not self._observed:
             return None
@@ -234,10 +236,11 @@ class Progress:
         state: Readings,
         devices: CoaxialReadings,
     ) -> np.ndarray:
-        """Ways (N, K, 3), m, to the route, see `CoaxialEnds.directions`.
+        """Vectors (N, K, 3), m, to points of the route, see `CoaxialEnds.directions`.
 
         Args:
-            ahead: (N, 1) or one, way along the route from each end to its point, m.
+            ahead: (N, 1) or scalar, distance along the route from each end to its
+                point, m.
         """
         assert self._ends is not None
         ends = place.arc_length[:, None] - coaxial_ends.gaps(devices.insertion) + ahead
@@ -254,7 +257,7 @@ class Progress:
         state: Readings,
         devices: CoaxialReadings,
     ) -> np.ndarray | None:
-        """`Ahead.turns`; None where it is not observed."""
+        """Computes `Ahead.turns`; None if it is not observed."""
         if not self._turns:
             return None
         assert self.memory is not None
@@ -270,7 +273,7 @@ class Progress:
         return np.stack([coaxial_ends.wrapped(error), away], axis=-1)
 
     def seen(self, state: Readings) -> np.ndarray | None:
-        """What policies see of the memory, see `retry.shown`; None if nothing."""
+        """Returns the observed memory, see `retry.shown`; None if none is observed."""
         if not self.shown or self.memory is None:
             return None
         return retry.shown(

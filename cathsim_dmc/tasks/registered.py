@@ -1,4 +1,4 @@
-"""The tasks that the suite comes with."""
+"""Definitions of the suite's own tasks."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -19,7 +19,8 @@ _PHANTOMS = {
     "type3": "Type-III arch",
     "bovine": "Bovine arch",
 }
-# What the longest routes to BCA and LCCA need, 0.167 and 0.274 m, see `placement`.
+# Working lengths by access, m, for the longest routes to BCA and LCCA, 0.167 and
+# 0.274 m, see `placement`.
 _ARCH_LENGTHS = {"ascending": 0.24, "descending": placement.COMMON_LENGTH}
 # Access, prefix of the name, anatomies ("arch" for random ones) and goals.
 _TABLE = (
@@ -39,7 +40,7 @@ COAXIAL = {
 
 
 def definitions() -> Iterator[tuple[str, TaskDefinition, tuple[str, ...]]]:
-    """Name, definition and tags of each task, which say how hard it is."""
+    """Yields each task's name, definition and tags: "easy", "hard" or none."""
     single = list(_single())
     yield from single
     for name, definition, _ in single:
@@ -55,7 +56,7 @@ def definitions() -> Iterator[tuple[str, TaskDefinition, tuple[str, ...]]]:
 
 
 def _single() -> Iterator[tuple[str, TaskDefinition, tuple[str, ...]]]:
-    """Those of the usual device."""
+    """Yields the tasks with the default device."""
     rows = [(*row[:2], a, g) for row in _TABLE for a in row[2] for g in row[3]]
     for access, prefix, anatomy, goal in rows:
         drawn = anatomy == "arch"

@@ -1,7 +1,7 @@
-"""Rehearsal: loops are compiled when a task is loaded, not in its first episode.
+"""Rehearsal: compiles loops when a task is loaded, not in its first episode.
 
-Loops are compiled when they are first called. Where a process finds some that are not
-kept on disk, an episode begins, and does a control step, in a copy of the simulations.
+numba compiles a loop at its first call. If a process has compiled one that was not
+cached on disk, a copy of the simulations begins an episode and does a control step.
 """
 
 from typing import Any
@@ -14,9 +14,9 @@ from cathsim_dmc.tasks.rollout import Rollout
 
 
 def is_due(config: NavigationConfig) -> bool:
-    """Whether loops have been compiled; never with effects of one's own.
+    """Whether loops have been compiled; always False with a user's own effects.
 
-    Those may share what they hold with their copies.
+    These may share state with their copies.
     """
     from cathsim_dmc import compiled_cache  # late, as numba takes long
 
@@ -24,10 +24,10 @@ def is_due(config: NavigationConfig) -> bool:
 
 
 def rehearse(rollout: Rollout, stepper: Any, num_actions: int) -> None:
-    """Begins an episode, and does a control step, of simulations that nobody has.
+    """Begins an episode and does a control step in simulations that are then dropped.
 
     Args:
-        rollout: Their course.
+        rollout: Rollout of these simulations.
         stepper: Does their physics steps.
         num_actions: Entries of an action.
     """
@@ -37,4 +37,4 @@ def rehearse(rollout: Rollout, stepper: Any, num_actions: int) -> None:
     rollout.start(everyone)
     rollout.command(np.zeros((len(everyone), num_actions)))
     stepper.run()
-    rollout.finish(logs=False)  # nobody has these simulations
+    rollout.finish(logs=False)  # errors of dropped simulations concern nobody

@@ -1,8 +1,8 @@
-"""Snapshots of a rollout: its whole state, gathered and put back in one place.
+"""Snapshots of a rollout: gathers and restores its whole state.
 
 The state is what holders name in their attribute `state`, and what the stepper keeps.
 `tests/test_tasks_snapshot.py` fails where an attribute of a holder changes during an
-episode and is neither named nor derived from what is.
+episode and is neither named nor derived from named ones.
 """
 
 import hashlib
@@ -36,11 +36,11 @@ def describe(
     model: mujoco.MjModel,
     config: NavigationConfig,
 ) -> dict[str, Any]:
-    """What tasks have in common that can go on from each other's snapshots.
+    """Returns what two tasks must share to restore each other's snapshots, JSON-able.
 
-    Friction, time limit, reward and what an agent sees may differ. Devices and sheath
-    may not: a snapshot holds the stiffness of the hinges, those held by the sheath too,
-    and the masses of links, some of which stay as they are at the start.
+    Friction, time limit and reward may differ, and observations that keep no state.
+    Devices and sheath may not: a snapshot holds stiffnesses of hinges, those held by
+    the sheath too, and masses of links, some of which keep their values of the start.
     """
     anatomies = {
         f"{case.scene.anatomy.name} {case.scene.anatomy.digest}": (
@@ -48,7 +48,7 @@ def describe(
         )
         for case in cases
     }
-    # By the number that a state holds.
+    # Ordered by the case number that a state holds.
     numbered = [[case.scene.anatomy.name, case.scene.goal.name] for case in cases]
     return {
         "goal": scene.goal.name,
@@ -68,14 +68,14 @@ def describe(
 
 
 def _named(device: Device) -> str:
-    """Name of a device; of one that is not of the library with a digest of it."""
+    """Name of a device, followed by a digest if it is not one of the library."""
     if DEVICES.get(device.name) == device:
         return device.name
     return f"{device.name} {hashlib.sha256(repr(device).encode()).hexdigest()[:8]}"
 
 
 def _check_state(holder: Any, name: str, value: Any, count: int) -> None:
-    """Refuses (TypeError) what an effect names as its state and cannot be restored."""
+    """Raise TypeError if a state that an effect names cannot be restored."""
     wrong = isinstance(value, list) or (
         isinstance(value, np.ndarray) and value.shape[:1] != (count,)
     )
@@ -103,7 +103,7 @@ class Restorable:
     _tracking: TrackingNoise
 
     def holders(self) -> dict[str, Any]:
-        """What has a state in Python; each names its attributes in `state`."""
+        """Objects with state in Python, by name; `state` names their attributes."""
         sensors, tracking = self._sensors, self._tracking
         numbered = enumerate(self.effects)
         return {
@@ -117,19 +117,20 @@ class Restorable:
 
     @property
     def half_done(self) -> np.ndarray:
-        """(N,) bool, whose last step or reset an error or an interrupt has left."""
+        """(N,) bool, whether an error has left the last step or reset half done."""
         return self._open.copy()
 
     def snapshot(self, indices: np.ndarray, random: bool = True) -> Snapshot:
-        """The state of some simulations (K,) between two control steps.
+        """Returns the state of some simulations (K,) between two control steps.
 
         Args:
             indices: Their numbers.
-            random: Whether with the sources of randomness.
+            random: Whether the sources of randomness are included.
 
         Raises:
             RuntimeError: if no episode has begun, or a step is half done.
-            NotImplementedError: if whoever steps them has no snapshots.
+            NotImplementedError: if the stepper has no snapshots.
+            TypeError: if an effect names a state that cannot be restored.
         """
         if not self._stepper.has_snapshots:
             raise NotImplementedError(
@@ -157,15 +158,16 @@ class Restorable:
         snapshot: Snapshot,
         random_states: Sequence[RandomState],
     ) -> Step:
-        """Puts some simulations (K,), each of which has an episode, to a snapshot.
+        """Restores a snapshot to some simulations (K,), each of which has an episode.
 
         Args:
             indices: Their numbers, in ascending order.
-            snapshot: Of K simulations of this task, perhaps of another process.
-            random_states: N sources of randomness, of which K are put back.
+            snapshot: Snapshot of K simulations of this task; it may come from another
+                process.
+            random_states: N sources of randomness; those of the K are restored.
 
         Returns:
-            All simulations as they stand.
+            State of all simulations.
 
         Raises:
             ValueError: if the snapshot is of another task.
@@ -175,7 +177,7 @@ class Restorable:
         numbers = snapshot.arrays["rollout._case_of"]
         if not ((numbers >= 0) & (numbers < len(self._cases))).all():
             raise ValueError(f"the snapshot is of the anatomies {numbers.tolist()}")
-        self._open[indices] = True  # until it is put back whole
+        self._open[indices] = True  # until the restore is complete
         self._random_states = list(random_states)
         if len(self._cases) > 1:
             for index, number in zip(indices.tolist(), numbers.tolist(), strict=True):
@@ -195,7 +197,7 @@ class Restorable:
         return step
 
     def _place_machine(self, index: int) -> None:
-        """Puts the angiography machine before one simulation."""
+        """Sets the planes of one simulation to its case and its machine's deviation."""
         if self._sensors.planes:
             machine = self.case(index).angiograph
             self._sensors.planes[index] = machine.planes(self.deviations[index])
@@ -206,9 +208,9 @@ class Restorable:
         return self._cases[self._case_of[index]]
 
     def _load(self, index: int, number: int) -> None:
-        """Puts one simulation into one of several cases."""
+        """Loads one of several cases into one simulation."""
         raise NotImplementedError
 
     def _derive(self, indices: np.ndarray) -> Step:
-        """What follows from the state, after some simulations (K,) are put back."""
+        """Derives the other quantities after some simulations (K,) are restored."""
         raise NotImplementedError

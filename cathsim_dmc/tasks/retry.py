@@ -1,16 +1,16 @@
-"""Memory of the attempts along a route, from what a policy may see alone.
+"""Memory of the attempts along a route, computed only from what a policy may observe.
 
-An automaton over the place of the head on the route, the insertion and the force of the
-base. A task advances it once in a control step, whoever acts; the expert decides by it,
-and a policy that observes it needs no recurrence.
+It is an automaton over the place of the head on the route, the insertion and the force
+of the base. A task advances it once per control step, whichever policy acts. The expert
+decides by it; a policy that observes it needs no recurrence.
 
-When the head makes no progress, has left the tube of the route as in a wrong branch, or
-the base is pushed too hard, the device is withdrawn until the head is back in the
-route, from farther back with each retry, and tries again. A shaft that buckles into a
-wide vessel while the head stays is given up too; taking up that slack lets the head
-spring forward, so of such retries most withdraw only as long as the head does not come
-back. Where the lumen ahead is narrower than the device, or the base was pushed too hard
-at one place several times, there is no further attempt.
+A retry begins when the head makes no progress, has left the tube of the route (as in a
+wrong branch), the base is pushed too hard, or the shaft buckles in a wide vessel. The
+device is withdrawn until the head is back in the route, farther with each retry, and
+then advances again. Taking up the slack of a buckled shaft lets the head spring
+forward, so most retries of coaxial devices end as soon as the head moves back. The
+memory gives up where the lumen ahead is narrower than the device, or after several
+retries at one place because of hard pushes.
 
 Pure functions of arrays with leading batch axes, written `...`; metres and newtons.
 """
@@ -24,11 +24,11 @@ from cathsim_dmc.tasks.route import Place, Route
 from cathsim_dmc.tasks.take_offs import bend
 
 _WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
-_GROWING = 4  # retries over which the way back, and the slack, grow
+_GROWING = 4  # retries over which the withdrawal and the slack grow
 _SAME_PLACE = 5e-3  # m of the route
-_PAST = 3e-3  # m from a close take-off on, where vessels lie side by side
-_ALONE = 20e-3  # m that a wire goes ahead from a held branch before it is followed
-# Scales of what a policy sees.
+_PAST = 3e-3  # m past a close take-off, where vessels lie side by side
+_ALONE = 20e-3  # m, lead of a wire past a held branch before the catheter follows
+# Scales of the observation.
 _SEEN_WAY, _SEEN_LEAD, _SEEN_ATTEMPTS, _MOST_LEAD = 20e-3, 20e-3, 4, 2.0
 RETRY_ENTRIES, COAXIAL_RETRY_ENTRIES = 11, 15
 SHOWN = (
@@ -43,12 +43,12 @@ SHOWN = (
 
 @dataclasses.dataclass(frozen=True)
 class Pattern:
-    """What successive attempts differ in, over and over.
+    """Parameters that successive attempts cycle through.
 
     Attributes:
-        lookahead_factors: of the look-ahead.
-        leads: by how much each coaxial device is ahead of the one around it, m;
-            negative where it stays behind in it.
+        lookahead_factors: factors of the look-ahead.
+        leads: lead of each coaxial device over the one around it, m; negative if it
+            stays behind.
         offsets: added to the direction of coaxial devices, rad.
     """
 
@@ -59,37 +59,38 @@ class Pattern:
 
 @dataclasses.dataclass(frozen=True)
 class RetrySettings:
-    """When to give an attempt up, how far to withdraw, and what the next one changes.
+    """When a retry begins, how far it withdraws, and what the next attempt changes.
 
     Attributes:
-        progress: m; what the head must gain to count as moving.
+        progress: least advance of the head along the route that counts as progress, m.
         patience: control steps without progress until a retry.
         lost_patience: control steps outside the route's tube until a retry.
-        tolerance: by how much of its radius the lumen may exceed the route's tube.
+        tolerance: largest `Place.excess` that counts as inside the route's tube.
         hard_push: force of the base above which it is pushed too hard, N.
         deep_push: likewise past the last of several take-offs that lie apart, where
-            the friction in the bends before takes up more of the push.
+            friction in the bends takes up more of the push, N.
         push_patience: control steps of such a push until a retry.
-        most_pushed: retries after such pushes at one place, with which it gives up.
-        backoff: way back of the first retry, m.
-        backoff_growth: of the way back from each retry to the next, up to the fourth.
+        most_pushed: number of retries after such pushes at one place at which the
+            memory gives up.
+        backoff: withdrawal of the first retry, m.
+        backoff_growth: share of `backoff` that each retry adds; the withdrawal starts
+            anew after every fourth retry.
         longest: control steps after which a withdrawal ends inside the tube.
         slack: Buckling threshold: advance of the base without the head, m.
-        slack_growth: share of `slack` that each attempt adds, over four attempts, then
-            anew: a shaft takes up more in a wide aorta before its end moves; none on
-            routes with a take-off close to the first one, where slack pushes a catheter
-            out.
+        slack_growth: share of `slack` that each attempt adds, anew after every fourth:
+            a shaft takes up more in a wide aorta before its end moves. None on routes
+            with a take-off close to the first one, where slack pushes a catheter out.
         give: distance that the head may move back while slack is taken up, m.
         thorough: every n-th retry withdraws the whole way, not the slack alone.
         middle: excess below which a head past a take-off close to the first one is in
-            the right branch; then a withdrawal ends, and not before.
-        held: how far past such a take-off a leading catheter holds it, so that the wire
-            goes on, m.
-        lookahead: longest way along the route to the point pursued, m, before the
-            factor of the attempt.
-        least_lookahead: shortest likewise, m; about one link of the tip.
-        lookahead_radii: in between it is so many radii of the lumen.
-        pattern: of the attempts.
+            the right branch; a withdrawal there ends only below it.
+        held: distance past such a take-off from which the catheter holds the branch and
+            only the wire advances, m.
+        lookahead: longest look-ahead along the route, m, before the factor of the
+            attempt.
+        least_lookahead: shortest look-ahead, m; about one link of the tip.
+        lookahead_radii: look-ahead between these limits, in radii of the lumen.
+        pattern: parameters of the attempts.
         close: likewise on routes with a take-off close to the first one.
         sharp, planar: turn of the route into its last branch, rad, and cosine between
             the planes of this turn and of the bend before it, below either of which
@@ -151,12 +152,12 @@ COAXIAL = RetrySettings(
 
 
 class Memory(NamedTuple):
-    """What is remembered of the attempts of an episode, arrays (...).
+    """Memory of the attempts of an episode, arrays (...).
 
     Attributes:
-        arc_length: of the place of the head on the route, m.
+        arc_length: arc length of the head's place on the route, m.
         excess: `Place.excess` there.
-        retracting: bool.
+        retracting: bool, whether the device is being withdrawn.
         taking_up: bool, whether the retraction ends when the slack is taken up.
         turn: insertion to be withdrawn to while retracting, m.
         best: farthest place on the route in this attempt, m.
@@ -167,10 +168,11 @@ class Memory(NamedTuple):
         barrier: place of the first retry after such a push, m.
         pushed: number of these retries at that place.
         attempts: retries so far.
-        first: number of the lead that the first attempt has.
+        first: index of the first attempt's lead in `Pattern.leads`.
         ostium: arc length of the last take-off close to the first one, m; infinite
             without.
-        last: of the last of several take-offs that lie apart, likewise.
+        last: arc length of the last of several take-offs that lie apart, m; infinite
+            without.
         given_up: bool, whether there is no further attempt.
     """
 
@@ -213,10 +215,10 @@ class Memory(NamedTuple):
 
     @property
     def steady(self) -> np.ndarray:
-        """Places (...) to stay near, m; NaN in even attempts.
+        """Last arc lengths (...) for `route.locate`, m; NaN in even attempts.
 
-        In every other attempt the head's place does not jump: both ways fail in some
-        branchings.
+        In odd attempts the head's place stays near the last one. Either choice fails in
+        some branchings.
         """
         return np.where(self.attempts % 2 == 1, self.arc_length, np.nan)
 
@@ -229,11 +231,11 @@ def advance(
     push: np.ndarray,
     narrow: np.ndarray | bool = False,
 ) -> Memory:
-    """Counts progress over a control step; begins and ends retries.
+    """Returns the memory after a control step; begins and ends retries.
 
     Args:
-        place: Of the head on the route, arrays (...).
-        insertion: (...), of the head's device, m.
+        place: Place of the head on the route, arrays (...).
+        insertion: (...), insertion of the head's device, m.
         push: (...), force of the base, positive forward, N.
         narrow: (...) bool, whether the lumen ahead is narrower than the device.
     """
@@ -260,7 +262,7 @@ def advance(
     # Taking up slack ends when the head comes back with the shaft.
     comes_back = taking_up & ~give_up & (place.arc_length < best - s.give)
     back = (insertion <= turn) | comes_back | m.retracting & (stale > s.longest)
-    # Past a close take-off only the middle of the lumen is in the right branch.
+    # Past a close take-off, only a head in mid-lumen is sure to be in the right branch.
     past, middle = place.arc_length > m.ostium + _PAST, place.excess <= s.middle
     falls_in = m.retracting & ~taking_up
     back = np.where(past, (back | falls_in) & middle, back & ~outside)
@@ -289,7 +291,7 @@ def advance(
 def _barrier(
     memory: Memory, place: Place, forced: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Place of the first too hard push, and number of retries after one there."""
+    """Arc length of the first hard push, m, and number of retries after one there."""
     farther = place.arc_length > memory.barrier + _SAME_PLACE
     barrier = np.where(forced & farther, place.arc_length, memory.barrier)
     pushed = np.where(farther, 0, memory.pushed) + forced
@@ -299,13 +301,13 @@ def _barrier(
 def lookahead(
     settings: RetrySettings, memory: Memory, route: Route, arc_length: np.ndarray
 ) -> np.ndarray:
-    """Way (...) to the point pursued in the present attempt, m.
+    """Look-ahead (...) along the route in the present attempt, m.
 
     Args:
-        arc_length: (...), of the place of the head on the route, m.
+        arc_length: (...), arc length of the head's place on the route, m.
     """
     s = settings
-    # The lumen that counts is the one to come, or a branch is entered too obliquely.
+    # With the radius at the head, a branch would be entered too obliquely.
     coming = arc_length + s.least_lookahead
     radius = np.interp(coming, route.arc_length, route.radii)
     way = np.clip(s.lookahead_radii * radius, s.least_lookahead, s.lookahead)
@@ -325,7 +327,7 @@ def lead(settings: RetrySettings, memory: Memory) -> np.ndarray:
 
 
 def offset(settings: RetrySettings, memory: Memory) -> np.ndarray:
-    """Offset (...) of the direction of coaxial devices likewise, rad."""
+    """Offset (...) of the direction of coaxial devices in the present attempt, rad."""
     offsets = settings.pattern.offsets, settings.close.offsets
     return _nth(offsets, memory.attempts, memory)
 
@@ -335,7 +337,7 @@ def _nth(
     number: np.ndarray,
     memory: Memory,
 ) -> np.ndarray:
-    """Those (...) of most routes, or of routes with two take-offs close together."""
+    """Values (...), cycled by `number`; the second tuple where take-offs are close."""
     usual, close = (np.asarray(v)[number % len(v)] for v in values)
     return np.where(np.isfinite(memory.ostium), close, usual)
 
@@ -347,7 +349,13 @@ def shown(
     push: np.ndarray,
     coaxial: bool,
 ) -> np.ndarray:
-    """What a policy sees of it: (..., `RETRY_ENTRIES` or `COAXIAL_RETRY_ENTRIES`)."""
+    """Observed memory, (..., `RETRY_ENTRIES` or `COAXIAL_RETRY_ENTRIES`), see `SHOWN`.
+
+    Args:
+        insertion: (...), insertion of the head's device, m.
+        push: (...), force of the base, positive forward, N.
+        coaxial: Whether the devices are coaxial.
+    """
     m, s = memory, settings
     left = np.clip((insertion - m.turn) / _SEEN_WAY, -1.0, 2.0)
     turns = m.attempts % len(s.pattern.lookahead_factors)
@@ -372,10 +380,9 @@ def shown(
 def blunt(settings: RetrySettings, route: Route) -> bool:
     """Whether attempts of coaxial devices begin with the last of the leads.
 
-    The bend before a take-off presses a wire on the outer wall of the vessel in the
-    plane of the bend; it hooks a branch that leaves there, and passes by one that
-    leaves aside or goes nearly straight on. The shaped end of a catheter, turned there,
-    enters these.
+    The bend before a take-off presses a wire against the outer wall, in the plane of
+    the bend. The wire enters a branch that leaves there. It passes a branch that leaves
+    to the side or nearly straight on; a catheter's shaped end, turned there, enters it.
     """
     turn, planar = bend(route, route.narrowing)
     return turn < settings.sharp or planar < settings.planar

@@ -1,4 +1,4 @@
-"""The course of an episode, for any number of simulations and whoever steps them.
+"""The sequence of an episode, for N simulations and any stepper.
 
 begin → (forward pass) → start → command → (physics steps) → finish → command → …
 """
@@ -49,20 +49,19 @@ class Rollout(Restorable):
     """Episodes of N simulations of one task.
 
     Attributes:
-        index: Places of the task's quantities in the compiled model.
+        index: Indices of the task's quantities in the compiled model.
         effects: Effects on the simulations, in the order in which they act.
-        objectives: Objectives with their goals of these episodes, and the rows of the
-            simulations of each.
-        resting_goal: (N, 3) m, goals where they are in the vessel at rest.
+        objectives: Objectives with the goals of these episodes, each with the rows of
+            its simulations.
+        resting_goal: (N, 3) m, goals in the vessel at rest, world frame.
         steps: Control steps (N,) since each episode began.
-        deviations: Of the angiography machine of each episode from the options.
-        moving: What moves the vessels; None where they rest.
+        deviations: Deviation of each episode's angiography machine from the options.
+        moving: Effect that moves the vessels; None if they rest.
         progress: Places of the heads on their routes, and the memory of the attempts.
         readings: State of the devices after the last step or reset.
-        resting: The same, with places where they are in the vessel at rest: judged
-            there.
+        resting: These readings, mapped to the vessel at rest, in which they are judged.
         wall_force: Force on the wall over the last step.
-        devices: State of coaxial devices; None for one alone.
+        devices: State of coaxial devices; None for a single one.
         vessel: State of the vessels; None for rigid ones with blood at rest.
     """
 
@@ -80,13 +79,13 @@ class Rollout(Restorable):
         stepper: Stepper,
         specs: Mapping[str, dm_env.specs.Array],
     ):
-        """Prepares what an episode needs; no episode has begun yet.
+        """Prepares the rollout; `begin` begins the episodes.
 
         Args:
-            cases: Anatomies with their objectives; an episode draws one of them, if
-                there are several.
+            cases: Anatomies with their objectives; if there are several, each episode
+                draws one.
             stepper: Steps the N simulations.
-            specs: Of the entries of the observation of one simulation.
+            specs: Specs of the entries of the observation of one simulation.
         """
         self._cases, self._config, self._stepper = tuple(cases), config, stepper
         count, scene = stepper.num_simulations, cases[0].scene
@@ -128,13 +127,13 @@ class Rollout(Restorable):
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
         self._goal_shift = np.zeros(count)
-        # Whether an episode's beginning or control step has begun and not ended.
+        # Whether a reset or control step has begun and not ended.
         self._open = np.zeros(count, dtype=bool)
         self.deviations = [Deviation()] * count
         self.steps = np.zeros(count, dtype=int)
         self._action = np.zeros((count, len(scene.catheter.action_names)))
         self._previous_action = self._action
-        # Of the heads: length of the path so far, shortest way to the goal, m.
+        # Length of the head's path so far, and of the route at the start, m.
         self._way, self._shortest = np.zeros(count), np.ones(count)
         self._errors: tuple[str | None, ...] = (None,) * count
         self._choose_objectives()
@@ -142,31 +141,30 @@ class Rollout(Restorable):
     # The course of an episode.
 
     def begin(self, indices: np.ndarray, random_states: Sequence[RandomState]) -> None:
-        """Draws new episodes and puts the devices to their start.
+        """Draws new episodes and lays the devices in their start posture.
 
         A forward pass must follow, then `start`.
 
         Args:
             indices: (K,) numbers of the simulations, whose state has been reset.
-            random_states: N sources of randomness; those of other simulations are left
-                alone.
+            random_states: N sources of randomness; only those of the K are used.
         """
         self._open[indices] = True
         self._random_states = list(random_states)
         self._stepper.restore(indices)
         for index in indices:
             self._draw(index, random_states[index])
-        # Only now: an anatomy that is loaded resets what a simulation has.
+        # After `_draw`, because loading an anatomy resets the simulation.
         self._layout.begin(indices)
         self._devices.pose_robot()
         self._choose_objectives()
         self.steps[indices] = 0
-        # New arrays: those handed out before stay what they were.
+        # New arrays, because those returned before must not change.
         self._action = self._previous_action = self._action.copy()
         self._action[indices] = 0.0
 
     def _choose_objectives(self) -> None:
-        """Takes the objective of each simulation's anatomy, with its goal."""
+        """Selects the objectives and goals of the simulations' anatomies."""
         self.objectives: list[tuple[Objective, np.ndarray | slice]] = []
         self.resting_goal = np.empty((len(self._case_of), 3))
         numbers = np.unique(self._case_of)
@@ -175,14 +173,14 @@ class Rollout(Restorable):
             if len(numbers) > 1:
                 rows = np.flatnonzero(self._case_of == number)
             if self._config.randomisation.goal_shift is not None:
-                # Navigation has made sure that it can be shifted.
+                # Navigation has checked that it can be shifted.
                 shiftable = cast(Shiftable, objective)
                 objective = shiftable.shifted(self._goal_shift[rows])
             self.objectives.append((objective, rows))
             self.resting_goal[rows] = objective.goal
 
     def _draw(self, index: int, random_state: RandomState) -> None:
-        """Draws the episode of one simulation and puts its device to the start."""
+        """Draws one simulation's episode and lays its device in the start posture."""
         ranges = self._config.randomisation
         number, episode = ranges.draw_in(random_state, len(self._cases))
         if len(self._cases) > 1:
@@ -197,7 +195,7 @@ class Rollout(Restorable):
         self._goal_shift[index] = episode.goal_shift or 0.0
 
     def _load(self, index: int, number: int) -> None:
-        """Puts one simulation into one of several cases."""
+        """Loads one of several cases into one simulation."""
         self.case(index).scene.anatomy.lumen.release()
         self._case_of[index] = number
         self._stepper.load(index, self.case(index))
@@ -208,7 +206,7 @@ class Rollout(Restorable):
             effect.enter(index, self.case(index).scene.anatomy)
 
     def command(self, action: np.ndarray) -> None:
-        """Takes the actions of a control step; its physics steps must follow.
+        """Applies the actions of a control step; its physics steps must follow.
 
         Args:
             action: (N, A) float64 as `bounds.actions` returns it.
@@ -226,7 +224,7 @@ class Rollout(Restorable):
         self._open[:] = True
         self._previous_action, self._action = self._action, action
         own = self._config.effects
-        if own:  # which may write into what they get
+        if own:  # effects of a user may write into the action
             action = action.copy()
         for effect in self.effects:
             if own and effect is self._devices:
@@ -237,20 +235,20 @@ class Rollout(Restorable):
         self._stepper.begin(action)
 
     def start(self, indices: np.ndarray) -> Step:
-        """First measurement of new episodes, after the forward pass.
+        """Measures the start of new episodes, after the forward pass.
 
         Args:
             indices: (K,) numbers of the simulations that have begun an episode.
 
         Returns:
-            All simulations as they stand; no episode ends at its start.
+            State of all simulations; no episode ends at its start.
 
         Raises:
             ValueError: if an observation is not as its row declares.
             RuntimeError: if a law has raised an error in the forward pass.
         """
         self._layout.raise_fault()
-        # The others have not moved: what is measured of them stays.
+        # The others have not moved and keep their measurements.
         self._measure(self._stepper.still(indices), indices)
         self._way[indices] = 0.0
         shortest = np.empty(len(self._way))
@@ -268,6 +266,9 @@ class Rollout(Restorable):
 
         Args:
             logs: whether physics errors are logged.
+
+        Raises:
+            RuntimeError: if a law has raised an error in a physics step.
         """
         force, warned = self._stepper.end()
         self._layout.raise_fault()
@@ -288,11 +289,11 @@ class Rollout(Restorable):
         return step
 
     def _measure(self, force: forces.WallForce, begun: np.ndarray) -> None:
-        """Measures simulations that have moved or begun an episode (K,)."""
+        """Measures the simulations (K,) that have moved or begun an episode."""
         new = self._read()
         devices = self._devices.read(new)
         if len(begun) < len(self.steps) and "readings" in vars(self):
-            # Restored ones have other derived quantities in MuJoCo.
+            # The others keep theirs: a restore recomputes MuJoCo's derived quantities.
             force = merged(self.wall_force, part(force, begun), begun)
             new = merged(self.readings, part(new, begun), begun)
             devices = merged(self.devices, part(devices, begun), begun)
@@ -304,11 +305,11 @@ class Rollout(Restorable):
         self.resting = self._at_rest(self.readings)
 
     def _at_rest(self, state: Readings) -> Readings:
-        """Readings with places where they are in the vessel at rest."""
+        """Maps readings to the vessel at rest."""
         return state if self.moving is None else self.moving.at_rest(state)
 
     def _step(self, rows: np.ndarray, begins: bool = False) -> Step:
-        """Judges and observes; captures images of all, or of those that have begun."""
+        """Judges and observes all simulations; captures images of those in `rows`."""
         distance = straight(self.resting.head, self.resting_goal)
         failed = None
         if any(self._errors):
@@ -360,7 +361,7 @@ class Rollout(Restorable):
         return observations.observe(self._names, frame)
 
     def _views(self, indices: np.ndarray) -> dict[str, np.ndarray]:
-        """What heads and MuJoCo's cameras of some simulations (K,) see, by name."""
+        """Endoluminal and camera images of some simulations (K,), by name."""
         moving, state, seen = self.moving, self.readings, {}
         if self._cameras is not None:
             seen = self._cameras.see(indices, self._stepper, state)
@@ -384,38 +385,39 @@ class Rollout(Restorable):
         self.progress.restart(indices, self._case_of, self.resting)
         return self._step(indices[:0])
 
-    # What others may read.
+    # State of the rollout.
 
     @property
     def memory(self) -> Memory:
-        """Memory of the attempts (N,); it begins now at latest, see `Progress`."""
+        """Memory of the attempts, arrays (N,); made at first use, see `Progress`."""
         return self.progress.remember(self._case_of, vars(self).get("resting"))
 
     @property
     def begun(self) -> bool:
-        """Whether an episode has ever begun; until then there is nothing to see."""
+        """Whether an episode has ever begun; until then there are no readings."""
         return self._random_states is not None
 
     @property
     def goal(self) -> np.ndarray:
-        """(N, 3) m, the goals in space, which move with their vessels."""
+        """(N, 3) m, the goals, world frame; they move with their vessels."""
         goal = self.resting_goal
         return goal if self.moving is None else self.moving.to_space(goal.copy())
 
     def around(self, planes: Planes, index: int = 0) -> Planes:
-        """A machine's planes with one simulation's vessel where it is now."""
-        if self.moving is None or self._random_states is None:  # at rest until then
+        """Returns a machine's planes with one simulation's vessel as moved by now."""
+        # The vessel is at rest until an episode has begun.
+        if self.moving is None or self._random_states is None:
             return planes
         surface = self.moving.surface(index)
         return tuple(plane.around(surface) for plane in planes)
 
     @property
     def shadows(self) -> Sequence[Shadow]:
-        """The devices as X-rays meet them, with points (N, n, 3)."""
+        """X-ray shadows of the devices, with points (N, n, 3), m."""
         courses = self._devices.courses(self.readings.centreline)
         return [device.shadow(points) for device, points in courses]
 
     @property
     def slipped(self) -> np.ndarray:
-        """Way by which the clamps have slipped, see `SingleDevice.slipped`."""
+        """Slip of the drives' clamps (N, D), m and rad, see `SingleDevice.slipped`."""
         return self._devices.slipped.copy()

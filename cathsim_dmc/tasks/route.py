@@ -1,4 +1,4 @@
-"""The route to a goal: where a head is on it, and what lies ahead of its tip.
+"""The route to a goal: places of heads on it, and route and lumen ahead of them.
 
 Pure functions of arrays with leading batch axes, written `...`; metres.
 """
@@ -13,9 +13,9 @@ from cathsim_dmc.anatomy.centreline import interpolate
 from cathsim_dmc.tasks.objectives import Objective, Routed
 
 ROUTE_SPACING = 1e-3  # m, resolution of the route
-# Way along the route from the place of the head to each of the points ahead, m.
+# Distances along the route from the place of the head to the points ahead, m.
 AHEAD = np.arange(8) * 5e-3
-SIDE_AHEAD = 25e-3  # m, way to the point of the route that a shaped end is turned to
+SIDE_AHEAD = 25e-3  # m along the route to the point that a shaped end is turned to
 _NEARBY = 10e-3  # m of the route that a head can pass between two control steps
 
 
@@ -51,7 +51,7 @@ class Route:
         return float(self.arc_length[np.diff(self.radii).argmin()])
 
     def at(self, arc_length: np.ndarray) -> np.ndarray:
-        """Point (..., 3) of the route; beyond its end, straight on."""
+        """Points (..., 3), m, at arc lengths (...), m; straight on beyond the end."""
         held = interpolate(arc_length, self.arc_length, self.points)
         last = self.points[-1] - self.points[-2]
         last = last / np.linalg.norm(last)
@@ -64,8 +64,8 @@ class Place(NamedTuple):
 
     Attributes:
         arc_length: (...), m.
-        excess: (...), by how much the head is out of the route's tube, in radii there;
-            negative inside.
+        excess: (...), distance of the head outside the route's tube, in radii of the
+            lumen there; negative inside.
     """
 
     arc_length: np.ndarray
@@ -75,19 +75,19 @@ class Place(NamedTuple):
 def locate(route: Route, head: np.ndarray, last: np.ndarray | None = None) -> Place:
     """Finds the place of a head (..., 3) on the route.
 
-    It is the nearest point of the route whose cross-section reaches the head: beside
-    an ostium, still in the parent, the axis of the branch may be nearer than the
-    parent's, yet the head is not in the branch. If none does, it is the point whose
-    cross-section comes nearest.
+    It is the nearest point of the route that has the head within the radius of its
+    lumen, or else the point with the least distance beyond that radius. The nearest
+    axis alone is not enough: in the parent vessel beside an ostium, it may be that of
+    the branch.
 
-    Where the route turns back into a branch, the cross-sections of both reach a head
-    between them, and the nearer axis changes with every movement. A head that was on
-    one of them stays on it as long as it can: points near the last place come first.
+    Where the route turns back into a branch, a head may be within the lumen of both
+    parts, and the nearer axis changes with every movement. Points near the last place
+    therefore take precedence.
 
     Args:
-        head: (..., 3), m.
-        last: (...), arc length of its place a control step ago, m; NaN or None where
-            that is not known.
+        head: (..., 3), m, world frame.
+        last: (...), arc length of its place a control step ago, m; NaN or None if that
+            is not known.
     """
     offset = head[..., None, :] - route.points
     distance = np.sqrt(np.einsum("...i,...i->...", offset, offset))
@@ -95,7 +95,7 @@ def locate(route: Route, head: np.ndarray, last: np.ndarray | None = None) -> Pl
     inside = outside <= 0
     # Any inside point beats every outside one.
     rank = np.where(inside, distance - 1.0, np.maximum(outside, 0.0))
-    if last is not None:  # and one near the last place every other
+    if last is not None:  # an inside point near the last place beats every other
         nearby = np.abs(route.arc_length - last[..., None]) <= _NEARBY
         rank = rank - 1.0 * (inside & nearby)
     index = rank.argmin(-1)
@@ -106,17 +106,17 @@ def locate(route: Route, head: np.ndarray, last: np.ndarray | None = None) -> Pl
 class Ahead(NamedTuple):
     """Route and lumen ahead of N tips, each in the frame of its tip.
 
-    Its origin is the head, its z the direction of the head, its x and y the axes of
-    the hinges of the last link.
+    The origin of this frame is the head, its z-axis the direction of the head, its x
+    and y the hinge axes of the last link.
 
     Attributes:
-        points: (N, K, 3), of the route, `AHEAD` of the place of the head, m.
-        radii: (N, K), of the lumen there, m.
+        points: (N, K, 3), points of the route, `AHEAD` of the place of the head, m.
+        radii: (N, K), radii of the lumen there, m.
         excess: (N,), `Place.excess` of the head.
-        sides: (N, K, 5), how coaxial devices lie to the route, `coaxial_ends.sides`;
-            None where no observation needs it.
-        turns: (N, K, 2), what is left to turn to the point pursued, and its bend away,
-            `coaxial_ends.turns`, rad; None where no observation needs it.
+        sides: (N, D, 5), directions from D coaxial devices to the route, see
+            `coaxial_ends.sides`; None if no observation needs it.
+        turns: (N, D, 2), remaining rotations and bend angles to the route at the
+            look-ahead, rad, see `coaxial_ends.turns`; None if no observation needs it.
     """
 
     points: np.ndarray
@@ -135,10 +135,10 @@ def locate_each(
     """Places (N,) of heads on their routes.
 
     Args:
-        routes: Of the anatomies.
+        routes: Routes of the anatomies.
         chosen: (N,) int, number of the anatomy of each simulation.
         head: (N, 3), m, world frame.
-        last: (N,), see `locate`.
+        last: (N,), m, see `locate`.
     """
     place = Place(np.empty(len(head)), np.empty(len(head)))
     for number in np.unique(chosen).tolist():
@@ -159,9 +159,9 @@ def look_ahead(
     """Routes and lumens ahead of N tips, which may lie in different anatomies.
 
     Args:
-        routes: Of the anatomies.
+        routes: Routes of the anatomies.
         chosen: (N,) int, number of the anatomy of each simulation.
-        place: Of the heads, see `locate_each`.
+        place: Places (N,) of the heads, see `locate_each`.
         head: (N, 3), m, world frame.
         frame: (N, 3, 3), orientation of each tip, its axes in columns.
     """
@@ -176,9 +176,9 @@ def look_ahead(
 
 
 def into_frame(vectors: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """Vectors (..., K, 3) of the world in frames (..., 3, 3), axes in columns.
+    """Rotates world vectors (..., K, 3) into frames (..., 3, 3), axes in columns.
 
-    Written out: a matrix product may round otherwise for one simulation than for many.
+    It uses no matrix product, whose rounding may depend on the number of simulations.
     """
     x, y, z = (frame[..., None, axis, :] for axis in range(3))
     return vectors[..., :1] * x + vectors[..., 1:2] * y + vectors[..., 2:] * z

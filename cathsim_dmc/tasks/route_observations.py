@@ -70,13 +70,13 @@ def _retry(key: str) -> Entry:
 
 
 def route_retry(frame: Frame) -> Observation:
-    """Memory of the attempts along the route; every other one has a steady place."""
+    """Memory of the attempts along the route, see `retry.shown`."""
     assert frame.retry is not None
     return {"route_retry": frame.retry}
 
 
 def biplane_retry(frame: Frame) -> Observation:
-    """The memory of `route_retry`, of the route through both roadmaps."""
+    """Memory of the attempts along the route through both roadmaps."""
     assert frame.retry is not None
     return {"biplane_retry": frame.retry}
 
@@ -104,7 +104,7 @@ _COAXIAL = (
 
 
 def route_coaxial(frame: Frame) -> Observation:
-    """Route ahead and coaxial devices in the tip frame, without any world frame."""
+    """Route ahead and coaxial devices, all in the tip frame."""
     state, ahead = frame.devices, frame.ahead
     assert state is not None
     assert ahead is not None
@@ -133,7 +133,7 @@ _TURNS = Entry(
 
 
 def route_turns(frame: Frame) -> Observation:
-    """What is left to turn, at the look-ahead and the offset of the attempt."""
+    """Remaining rotation and bend angle of each device's end in the present attempt."""
     assert frame.ahead is not None
     assert frame.ahead.turns is not None
     return {"route_turns": flat(frame.ahead.turns, 2)}

@@ -1,4 +1,4 @@
-"""The scene of a navigation task: entities, and where each is attached."""
+"""The scene of a navigation task: entities and their placement."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,12 +19,13 @@ from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import GOAL_RADIUS
 
-# Wall of the sheath, m: what a tilted one needs of the hole by which it comes in.
+# Radius of the hole for the sheath minus that of its bore, m: room for the wall of a
+# tilted sheath.
 AROUND_SHEATH = 2e-3
-# Joints of the shaft that twist, where the base turns.
+# Number of torsion joints in the shaft of a device whose base rotates.
 _TORSION_JOINTS = 4
-# Chains of so many links are faster with dense Jacobians: 1.1 to 1.4 times in free
-# motion, and as fast in a jam. MuJoCo's own choice is 60 degrees of freedom.
+# Chains of up to this many links are faster with dense Jacobians: 1.1 to 1.4 times in
+# free motion, and as fast in a jam. MuJoCo's own limit is 60 degrees of freedom.
 _DENSE_LINKS = 50
 
 
@@ -35,10 +36,10 @@ class Scene:
     Attributes:
         anatomy: lumen, wall and goals.
         goal: where the device is to go.
-        placement: where device, sheath and robot stand.
+        placement: poses of device, sheath and robot.
         arena: the root, with light and the density of blood.
         phantom: wall, goals and load cell.
-        catheter: the device, or several in each other.
+        catheter: the device, or the stack of coaxial devices.
         sheath: holds the device before the inlet.
         robot: the follower, which moves along with the device.
     """
@@ -66,8 +67,11 @@ class Scene:
 
         Args:
             goal: Name in `anatomy.goals`, or a goal inside the lumen.
-            goal_radius: Radius of the goal markers, m; for looks only.
-            drawn: Whether the surface of the lumen is there to be seen.
+            goal_radius: Radius of the goal markers, m, which are only visual.
+            drawn: Whether the arena has a mesh of the lumen's surface.
+
+        Raises:
+            ValueError: if goal, device or vessel options do not fit the anatomy.
         """
         goal = placement.resolve_goal(anatomy, goal)
         config.vessel.check(anatomy)
@@ -155,7 +159,7 @@ def count_actions(config: NavigationConfig) -> int:
 
 
 def longest_tip(chosen: Sequence[devices.Device]) -> devices.Device:
-    """The device whose tip decides how far the chain starts inside."""
+    """The device with the longest tip, which limits the start depth."""
     return max(chosen, key=lambda device: device.tip_length)
 
 

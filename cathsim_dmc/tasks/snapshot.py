@@ -23,8 +23,8 @@ from cathsim_dmc import __version__, bounds, files
 Arrays = Mapping[str, np.ndarray]
 _FORMAT = 1
 _META, _DIGEST = "meta", "sha256"
-# At the end of the names of arrays whose second axis differs between episodes, padded
-# with NaN.
+# Suffix of the names of arrays whose second axis differs between episodes; they are
+# padded with NaN.
 _RAGGED = "*"
 _TEXT = "<U64"
 _WORDS = 624  # of a RandomState
@@ -36,9 +36,10 @@ class Snapshot:
     """State of K simulations of a task, random states and images included.
 
     Attributes:
-        task: What another task must have in common to take it, JSON-able.
+        task: What a task must share to restore it, JSON-able; see
+            `restorable.describe`.
         arrays: Arrays (K, ...) by name.
-        versions: Of the packages that it was taken with; others may round otherwise.
+        versions: Versions of the packages that took it; others may round differently.
     """
 
     task: Mapping[str, Any]
@@ -46,7 +47,7 @@ class Snapshot:
     versions: Mapping[str, str] = dataclasses.field(default_factory=lambda: versions())
 
     def __len__(self) -> int:
-        """K."""
+        """Number K of simulations."""
         return len(next(iter(self.arrays.values())))
 
     def __getitem__(self, rows: Any) -> "Snapshot":
@@ -61,7 +62,7 @@ class Snapshot:
         """The snapshot of `count` simulations in the state of this single one.
 
         Raises:
-            ValueError: if it is of several, or the number is wrong.
+            ValueError: if it is of several simulations, or `count` is out of range.
         """
         count = bounds.whole("count", count, 1, bounds.MOST_SIMULATIONS)
         if len(self) != 1:
@@ -72,18 +73,18 @@ class Snapshot:
         return self[np.zeros(count, int)]
 
     def part(self, name: str) -> dict[str, np.ndarray]:
-        """Arrays of a part, by the rest of their names."""
+        """Arrays whose names begin with `name` and a dot, by the rest of the name."""
         return _below(self.arrays, name)
 
     def require(self, other: "Snapshot") -> None:
-        """Refuses simulations that the snapshot does not fit.
+        """Checks that the snapshot fits some simulations.
 
         Args:
-            other: Of those simulations.
+            other: Present snapshot of those simulations.
 
         Raises:
-            ValueError: if they are of another task, model or number, or the snapshot
-                holds a state that MuJoCo could not have.
+            ValueError: if they are of another task, model or number, or the snapshot's
+                state is not finite.
         """
         for key, own in other.task.items():
             if self.task.get(key) != own:
@@ -118,8 +119,8 @@ class Snapshot:
         """Writes an .npz file without pickles; returns its path.
 
         Raises:
-            ValueError: if the name does not end in .npz, or it would unpack to more
-                than `load` reads.
+            ValueError: if the name does not end in .npz, or the unpacked file would be
+                larger than `load` accepts.
             OSError: if it cannot be written.
         """
         meta = {"task": self.task, "versions": self.versions}
@@ -131,7 +132,7 @@ class Snapshot:
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: if the file is damaged or something else.
+            ValueError: if the file is damaged or holds no snapshot.
         """
         meta, arrays = read_arrays(path, "snapshot")
         return cls.of(path, meta, arrays)
@@ -140,7 +141,7 @@ class Snapshot:
     def of(
         cls, path: str | os.PathLike[str], meta: Mapping[str, Any], arrays: Arrays
     ) -> "Snapshot":
-        """The snapshot in what `read_arrays` has read; ValueError if there is none."""
+        """Makes a snapshot of what `read_arrays` returns; ValueError if it is none."""
         text = f"{path} holds no snapshot"
         with files.refused(ValueError, text, (KeyError, TypeError, AttributeError)):
             counts = {array.shape[:1] for array in arrays.values()}
@@ -160,7 +161,7 @@ def versions() -> dict[str, str]:
 def write_arrays(
     path: str | os.PathLike[str], kind: str, meta: Mapping[str, Any], arrays: Arrays
 ) -> Path:
-    """Writes arrays with what describes them (JSON-able) and a checksum; see `save`."""
+    """Writes arrays, their description (JSON-able) and a checksum; see `save`."""
     text = np.array(json.dumps({"kind": kind, "format": _FORMAT, **meta}))
     held, buffer = {_META: text, **arrays}, io.BytesIO()
     digest = np.array(_digest(held))
@@ -179,7 +180,7 @@ def write_arrays(
 def read_arrays(
     path: str | os.PathLike[str], kind: str
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What describes the arrays of a file, and they; ValueError if it is another."""
+    """Returns description and arrays of a file; ValueError if it is of another kind."""
     wrong = ValueError, KeyError, TypeError, RecursionError
     with files.refused(ValueError, f"{path} is no file of a {kind}", wrong):
         held = files.read_arrays(path)
@@ -217,13 +218,13 @@ def _below(arrays: Arrays, name: str) -> dict[str, np.ndarray]:
 
 
 def packed(name: str, value: Any, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """The value of an attribute for some simulations, as arrays (K, ...) by name.
+    """Converts an attribute of some simulations to arrays (K, ...) by name.
 
     Args:
         name: Name of the attribute.
         value: An array (N, ...), a named tuple or dictionary of values, or a list of N
             sources of randomness, dataclasses or arrays, or a tuple of texts or None.
-            There is nothing to keep of None, also in a list.
+            None, and a list that contains None, give no array.
         rows: (K,) numbers of the simulations.
 
     Raises:
@@ -270,7 +271,7 @@ def _ragged(name: str, values: Sequence[Any]) -> dict[str, np.ndarray]:
 
 
 def restored(name: str, old: Any, arrays: Arrays, rows: np.ndarray) -> Any:
-    """A value like `old` with some simulations as in `packed` arrays; `old` stays.
+    """Returns a copy of `old` with some simulations taken from `packed` arrays.
 
     Args:
         name: Name of the attribute.
@@ -330,7 +331,8 @@ def _random_arrays(sources: Sequence[np.random.RandomState]) -> dict[str, np.nda
 
 def _set_random(sources: Sequence[np.random.RandomState], arrays: Arrays) -> None:
     rest = arrays["rest"]
-    if not ((rest[:, 0] >= 0) & (rest[:, 0] <= _WORDS)).all():  # numpy reads there
+    # numpy reads its words at this place, without a check of bounds.
+    if not ((rest[:, 0] >= 0) & (rest[:, 0] <= _WORDS)).all():
         raise ValueError(f"the snapshot's random states stand at {rest[:, 0].tolist()}")
     pairs = zip(sources, arrays["words"], rest.tolist(), strict=True)
     for source, words, (place, has_gauss, gauss) in pairs:

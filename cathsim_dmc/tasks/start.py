@@ -1,4 +1,4 @@
-"""The posture in which a device waits for its episode to begin."""
+"""Start posture of a device."""
 
 import contextlib
 import functools
@@ -23,32 +23,31 @@ from cathsim_dmc.tasks.scene import AROUND_SHEATH, Scene
 
 _SETTLING_TIME = 2.0  # s, after which the device rests
 STARTS_ALONG_ROUTE = 16
-# How much deeper a displacement may put the links behind the head into the wall, m.
+# Largest increase of the depth in the wall of the links behind a displaced head, m.
 _PRESSED = 2e-4
-# MuJoCo starts anew where a state is no number, and only these tell.
+# MuJoCo resets a simulation whose state is not finite; only these warnings show it.
 _DIVERGED = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
     int(mujoco.mjtWarning.mjWARN_BADQVEL),
     int(mujoco.mjtWarning.mjWARN_BADQACC),
 ]
 _LARGEST_START = 0.5  # share of the way to the goal
-START_SPACING = 5e-3  # m, between the postures that a start farther in chooses from
-# Displacements that are tried where the whole one presses on the wall.
+START_SPACING = 5e-3  # m, between the start postures of `start_insertion`
+# Factors of a displacement that are tried if the whole one presses on the wall.
 _SMALLER = tuple(sign * 0.5**half for half in range(1, 6) for sign in (1.0, -1.0))
-# By how much the axis of a settled device may stand out of the lumen, m: the pieces of
-# the wall stay behind it by less, the device's radius not counted.
+# Largest distance of a settled device's axis outside the lumen, m.
 _OUTSIDE = 0.5e-3
-# Deepest contact that a device at rest makes with a wall that it does not stand in, m.
+# Largest penetration depth of a device at rest, m.
 _DEEPEST = 1.0e-3
-# Deepest place of a displaced device in the wall of the sheath, m. From 2 mm on, the
-# shaft stands in the rim of the hole by which the sheath comes in, and throws the tip.
+# Largest depth of a displaced device in the wall of the sheath, m. From 2 mm on, the
+# shaft penetrates the rim of the hole for the sheath, and that contact throws the tip.
 _DEEPEST_IN_SHEATH = AROUND_SHEATH - 0.1e-3
-# A base that moves so many times as far as the head, or a head that misses its place by
-# so much of the displacement: the Jacobian is nearly singular, or the stroke ends.
+# Largest slide of the base and largest miss of the head, relative to the displacement.
+# Beyond them the Jacobian is nearly singular, or the stroke ends.
 _LARGEST_SLIDE, _LARGEST_MISS = 4.0, 0.9
-_DRAWS = 20  # of a displacement, until the posture stands free
-_SAMPLES = 0.5e-3  # m, between places of a posture whose depth is looked up
-_GUIDED = 0.02  # m of the shaft in the sheath that a displacement may turn
+_DRAWS = 20  # of a displacement at most, until the posture penetrates no wall
+_SAMPLES = 0.5e-3  # m, between points of a posture whose depth is checked
+_GUIDED = 0.02  # m of the shaft in the sheath that are checked, as they may turn
 
 
 class _Joints(NamedTuple):
@@ -61,9 +60,9 @@ class _Joints(NamedTuple):
 class StartPosture:
     """Joint positions of the device at the start of an episode.
 
-    The device is laid along the centreline of the vessel and let go, with motors and
-    base at rest, once, on the compiled model without randomisation. An episode starts
-    there at rest, the head displaced by what was drawn.
+    The device is laid along the centreline of the vessel and settles once, with motors
+    and base at rest, on the compiled model without randomisation. An episode starts in
+    the settled posture, at rest, with the head displaced as drawn.
     """
 
     def __init__(
@@ -73,14 +72,15 @@ class StartPosture:
         index: ModelIndex,
         config: NavigationConfig,
     ):
-        """Lets the device settle.
+        """Settles the device.
 
         Args:
-            index: Places of the task's quantities in the model.
-            config: Says where an episode may begin.
+            index: Indices of the task's quantities in the model.
+            config: Options, which set where an episode may begin.
 
         Raises:
-            ValueError: if the device comes to rest outside the lumen or in its wall.
+            ValueError: if the device does not come to rest, or outside the lumen or in
+                its wall, or nowhere in the range `start_along_route`.
         """
         # The base cannot go back behind its start, so the stroke begins 1 mm later.
         settle = functools.partial(_settle, scene, model, index, _Shape(scene))
@@ -113,14 +113,14 @@ class StartPosture:
         """Writes the start configuration of one simulation.
 
         A displacement that would press the device on the wall is reversed, then
-        halved until it does not. Where the posture then stands in a wall or misses its
-        place, another displacement is drawn.
+        halved until it does not. If the posture then penetrates a wall or misses its
+        place, another displacement is drawn; after 20 draws there is none.
 
         Args:
             qpos: (nq,), written in place; joints of other entities are left alone.
-            episode: What was drawn for it.
-            random_state: Draws where along the route a device lies, which is then not
-                displaced, and further displacements.
+            episode: Values drawn for the episode.
+            random_state: Draws the start along the route, which has no displacement,
+                and further displacements.
         """
         if self._ahead:
             number = random_state.randint(len(self._ahead))
@@ -142,7 +142,7 @@ class StartPosture:
 
 
 class _Posture:
-    """A device at rest, so far advanced (m), and how its joints displace its head."""
+    """A device at rest at one advance (m), and the Jacobian that displaces its head."""
 
     def __init__(
         self,
@@ -176,7 +176,8 @@ class _Posture:
         self._steps = np.zeros((3, 3))
         with contextlib.suppress(np.linalg.LinAlgError):
             self._steps = np.linalg.inv(self._frame.T @ jacobian[:, dofs])
-        # The joints that the first free one moves and the head, as far as they move.
+        # Nodes distal to the first free joint and the head, and their shares of the
+        # displacement.
         swinging = slice(index.links.start + self._free + 2, index.links.stop)
         self._nodes = np.vstack([data.xpos[swinging], data.site_xpos[index.head_site]])
         ahead = np.append(beyond[self._free + 2 :], 0.0)[:, None]
@@ -190,7 +191,7 @@ class _Posture:
         self._deepest = np.maximum(deepest, (forces.DEEPEST, _DEEPEST_IN_SHEATH))
 
     def clear_of_wall(self, displacement: np.ndarray) -> np.ndarray:
-        """The displacement (3,), m, reversed or halved where it would press."""
+        """A displacement (3,), m, reversed or halved until it presses on no wall."""
         for factor in (1.0, -1.0, *_SMALLER):
             displaced = self._frame @ (factor * displacement)
             depth = self._anatomy.lumen(self._nodes + self._shares * displaced)
@@ -199,10 +200,9 @@ class _Posture:
         return np.zeros(3)
 
     def joints(self, displacement: np.ndarray, roll: float | None) -> _Joints:
-        """Joints that displace the head by (3,) m in the inlet's frame.
+        """Joints that displace the head by (3,) m in the inlet's frame, linearised.
 
-        They are exact for small displacements. A device that is turned about its axis
-        has other angles and the same shape.
+        With a roll of the base, rad, the hinge angles differ and the shape is the same.
         """
         angles, step = self._angles.copy(), self._steps @ displacement
         if roll:
@@ -217,7 +217,13 @@ class _Posture:
     def stands_free(
         self, displacement: np.ndarray, joints: _Joints, roll: float | None
     ) -> bool:
-        """Whether joints displace the head as asked, and the device is in no wall."""
+        """Whether joints displace the head as asked, and the device is in no wall.
+
+        Args:
+            displacement: (3,), m, frame of the inlet.
+            joints: Joints of the device.
+            roll: Roll of the base, rad.
+        """
         size = np.linalg.norm(displacement)
         slide = abs(joints.insertion - self._inserted)
         points = self._shape.points(joints, roll or 0.0)
@@ -235,7 +241,7 @@ class _Posture:
 
 
 class _Shape:
-    """Places of a device with given joints, and how deep it stands in walls there."""
+    """Points of a device with given joints, and their depths in the walls."""
 
     def __init__(self, scene: Scene):
         """Takes the device, the field of the vessel and the bore of the sheath."""
@@ -255,11 +261,11 @@ class _Shape:
         self._walled = self._lumen.with_hole(self._hole)
 
     def points(self, joints: _Joints, roll: float = 0.0) -> np.ndarray:
-        """Points (m, 3) m of the axis in the world, the head last.
+        """Points (m, 3) of the axis, m, world frame, the head last.
 
         Args:
-            joints: Of the device.
-            roll: Of the base about its axis, rad.
+            joints: Joints of the device.
+            roll: Rotation of the base about its axis, rad.
         """
         nodes = nodes_of(self._lengths, joints.bends)
         c, s = np.cos(roll), np.sin(roll)
@@ -270,7 +276,7 @@ class _Shape:
         return self._inlet + points @ self._frame.T
 
     def depths(self, points: np.ndarray) -> np.ndarray:
-        """Depths (2,) m in the walls of vessel and sheath at the deepest of points."""
+        """Largest depths (2,), m, of points in the walls of vessel and sheath."""
         local = (points - self._inlet) @ self._frame
         near = local[:, 2] > -_GUIDED
         points, (x, y, level) = points[near], local[near].T
@@ -279,7 +285,7 @@ class _Shape:
         # A vessel may bend back beside the sheath.
         inside = self._lumen(points[guided])
         bore = np.where(inside > 0.0, np.maximum(bore, inside), bore)
-        # What lies outside, beside the sheath, is free to the physics.
+        # Beside the sheath, outside the lumen, the physics has no wall.
         outside = (clear >= FREE) & (level > self._hole)
         clear[outside] = self._lumen(points[outside])
         return self._radius - np.array([clear.min(), bore.min(initial=np.inf)])
@@ -292,7 +298,7 @@ def _settle(
     shape: _Shape,
     advance: float,
 ) -> _Posture:
-    """Lays the device along the line, so far advanced (m), and lets it go."""
+    """Lays the device along the line at an advance (m), and lets it settle."""
     data = mujoco.MjData(model)
     at = START_JITTER + advance
     data.qpos[index.insertion_qpos] = at
@@ -314,7 +320,7 @@ def _settle(
 def _settled(
     settle: Callable[[float], _Posture], advances: np.ndarray
 ) -> list[_Posture]:
-    """Postures that come to rest, so far advanced (m)."""
+    """Postures at advances (m), without those that do not come to rest inside."""
     settled = []
     for advance in advances.tolist():
         with contextlib.suppress(ValueError):
@@ -325,7 +331,7 @@ def _settled(
 def _refuse_outside(
     scene: Scene, model: mujoco.MjModel, index: ModelIndex, data: mujoco.MjData
 ) -> None:
-    """Raises ValueError if a settled device stands outside the lumen or in the wall."""
+    """Raise ValueError unless a device has settled inside the lumen."""
     nodes = np.vstack([data.xpos[index.links], data.site_xpos[index.head_site]])
     place, anatomy = scene.placement, scene.anatomy
     entered = past_sheath(anatomy, nodes, place.direction)

@@ -38,7 +38,8 @@ class Step(NamedTuple):
         readings: state of the devices.
         wall_force: force on the wall over the control step.
         distance: (N,), straight from head to goal, m.
-        path_ratio: (N,), way of the head so far over the shortest way to the goal.
+        path_ratio: (N,), length of the head's path so far over the length of the route
+            from the start to the goal.
         vessel: state of the vessel; None for a rigid one with blood at rest.
     """
 
@@ -63,7 +64,7 @@ class Step(NamedTuple):
 
         "distance" and "insertion" in m; "push_force" in N; "wall_force_sum",
         "wall_force_max" and their means and peaks within the control step in N (see
-        `forces.WallForce`); "path_ratio"; of a vessel that lives "heart_phase",
+        `forces.WallForce`); "path_ratio"; of a living vessel "heart_phase",
         "breath_phase", "blood_speed" (at the head, m/s), "indentation" (m) and
         "wall_work" (J); "reward_<term>" for each weighted term; and "success" and
         "physics_error" (bool).

@@ -1,21 +1,21 @@
-"""Where a route leaves one vessel for a narrower one, and how it turns there."""
+"""Take-offs, where a route leaves one vessel for a narrower one, and their bends."""
 
 import numpy as np
 
 from cathsim_dmc.tasks.route import ROUTE_SPACING, Route
 
-# A take-off: a lumen of this radius, m, or more falls below this share of itself within
-# this way, m, at a bend of this angle, rad, and this far, m, behind the last take-off.
-# In narrower vessels all devices follow the wall.
+# At a take-off, the radius of a lumen of at least `_WIDE`, m, falls below `_SHARE` of
+# itself within `_WITHIN`, m, at a bend of more than `_BEND`, rad, and more than
+# `_APART`, m, past the last take-off. In narrower vessels all devices follow the wall.
 _WIDE, _SHARE, _WITHIN, _BEND, _APART = 4.5e-3, 0.75, 10e-3, 0.6, 15e-3
 CLOSE = 30e-3  # m from one take-off to the next
 
 
 def take_offs(route: Route) -> list[float]:
-    """Arc lengths, m, where a route leaves one vessel for a narrower one, one or more.
+    """Returns the arc lengths, m, of the take-offs of a route, at least one.
 
-    Each is where the lumen narrows fastest. Where it does not narrow at a bend, it is
-    where the route narrows fastest of all.
+    A take-off is where the lumen narrows fastest at a bend. If there is none, it is
+    where the whole route narrows fastest.
     """
     radii, way = route.radii, round(_WITHIN / ROUTE_SPACING)
     wide = radii[:-way] >= _WIDE
@@ -32,10 +32,10 @@ def take_offs(route: Route) -> list[float]:
 
 
 def followed(route: Route) -> tuple[float, bool]:
-    """The last of the take-offs that are close to each other, from the first one on.
+    """Finds the last take-off of the close series that begins with the first one.
 
     Returns:
-        Its arc length, m, and whether it is another than the first.
+        Its arc length, m, and whether it differs from the first.
     """
     first, *others = take_offs(route)
     last = first
@@ -45,10 +45,10 @@ def followed(route: Route) -> tuple[float, bool]:
 
 
 def last_apart(route: Route) -> float:
-    """The last of several take-offs, none of which follows the first one closely.
+    """Finds the last of several take-offs, if the second is not close to the first.
 
     Returns:
-        Its arc length, m; infinite where there is one alone, or one is close.
+        Its arc length, m; infinite if there is only one, or the second one is close.
     """
     places = take_offs(route)
     apart = len(places) > 1 and places[1] >= places[0] + CLOSE
@@ -60,7 +60,7 @@ def bend(route: Route, place: float, way: float = 20e-3) -> tuple[float, float]:
 
     Args:
         place: arc length, m.
-        way: over which the directions before and after the place are measured, m.
+        way: distance over which directions before and after the place are measured, m.
     """
     points = route.at(place + way * np.array([-2.0, -1.0, 0.0, 1.0]))
     ways = np.diff(points, axis=0)

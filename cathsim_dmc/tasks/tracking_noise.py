@@ -10,7 +10,7 @@ from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 class TrackingNoise:
     """Independent normal errors of every tracked point, drawn in each control step.
 
-    Rewards, success and images are of the true points.
+    Rewards, success and images use the true points.
 
     Attributes:
         deviation: Standard deviation of each coordinate, m; 0 for no errors.
@@ -32,7 +32,8 @@ class TrackingNoise:
         """The states of N simulations with the errors of the present control step.
 
         Args:
-            random_states: N sources; None before the first episode, without errors.
+            random_states: N sources of randomness; None for no errors, as before the
+                first episode.
             rows: (K,) numbers of the simulations whose errors are drawn; the others
                 keep theirs.
         """

@@ -33,18 +33,18 @@ class Links(NamedTuple):
 
 
 class Walls(NamedTuple):
-    """Walls of all anatomies, one after the other, and that of each world.
+    """Walls of all anatomies, concatenated, and the walls of each world.
 
     Attributes:
         head, coarse, bricks, samples: As `laws.field.FieldArrays`, of all lumens.
         line: As `laws.wall.Wall`, of all bores.
-        lattice: Of the motions of all walls, see `laws.motion`.
-        starts: (F, 6, 2) first and last place of wall f in each of these arrays.
+        lattice: Lattices of the motions of all walls, see `laws.motion`.
+        starts: (F, 6, 2) start and stop index of wall f in each of these arrays.
         is_bore: (F,) whether a wall is a bore.
         middle: (F, 3) m, place of the carrier's middle in the frame of the wall.
         of_world: (N, C) wall of a carrier in each world.
-        places: (N, C, 3) m, of a carrier in each world. Warp has the same places of
-            what stands still in all worlds.
+        places: (N, C, 3) m, position of a carrier in each world. They are kept here
+            because Warp has one position of a static geom for all worlds.
         turns: (N, C, 3, 3), the axes of a carrier in columns.
     """
 
@@ -92,8 +92,9 @@ class Found(NamedTuple):
 
     Attributes:
         number: (T,) contacts of a thread.
-        rows: (T, MOST, ROW) of each the distance m, the place (3) m, the direction (3)
-            from the link into the wall, and 1 where it shares its spring, else 0.
+        rows: (T, MOST, ROW) of each contact the distance m, the place (3) m, the
+            direction (3) from the link into the wall, and 1 if it shares its spring,
+            else 0.
     """
 
     number: Any

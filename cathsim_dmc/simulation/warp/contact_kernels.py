@@ -47,8 +47,8 @@ _CONSTRAINT = 1  # mujoco_warp's ContactType.CONSTRAINT
 
 @compiled
 def _wall(walls, number):
-    """`laws.wall.Wall` of a number."""
-    # A device function of numba-cuda may return arrays in a tuple alone.
+    """The wall of a number, as `laws.wall.Wall`."""
+    # A device function of numba-cuda can return arrays only inside a tuple.
     first, last = walls.starts[number, :, 0], walls.starts[number, :, 1]
     field = FieldArrays(
         walls.head[first[0] : last[0]],
@@ -80,9 +80,9 @@ def vector(places, world, number):
 
 @compiled
 def _swept(links, motion, world, link, step):
-    """Ways of a link's centre (3) m and turn (3) rad in a physics step, in the world.
+    """Displacement (3) m of a link's centre and rotation (3) rad in a physics step.
 
-    See `collision.links`.
+    World frame; see `collision.links`.
     """
     a, b, c, x, y, z = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     dof = links.last_dof[link]
@@ -107,8 +107,8 @@ class Pair(NamedTuple):
         capsule: The link in the frame of the wall.
         law: `laws.contact.Law`.
         sweep: `laws.contact.Sweep`.
-        centre: (3) m, of the link, in the world.
-        axis: (3) unit vector of the link, in the world.
+        centre: (3) m, centre of the link, world frame.
+        axis: (3) unit vector of the link, world frame.
         frame: (9) matrix whose columns are the axes of the wall's frame.
     """
 
@@ -167,7 +167,7 @@ def pair_of(thread, links, walls, fields, motion):
 
 
 class Scene(NamedTuple):
-    """What contacts are found from, and where they go."""
+    """Inputs of `find`, and the array that it writes, `found`."""
 
     links: Links
     walls: Walls
@@ -177,17 +177,16 @@ class Scene(NamedTuple):
 
 
 class Written(NamedTuple):
-    """What contacts are written from, and where they go.
+    """Inputs of `count` and `place`, and the arrays that they write.
 
     Attributes:
         links: See `Links`.
         fields: See `Fields`.
         found: See `Found`.
-        out: Warp's contacts; those of a world follow each other, without a gap between
-            two worlds.
-        counts: (N,) contacts of a world.
-        starts: (N,) places of the first ones.
-        overflow: (N,) gets 1 where a world has more contacts than places.
+        out: Warp's contacts, world by world, without a gap between two worlds.
+        counts: (N,) number of contacts of a world.
+        starts: (N,) index of the first contact of a world.
+        overflow: (N,) set to 1 if a world has more contacts than room.
     """
 
     links: Links
@@ -220,7 +219,7 @@ def find(thread, scratch, scene):
 
 @compiled
 def is_finite(pair):
-    """Whether the place and the axis of a link are numbers."""
+    """Whether position and axis of a link are finite."""
     centre = pair.capsule.centre
     return math.isfinite(centre[0] + centre[1] + centre[2] + pair.axis[0])
 
@@ -241,7 +240,7 @@ def keep(found, thread, pair, given, count):
 
 @compiled
 def _tangent(normal):
-    """A unit vector (3) across a unit vector, that of MuJoCo's `mju_makeFrame`."""
+    """A unit vector (3) orthogonal to a unit vector, as MuJoCo's `mju_makeFrame`."""
     x, y, z = normal
     a, b = (0.0, 1.0) if abs(y) < 0.5 else (1.0, 0.0)
     along = a * z + b * y
@@ -261,7 +260,7 @@ def _mixed(array, row, geoms, k, mix, priority):
 
 @compiled
 def _write_law(links, fields, out, at, pair):
-    """Writes what two geoms give a contact, as MuJoCo's `mj_contactParam` does."""
+    """Writes a contact's parameters from two geoms, as MuJoCo's `mj_contactParam`."""
     world, link, which = pair
     geoms = links.geoms[link], links.carriers[which]
     priority, mix = links.priorities[link, which], links.mix[link, which]
@@ -332,7 +331,7 @@ def place(thread, scratch, given):
     if thread == 0:
         out.nacon[0] = given.starts[worlds - 1] + given.counts[worlds - 1]
     at = given.starts[world]
-    for own in range(which * threads + link):  # those that other threads write
+    for own in range(which * threads + link):  # contacts that other threads write
         carrier, before = own // threads, own % threads
         at += found.number[(carrier * worlds + world) * threads + before]
     for n in range(min(found.number[thread], last - at)):
@@ -342,7 +341,7 @@ def place(thread, scratch, given):
 
 @compiled
 def _write(given, at, own, row):
-    """Writes a contact into a place of Warp's arrays."""
+    """Writes a contact to index `at` of Warp's arrays."""
     world, link, which, n = own
     out = given.out
     out.dist[at], out.includemargin[at] = row[0], 0.0

@@ -74,12 +74,12 @@ class WallContacts:
         self, worlds: Sequence[int] | np.ndarray, model: mujoco.MjModel,
         data: mujoco.MjData,
     ) -> None:  # fmt: skip
-        """Puts some worlds into an anatomy.
+        """Sets the walls of some worlds to those of an anatomy.
 
         Args:
             worlds: (K,) numbers of worlds.
-            model: With the walls that the carriers name, and their places.
-            data: Of the model, in any posture; changes.
+            model: Model whose carriers name the walls and have their places.
+            data: Data of the model, in any posture; its kinematics are overwritten.
         """
         mujoco.mj_kinematics(model, data)
         for which, carrier in enumerate(self.carriers):
@@ -97,7 +97,7 @@ class WallContacts:
         self._entered = True
 
     def move(self, effect: Effect, bore: int) -> None:
-        """Has the walls move, before they are bound.
+        """Makes the walls move; called before `bind`.
 
         Args:
             effect: `physics.motion.Moving`, bound to its worlds.
@@ -111,11 +111,11 @@ class WallContacts:
         return self._walls is not None
 
     def bind(self, model: Any, data: Any) -> None:
-        """Takes the arrays of Warp's model and data, which must not be replaced.
+        """Binds to the arrays of Warp's model and data, which must not be replaced.
 
         Args:
             model: `mujoco_warp.Model`.
-            data: `mujoco_warp.Data` with as many places for contacts in each world.
+            data: `mujoco_warp.Data` with the same room for contacts in each world.
         """
         device, view = self._device, self._device.view
         if self._walls is None:
@@ -154,11 +154,11 @@ class WallContacts:
         self._device.write(self._overflow, np.zeros(self.num_worlds, np.int32))
 
     def overflowed(self) -> np.ndarray:
-        """(N,) whether a world had more contacts than places in the control step."""
+        """(N,) bool, whether a world had more contacts than room in the step."""
         return self._device.host(self._overflow) != 0
 
     def __call__(self, model: Any, data: Any) -> None:
-        """What mujoco_warp calls at the end of its own collision."""
+        """Finds the contacts with walls; mujoco_warp's callback after its collision."""
         del model, data
         device, threads = self._device, self.num_worlds * self._host.dims.size
         if self._motion is None:
@@ -170,17 +170,17 @@ class WallContacts:
         device.launch(place, threads, NONE, self._written)
 
     def write(self) -> None:
-        """Writes the parameters of the motion as they are on the host."""
+        """Copies the parameters of the motion from the host to the device."""
         if self._motion is not None:
             self._motion.write()
 
     def carry(self) -> None:
-        """Adds the velocities of walls, once the rows of constraints are there."""
+        """Adds the velocities of walls to the rows of constraints, once these exist."""
         if self._motion is not None:
             self._motion.carry(self.num_worlds)
 
     def _made(self) -> Walls:
-        """The walls of all anatomies on the device."""
+        """Copies the walls of all anatomies to the device."""
         empty = [np.zeros(1), *(np.zeros(1, t) for t in (np.int16, np.int32, np.int16))]
         columns: list[list[np.ndarray]] = [[] for _ in range(6)]
         starts = np.zeros((len(self._parts), 6, 2), np.int64)

@@ -1,8 +1,8 @@
-"""Where compiled laws run on Warp's arrays: kernels on a GPU, loops on the CPU.
+"""Devices on which compiled laws run on Warp's arrays: as GPU kernels or CPU loops.
 
 A *thread function* is a compiled function of a thread's number and of named tuples of
 arrays. `Device.launch` runs it for many threads: numba-cuda compiles the same source
-for the GPU and launches it on Warp's stream, so that a captured CUDA graph has it.
+for the GPU and launches it on Warp's stream, so that a captured CUDA graph includes it.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ import numpy as np
 from cathsim_dmc import bounds, extras
 from cathsim_dmc.compiled import compiled, for_cuda
 
-_THREADS, _MANY = 64, 32_768  # of a block, of all
+# Threads of a block where there are more than `_MANY` threads in all.
+_THREADS, _MANY = 64, 32_768
 
 Scratch = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 NONE: Scratch = ((1,), (1,), (1,))
 
 
 def warp_modules() -> tuple[Any, Any]:
-    """The modules `warp` and `mujoco_warp`; ImportError says what to install."""
+    """Imports `warp` and `mujoco_warp`; ImportError names the extra to install."""
     extras.require("gpu", "warp", "mujoco_warp")
     found = [importlib.import_module(name) for name in ("warp", "mujoco_warp")]
     found[0].config.quiet = True
@@ -37,7 +38,7 @@ class Device:
     """A device of Warp, "cpu" or "cuda:0".
 
     Attributes:
-        name: Warp's name of it.
+        name: Warp's name of the device.
         is_cuda: Whether it is a GPU.
     """
 
@@ -52,14 +53,14 @@ class Device:
         self.name, self.is_cuda = alias, alias != "cpu"
 
     def active(self) -> Any:
-        """A context in which it is the device of Warp and of numba-cuda."""
+        """A context in which this is the active device of Warp and numba-cuda."""
         return self._warp.ScopedDevice(self.name)
 
     @contextlib.contextmanager
     def captured(self) -> Iterator[Any]:
-        """Captures what is launched as a CUDA graph, `graph` of what is given.
+        """Captures the launches in this context as a CUDA graph, `graph` of its value.
 
-        Nothing is freed meanwhile: CUDA ends a capture in which memory is.
+        Garbage collection is off meanwhile: CUDA ends a capture if memory is freed.
         """
         collects = gc.isenabled()
         gc.collect()
@@ -81,22 +82,22 @@ class Device:
             return _cuda().to_device(values)
 
     def view(self, array: Any) -> Any:
-        """Warp's array as thread functions take it, without a copy."""
+        """A view of Warp's array for thread functions, without a copy."""
         if not self.is_cuda:
             return array.numpy()
         with self.active():
             return _cuda().as_cuda_array(array)
 
     def zeros(self, size: int) -> Any:
-        """Warp's array of whole numbers, all 0."""
+        """Makes a Warp array (size,) of int, all 0."""
         return self._warp.zeros(size, dtype=int, device=self.name)
 
     def sum_before(self, numbers: Any, sums: Any) -> None:
-        """Writes sums of all numbers before each, of two arrays of `zeros`."""
+        """Writes the exclusive prefix sums of numbers; both are arrays of `zeros`."""
         self._warp.utils.array_scan(numbers, sums, inclusive=False)
 
     def write(self, array: Any, values: np.ndarray) -> None:
-        """Writes into what `constant` returned."""
+        """Writes values into an array made by `constant`."""
         if self.is_cuda:
             with self.active():
                 array.copy_to_device(np.ascontiguousarray(values, array.dtype))
@@ -104,7 +105,7 @@ class Device:
             array[...] = values
 
     def host(self, array: Any) -> np.ndarray:
-        """What `constant` returned, on the host, a copy."""
+        """Returns a copy on the host of an array made by `constant`."""
         if not self.is_cuda:
             return array.copy()
         with self.active():
@@ -116,7 +117,7 @@ class Device:
         Args:
             function: Compiled thread function.
             count: Number of threads.
-            scratch: Shapes of arrays of float64 that each thread has for itself.
+            scratch: Shapes of the float64 arrays that are private to each thread.
             given: Named tuple of arrays, numbers and named tuples.
         """
         if self.is_cuda:
@@ -126,7 +127,7 @@ class Device:
 
     def _run(self, kernel: Any, count: int, given: Any) -> None:
         stream = _cuda().external_stream(self._warp.get_stream(self.name).cuda_stream)
-        # Few threads are spread over all processors of the GPU.
+        # Small blocks spread few threads over all multiprocessors of the GPU.
         block = _THREADS if count > _MANY else 32
         with self.active():
             kernel[(count + block - 1) // block, block, stream](count, given)
@@ -139,7 +140,7 @@ def _cuda() -> Any:
     return cuda
 
 
-# Loops and kernels refer to the function: none is kept on disk.
+# Loops and kernels refer to a function object, so they are not cached on disk.
 
 
 @functools.cache

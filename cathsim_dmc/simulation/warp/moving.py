@@ -24,12 +24,12 @@ from cathsim_dmc.simulation.warp.moving_kernels import (
 class MovingWalls:
     """The motion of the walls of N worlds.
 
-    Contacts feel the velocity of the wall as the reference of their constraints. On the
-    CPU it is a column of their Jacobian, see `physics.adapters.motion`.
+    The velocity of a wall enters the reference of a contact's constraint. On the CPU it
+    is a column of the contact's Jacobian, see `physics.adapters.motion`.
     """
 
     def __init__(self, device: Device, effect: Effect, bore: int):
-        """Takes what `WallContacts.move` takes."""
+        """Takes the arguments of `WallContacts.move`."""
         self._device, self._given, self._bore = device, effect.world.parameters, bore
         count = effect.world.num_simulations
         self._places, self._sizes = np.zeros((count, 1, 3)), np.zeros((count, 3))
@@ -52,7 +52,7 @@ class MovingWalls:
             self._sizes[worlds] = model.geom_size[self._bore]
 
     def bind(self, model: Any, data: Any, scene: Scene, written: Written) -> None:
-        """Takes Warp's arrays, and those of the contacts."""
+        """Binds to Warp's arrays and to those of the contacts."""
         constant, view = self._device.constant, self._device.view
         given = [constant(np.array(each)) for each in self._given]
         self._vessels = Vessels(
@@ -70,18 +70,18 @@ class MovingWalls:
         )  # fmt: skip
 
     def place(self) -> None:
-        """Writes where the sheaths are."""
+        """Copies poses and sizes of the sheaths from the host to the device."""
         self._device.write(self._vessels.places, self._places)
         self._device.write(self._vessels.turns, self._turns)
         self._device.write(self._vessels.sizes, self._sizes)
 
     def write(self) -> None:
-        """Writes the parameters of the motion as they are on the host."""
+        """Copies the parameters of the motion from the host to the device."""
         for values, array in zip(self._given, self._vessels.parameters, strict=True):
             self._device.write(array, values)
 
     def find(self, threads: int) -> None:
-        """Finds the contacts."""
+        """Finds the contacts in a number of threads."""
         self._device.launch(find_moving, threads, SCRATCH, self._scene)
 
     def carry(self, worlds: int) -> None:

@@ -40,12 +40,12 @@ _LEAST, _MOST = 1e-4, 0.9999  # MuJoCo's mjMINIMP and mjMAXIMP
 
 
 class Vessels(NamedTuple):
-    """What moves the walls of N worlds.
+    """Motion of the walls of N worlds, and the boxes around their sheaths.
 
     Attributes:
         time: (N,) s, Warp's.
         parameters: `laws.motion.MotionParameters` of arrays (N,).
-        places: (N, 1, 3) m, of the box around the sheath.
+        places: (N, 1, 3) m, centre of the box around the sheath.
         turns: (N, 1, 3, 3), its axes in columns.
         sizes: (N, 3) m, its half lengths; 0 for none.
     """
@@ -58,14 +58,14 @@ class Vessels(NamedTuple):
 
 
 class MovingScene(NamedTuple):
-    """What contacts with walls that move are found from, and where they go."""
+    """Inputs of `find_moving`."""
 
     scene: Scene
     vessels: Vessels
 
 
 class Carried(NamedTuple):
-    """What the velocity of a wall is written from, and where it goes.
+    """Inputs of `carry`, and the arrays that it changes, the last two.
 
     Attributes:
         links: See `Links`.
@@ -74,8 +74,8 @@ class Carried(NamedTuple):
         contacts: Warp's.
         counts, starts: (N,), see `WallContacts`.
         timestep: (1 or N,) s, Warp's.
-        velocity: (N, R) of the rows of constraints, Warp's `efc.vel`.
-        reference: (N, R) Warp's `efc.aref`.
+        velocity: (N, R) velocities of the rows of constraints, Warp's `efc.vel`.
+        reference: (N, R) their reference accelerations, Warp's `efc.aref`.
     """
 
     links: Links
@@ -122,7 +122,7 @@ def find_moving(thread, scratch, given):
         memory = Memory(samples, own)
         made = contacts(pair.wall, pair.capsule, pair.law, pair.sweep, memory, out)
     else:
-        # The sheath rests, whatever moves past it.
+        # In the sheath, which does not move, only the wall at rest counts.
         if _in_sheath(vessels, world, pair.centre):
             if clearance_along(pair.wall, pair.capsule, 0.0) >= FREE:
                 return
@@ -152,9 +152,9 @@ def _impedance(solimp, depth):
 
 @compiled
 def _damping(contacts, at, row, step):
-    """Change of a row's reference by its velocity, 1/s, with a direct `solref`.
+    """Change of a row's reference with its velocity, 1/s, with a direct `solref`.
 
-    As the integrator `discrete` of MuJoCo Warp's `constraint._efc_row` has it.
+    As in MuJoCo Warp's `constraint._efc_row` with the integrator `discrete`.
     """
     solimp, solref = contacts.solimp[at], contacts.solref[at]
     high = min(max(float(solimp[1]), _LEAST), _MOST)
@@ -169,7 +169,7 @@ def _damping(contacts, at, row, step):
 def carry(world, scratch, given):
     """Adds the velocity of the wall to the contacts of a world.
 
-    Warp has computed the references of constraints from the velocities of links alone.
+    Warp computes the references of constraints from the velocities of links alone.
 
     Args:
         world: Its number.

@@ -1,7 +1,7 @@
 """Passive forces of a task's effects, added in MuJoCo Warp.
 
-The laws are those that `physics.dispatcher` has MuJoCo call, `laws.blood` and
-`laws.springs`. One thread takes one world.
+The laws are `laws.blood` and `laws.springs`, which MuJoCo calls through
+`physics.dispatcher` on the CPU. One thread computes one world.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ class Arrays(NamedTuple):
 
     Attributes:
         first_link: Number of the first link among the bodies.
-        body_dofadr: (L,) of the links.
-        body_dofnum: (L,) of the links.
-        geoms: (L,) of the links.
-        hinges: (3, 2 J) joints of the hinges, places in `qpos`, degrees of freedom.
+        body_dofadr: (L,) first degree of freedom of each link.
+        body_dofnum: (L,) number of degrees of freedom of each link.
+        geoms: (L,) geoms of the links.
+        hinges: (3, 2 J) joints of the hinges, their indices in `qpos`, and their
+            degrees of freedom.
         time: (N,) s.
     """
 
@@ -81,10 +82,10 @@ def device_of(world, arrays):
 
 
 class Given(NamedTuple):
-    """What a law gets.
+    """Inputs of a law.
 
     Attributes:
-        parameters: Its parameters, of arrays (N, ...).
+        parameters: Parameters of the law, of arrays (N, ...).
         arrays: `Arrays`.
         memory: `laws.springs.Scratch` of arrays (N, ...).
     """
@@ -121,7 +122,7 @@ def add_drag(world, scratch, all_given):
 
 @compiled
 def add_springs(world, scratch, all_given):
-    """Adds what the springs of a shaped device lack, see `laws.springs`.
+    """Adds to the hinge springs the torques of the device's shape, see `laws.springs`.
 
     Args:
         world: Its number.
@@ -144,16 +145,16 @@ class PassiveForces:
         """Takes the effects that have a law.
 
         Args:
-            device: Where Warp's arrays are.
-            places: Of the links and hinges in the model.
-            effects: Bound to their worlds.
+            device: Device of Warp's arrays.
+            places: Indices of the links and hinges in the model.
+            effects: Effects, bound to their worlds.
             count: N.
 
         Raises:
             NotImplementedError: if there is a law that is not simulated on Warp.
         """
         self._device, self._places, self._count = device, places, count
-        # With each whether its parameters change within an episode.
+        # The last entry of each: whether its parameters change within an episode.
         self._laws: list[tuple[Any, Any, Any, bool]] = []
         for effect in effects:
             if effect.adapter not in ("blood", "springs"):
@@ -171,7 +172,7 @@ class PassiveForces:
             self._laws.append((law, given, there, changes))
 
     def bind(self, model: Any, data: Any, host: mujoco.MjModel) -> None:
-        """Takes the arrays of Warp's model and data, which must not be replaced."""
+        """Binds to the arrays of Warp's model and data, which must not be replaced."""
         view, constant, places = self._device.view, self._device.constant, self._places
         links = slice(places.first_link, places.first_link + len(places.geoms))
         rows = view(data.xmat)
@@ -206,10 +207,10 @@ class PassiveForces:
         ]
 
     def write(self, whole: bool) -> None:
-        """Writes the parameters as they are on the host.
+        """Copies the parameters from the host to the device.
 
         Args:
-            whole: Whether those have changed that stay the same in an episode, too.
+            whole: Whether also to copy those that are constant within an episode.
         """
         for _, given, there, changes in self._laws:
             if not (whole or changes):
@@ -218,7 +219,7 @@ class PassiveForces:
                 self._device.write(array, values)
 
     def __call__(self, model: Any, data: Any) -> None:
-        """What mujoco_warp calls at the end of its own passive forces."""
+        """Adds the forces of all laws; mujoco_warp's callback after its own ones."""
         del model, data
         for law, given in self._calls:
             self._device.launch(law, self._count, NONE, given)

@@ -1,4 +1,4 @@
-"""What is summed up on the device, so that little has to be copied from it."""
+"""Forces, errors and sensors, reduced on the device to keep transfers small."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ _FORCES = 7  # rows of `Totals.force`
 
 
 class Totals(NamedTuple):
-    """Of the physics steps of a control step, float64.
+    """Totals over the physics steps of a control step, float64.
 
     Attributes:
-        force: (7, N) the forces of `physics.forces.WallForce`, N, of the means the sums
-            over the physics steps, and the depth of the deepest contact, m.
-        diverged: (N,) whether the state is not finite.
-        beside: (N, B) sensors beside those of contacts.
+        force: (7, N) the forces of `physics.forces.WallForce`, N, with sums over the
+            physics steps in place of the means, and the largest contact depth, m.
+        diverged: (N,) 1 if an entry of the state is beyond MuJoCo's mjMAXVAL or not
+            finite, else 0.
+        beside: (N, B) the sensors other than those of contacts.
     """
 
     force: Any
@@ -31,17 +32,17 @@ class Totals(NamedTuple):
 
 
 class Added(NamedTuple):
-    """What a physics step adds to the totals, arrays of Warp's.
+    """Arrays of `clear` and `add`, most of them Warp's.
 
     Attributes:
         counts, starts: (N,), see `WallContacts`.
         is_wall: (ngeom,) whether a geom is the wall of the vessel.
         geom: (K, 2) geoms of the contacts.
-        dist: (K,) m.
-        dim: (K,) rows of a contact.
-        rows: (K, dim) its rows; -1 for none.
-        forces: (N, R) of the rows, N.
-        out: (8 + B, N) `Totals`, one after the other.
+        dist: (K,) signed distances of the contacts, m.
+        dim: (K,) number of constraint rows of a contact.
+        rows: (K, dim) indices of these rows; -1 for none.
+        forces: (N, R) forces of the rows, N.
+        out: (8 + B, N) the fields of `Totals`, concatenated.
     """
 
     counts: Any
@@ -56,11 +57,11 @@ class Added(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """What ends a control step.
+    """Arrays of `end`.
 
     Attributes:
         sensors: (N, nsensordata), Warp's.
-        places: (B,) of the sensors beside those of contacts.
+        places: (B,) indices of the sensors other than those of contacts.
         qpos: (N, nq), Warp's.
         qvel: (N, nv), Warp's.
         out: See `Added`.
@@ -137,10 +138,10 @@ class Reduction:
         """Takes the arrays of Warp's data.
 
         Args:
-            device: Where they are.
+            device: Device of these arrays.
             data: `mujoco_warp.Data`.
-            contacts: With the places of the contacts.
-            beside: (B,) places of the sensors beside those of contacts.
+            contacts: Has the places of the contacts.
+            beside: (B,) indices of the sensors other than those of contacts.
         """
         view, found = device.view, data.contact
         self._device, self._count = device, len(data.qpos)

@@ -13,8 +13,8 @@ from cathsim_dmc.tasks.navigation import Navigation
 class WarpSimulation(BatchSimulation):
     """N simulations of one task on one device.
 
-    They follow those of `BatchSimulation` within single precision, and differ from run
-    to run on a GPU, which adds numbers in any order.
+    They agree with those of `BatchSimulation` within single precision. On a GPU they
+    differ from run to run, because it adds numbers in any order.
 
     Attributes:
         stepper: Does the physics steps.
@@ -31,18 +31,18 @@ class WarpSimulation(BatchSimulation):
         num_threads: int = 0,
         seeds: Sequence[int] | int = 0,
     ):
-        """Compiles the task's model; the device gets it with the first step.
+        """Compiles the task's model; the first step copies it to the device.
 
         Args:
-            task: Task that no environment owns; the simulation takes it over.
+            task: Task that belongs to no environment; from now on it is the batch's.
             num_simulations: N.
-            device: Of Warp, "cuda" for the first GPU.
+            device: Device of Warp, "cuda" for the first GPU.
             num_threads: Threads of the host, 0 for one per core.
-            seeds: Seeds of the simulations, or of the first, the others counting up.
+            seeds: Seeds of the simulations, or of the first; the others count up.
 
         Raises:
             ImportError: if the extra `gpu` is not installed.
-            NotImplementedError: if the task has what is not simulated there.
+            NotImplementedError: if Warp does not support an option of the task.
             ValueError: as `BatchSimulation`, or if there is no such device.
         """
         self._device = Device(device)
@@ -54,5 +54,5 @@ class WarpSimulation(BatchSimulation):
         return WarpStepper(task, model, num_simulations, self._device, num_threads)
 
     def close(self) -> None:
-        """Lets the memory of the device go; the next step takes it anew."""
+        """Frees the memory of the device; the next step allocates it again."""
         self.stepper.close()

@@ -1,9 +1,9 @@
 """Steps N simulations of one task in MuJoCo Warp.
 
-At the beginning of a control step the state of all worlds goes to the device, at its
-end the state and what an episode reads come back. MuJoCo itself, on the host, does the
-forward pass of a reset, the control steps that are done again in shorter steps, and the
-check of depths at the end of a control step.
+At the beginning of a control step, the state of all worlds is copied to the device; at
+its end, the state and the readings are copied back. MuJoCo on the host does the forward
+pass of a reset, the control steps that are repeated in shorter steps, and the check of
+depths at the end of a control step.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
 
-# State of a simulation that the physics changes, and that the effects write.
+# State of a simulation that the physics changes, and state that the effects write.
 _STATE = ("qpos", "qvel", "act", "qacc_warmstart")
 _GIVEN = ("userdata", "qfrc_applied")
 _LEAST_TOLERANCE = 1e-6  # of the solver, which has single precision
@@ -42,7 +42,8 @@ class WarpStepper(Stepper):
     """N simulations on one device.
 
     Attributes:
-        lost: (N,) worlds that had more contacts than there are places for, counted.
+        lost: (N,) number of control steps in which a world had more contacts or
+            constraint rows than room.
     """
 
     def __init__(
@@ -53,10 +54,10 @@ class WarpStepper(Stepper):
         device: Device,
         num_threads: int,
     ):
-        """Puts the compiled scene on the device.
+        """Prepares the arrays; the first step copies the scene to the device.
 
         Raises:
-            NotImplementedError: if the task has what is not simulated there.
+            NotImplementedError: if Warp does not support an option of the task.
         """
         refuse(task)
         super().__init__(model, num_simulations, task.substeps)
@@ -67,7 +68,7 @@ class WarpStepper(Stepper):
         self._read = [name for name in self._names if name not in _GIVEN]
         self.arrays = types.SimpleNamespace(**self._empty(model, num_simulations))
         self._force = np.zeros((7, num_simulations))
-        # Where the last physics step was done.
+        # Whether the last physics step was done on the device.
         self._on_device = np.zeros(num_simulations, bool)
         self._own: dict[str, np.ndarray] = {}
         fields = [name for effect in task.effects for name in effect.model_fields]
@@ -120,7 +121,7 @@ class WarpStepper(Stepper):
         return self._own[name][index]
 
     def load(self, index: int, case: Case) -> None:
-        """Puts one simulation into an anatomy."""
+        """Loads an anatomy into one simulation."""
         if self._cases.get(index) is case:
             return
         self._cases[index] = case
@@ -146,10 +147,10 @@ class WarpStepper(Stepper):
             self._local.made = copy.copy(self._model), mujoco.MjData(self._model)
         return self._local.made
 
-    # The course of a control step.
+    # The sequence of a control step.
 
     def reset(self, indices: np.ndarray) -> None:
-        """Begins anew in some simulations (K,), at the default pose."""
+        """Resets some simulations (K,) to the default pose."""
         for name in (*_STATE, *_GIVEN, "ctrl", "time"):
             getattr(self.arrays, name)[indices] = 0.0
         self.arrays.qpos[indices] = self._model.qpos0
@@ -161,7 +162,7 @@ class WarpStepper(Stepper):
         self._begun = {
             n: rows.copied(getattr(self.arrays, n)) for n in (*_STATE, "time")
         }
-        # The physics leaves what the effects write as it is.
+        # The physics does not change what the effects write.
         self._begun |= {name: getattr(self.arrays, name) for name in _GIVEN}
         self._warnings_before = self.warnings.copy()
 
@@ -199,13 +200,13 @@ class WarpStepper(Stepper):
         self._note(totals.diverged != 0, worlds.overflowed())
 
     def close(self) -> None:
-        """Lets the memory of the device go; the next step takes it anew."""
+        """Frees the memory of the device; the next step allocates it again."""
         if self._worlds is not None:
             self._worlds.close()
             self._worlds = None
 
     def _note(self, diverged: np.ndarray, lost: np.ndarray) -> None:
-        """Counts worlds that diverged, put back to where they began, and overflows."""
+        """Counts overflows and diverged worlds; restores the latter's last state."""
         self.lost += lost
         for index in np.flatnonzero(diverged).tolist():
             self.warnings[index] += 1
@@ -253,7 +254,7 @@ class WarpStepper(Stepper):
         self._stale = True
 
     def restore(self, indices: np.ndarray) -> None:
-        """Nothing: models of the host change while one simulation uses them."""
+        """Does nothing: options of the host's models are restored after each use."""
 
     # What MuJoCo does on the host.
 
@@ -270,7 +271,7 @@ class WarpStepper(Stepper):
         self, index: int, act: Callable[[mujoco.MjModel, mujoco.MjData], Any],
         arrays: Any = None,
     ) -> Any:  # fmt: skip
-        """Lets MuJoCo act on one simulation, and takes what an episode reads."""
+        """Calls `act` on MuJoCo's model and data of one simulation; reads arrays."""
         model, data = self._model_of(index), self._mine()[1]
         mujoco.mj_resetData(model, data)
         self._write(index, data, vars(self.arrays) if arrays is None else arrays)
@@ -281,7 +282,7 @@ class WarpStepper(Stepper):
         return result
 
     def forward_unactuated(self, indices: np.ndarray) -> None:
-        """What dm_control does at a reset, when there is no control yet."""
+        """Does a forward pass with actuators off, as dm_control does at a reset."""
         flag = mujoco.mjtDisableBit.mjDSBL_ACTUATION.value
 
         def forward(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -294,7 +295,7 @@ class WarpStepper(Stepper):
         self._each(lambda index: self._on_host(index, forward), indices)
 
     def still(self, indices: np.ndarray) -> forces.WallForce:
-        """Force on the wall where some simulations have not moved yet."""
+        """Returns the force on the wall; some simulations (K,) have not moved yet."""
         rows = self.arrays.sensordata[indices][:, None, self._contacts]
         force, depth = forces.wall_force(np.ascontiguousarray(rows))
         self._force[:, indices] = *force, depth
@@ -304,7 +305,7 @@ class WarpStepper(Stepper):
         return list(self._pool.map(act, indices.tolist()))
 
     def _refine(self, indices: np.ndarray, parts: int) -> np.ndarray:
-        """Does the control step of some simulations again, in shorter steps."""
+        """Repeats the control step of some simulations in shorter physics steps."""
         rows = np.stack(self._each(lambda i: self._again(i, parts), indices))
         last = np.ascontiguousarray(rows[:, parts - 1 :: parts])
         force, depth = forces.wall_force(last)
@@ -334,7 +335,7 @@ class WarpStepper(Stepper):
         return rows
 
     def _keep_still(self, indices: np.ndarray) -> None:
-        """Nothing: `still` reads the sensors."""
+        """Does nothing: `still` reads the sensors."""
 
     def _forward(self, indices: np.ndarray) -> None:
         self._each(lambda index: self._on_host(index, mujoco.mj_forward), indices)
@@ -344,7 +345,7 @@ class WarpStepper(Stepper):
 
 
 def refuse(task: Navigation) -> None:
-    """NotImplementedError by name for what is not simulated on Warp."""
+    """Raise NotImplementedError if Warp does not support an option of the task."""
     if task.config.solver_tolerance < _LEAST_TOLERANCE:
         raise NotImplementedError(
             f"a solver_tolerance below {_LEAST_TOLERANCE:g}: not simulated on Warp; "

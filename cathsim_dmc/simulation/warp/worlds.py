@@ -1,4 +1,4 @@
-"""Model, data and graph of MuJoCo Warp for N worlds, and what goes to and fro."""
+"""Model, data and graph of MuJoCo Warp for N worlds, and transfers with the host."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from cathsim_dmc.simulation.warp.devices import Device, warp_modules
 from cathsim_dmc.simulation.warp.passive import PassiveForces
 from cathsim_dmc.simulation.warp.reduction import Reduction, Totals
 
-# Places for contacts and for rows of constraints, in each world.
+# Room for contacts and for rows of constraints, in each world.
 CONTACTS, ROWS = 48, 128
-# The solver takes a full matrix of constraints one contact of all worlds after the
-# other, a sparse one the contacts of a world where it is not done.
+# With a dense matrix of constraints, the solver visits the contacts of all worlds one
+# after the other; with a sparse one, only those of worlds that have not converged.
 SPARSE = True
 _WRITTEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl", "qfrc_applied", "time")
 _ALWAYS = ("qpos", "act", "ctrl", "qfrc_applied", "time")
-# Fields of a model that Warp does not read here: boxes serve MuJoCo's own collision.
+# Fields of a model that Warp does not read here: they serve MuJoCo's own collision.
 _HOST_ONLY = ("geom_aabb", "geom_rbound", "mesh_")
 
 
@@ -42,23 +42,23 @@ class Worlds:
         laws: tuple[WallContacts, PassiveForces],
         substeps: int,
     ):
-        """Puts the compiled scene on the device.
+        """Copies the compiled scene to the device.
 
         Args:
-            device: Where to simulate.
+            device: Device of the simulations.
             model: Scene of the task.
             own: Fields (N, ...) that differ between worlds.
             laws: Contacts of the links with the walls, and passive forces.
             substeps: Physics steps in a control step.
 
         Raises:
-            NotImplementedError: if a field differs that Warp has once for all worlds.
+            NotImplementedError: if a field differs that all worlds of Warp share.
         """
         self._warp, self._mjwarp = warp_modules()
         self._device, self._substeps = device, substeps
         contacts, self._passive = laws
         prepared = copy.copy(model)
-        # Their contacts come from the field.
+        # `WallContacts` finds the contacts of the carriers.
         prepared.geom_contype[contacts.carriers] = 0
         kinds = mujoco.mjtJacobian
         kind = kinds.mjJAC_SPARSE if SPARSE else kinds.mjJAC_DENSE
@@ -70,11 +70,11 @@ class Worlds:
             self.model.opt.contact_sensor_maxmatch = max(size // 14, CONTACTS)
             self.model.opt.warn_overflow = 0  # counted instead
             count = contacts.num_worlds
-            # Warp's default is for contacts of its own collision.
+            # Warp's default size is that for its own contacts.
             entries = ROWS * model.nv
             sizes = {"nconmax": CONTACTS, "njmax": ROWS, "njmax_nnz": entries}
             self.data = self._mjwarp.make_data(prepared, nworld=count, **sizes)
-            # Those that do not collide are drawn, and Warp does not read them.
+            # The other geoms are only visual, and Warp does not read them.
             self._colliding = (model.geom_contype | model.geom_conaffinity) != 0
             self._fields = {name for name in own if self._expand(name, own[name])}
             contacts.bind(self.model, self.data)
@@ -89,18 +89,18 @@ class Worlds:
         self.seconds: dict[str, float] = {}
 
     def close(self) -> None:
-        """Lets its memory go, which the callbacks of its own model hold otherwise."""
+        """Frees the memory; the model's callbacks and the graph refer to it."""
         self.model.callback.contactfilter = self.model.callback.passive = None
         self._graph = None
         self._staged.clear()
 
     def _act(self, model: Any, data: Any) -> None:
-        """What mujoco_warp calls at the end of its own passive forces."""
+        """Adds passive forces; mujoco_warp's callback after its own passive forces."""
         self._passive(model, data)
         self._contacts.carry()
 
     def _expand(self, name: str, values: np.ndarray) -> bool:
-        """Gives each world values (N, ...) of its own; False where none are needed."""
+        """Gives each world its own values (N, ...); returns whether Warp has them."""
         array = getattr(self.model, name, None)
         if name.startswith("opt."):
             raise NotImplementedError(f"{name} is the same in all worlds of Warp")
@@ -116,10 +116,10 @@ class Worlds:
         return True
 
     def _check_shared(self, name: str, values: np.ndarray) -> None:
-        """Refuses a field that Warp has once, and whose values (N, ...) differ."""
+        """Raise NotImplementedError if values (N, ...) of a shared field differ."""
         if name.startswith("geom_"):
             values = values[:, self._colliding]
-        # The same in another frame is the same but for rounding.
+        # Equal values in other frames differ by rounding.
         if not np.allclose(values, values[:1], rtol=1e-6, atol=1e-12):
             raise NotImplementedError(
                 f"{name} cannot differ between worlds of Warp; "
@@ -144,11 +144,12 @@ class Worlds:
                 self._check_shared(name, own[name])
 
     def write(self, arrays: Any, whole: bool) -> None:
-        """Writes the state of all worlds, or what the host changes in every step.
+        """Copies the state of all worlds to the device.
 
         Args:
-            arrays: Of the host, by MuJoCo's names.
-            whole: Whether velocities and accelerations have changed, too.
+            arrays: Arrays of the host, by MuJoCo's names.
+            whole: Whether to copy the whole state, or only what the host changes in
+                every control step.
         """
         began = time.perf_counter()
         self._passive.write(whole)
@@ -166,7 +167,7 @@ class Worlds:
         self._warp.copy(array, staged)
 
     def _stage(self, key: str, array: Any) -> Any:
-        """Page-locked memory of the host for a copy of an array."""
+        """Page-locked host memory for a copy of an array."""
         if key not in self._staged:
             pinned = self._device.is_cuda
             self._staged[key] = self._warp.empty(
@@ -192,7 +193,7 @@ class Worlds:
         self._reduction.end()
 
     def _step(self, last: bool) -> None:
-        """Does a physics step; sensors and forces on links are of the last one."""
+        """Does a physics step; only the last computes sensors and forces on links."""
         option, without = self.model.opt, mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         kept, option.run_rne_postconstraint = option.disableflags, last
         option.disableflags = kept if last else kept | without
@@ -203,9 +204,9 @@ class Worlds:
         self._reduction.add()
 
     def _captured(self) -> Any:
-        """The physics steps as a CUDA graph; the state stays as it is."""
+        """Captures the physics steps as a CUDA graph; the state does not change."""
         kept = {name: self._warp.clone(getattr(self.data, name)) for name in _WRITTEN}
-        for last in (False, True):  # compiles what is not compiled yet
+        for last in (False, True):  # compiles all kernels before the capture
             self._step(last)
         self._reduction.end()
         self.wait()
@@ -217,11 +218,12 @@ class Worlds:
         return capture.graph
 
     def read(self, arrays: Any, names: Iterable[str]) -> Totals:
-        """Reads the state, what an episode reads, and the sums of the control step.
+        """Copies arrays and the totals of the control step to the host.
 
         Args:
-            arrays: Of the host, by MuJoCo's names, (N, ...) float64.
-            names: Those to read; of `sensordata` all but the contacts.
+            arrays: Arrays of the host, by MuJoCo's names, (N, ...) float64; written.
+            names: Names of the arrays to copy; of `sensordata`, the sensors other than
+                those of contacts are copied in any case.
         """
         chosen = [name for name in names if name != "sensordata"]
         began = time.perf_counter()
@@ -243,15 +245,15 @@ class Worlds:
         return totals
 
     def wait(self) -> None:
-        """Waits until the device has done what it was told."""
+        """Waits until the device has finished all launched work."""
         self._warp.synchronize_device(self._device.name)
 
     def read_sensors(self, out: np.ndarray, chosen: np.ndarray) -> None:
-        """Reads all sensors (N, nsensordata) of the last physics step of some worlds.
+        """Copies all sensors of the last physics step of some worlds to the host.
 
         Args:
-            out: Gets them.
-            chosen: (N,) bool.
+            out: (N, nsensordata), written.
+            chosen: (N,) bool, the worlds.
         """
         staged = self._stage("sensordata", self.data.sensordata)
         self._warp.copy(staged, self.data.sensordata)
@@ -264,7 +266,7 @@ class Worlds:
         rows.each(len(out), convert)
 
     def overflowed(self) -> np.ndarray:
-        """(N,) whether a world had too many contacts or rows in the control step."""
+        """(N,) bool, whether a world had too many contacts or rows in the step."""
         found = self._contacts.overflowed() | (self.data.overflow.numpy() != 0)
         self.data.overflow.zero_()
         return found
