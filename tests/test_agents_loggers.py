@@ -98,6 +98,7 @@ def test_an_unknown_logger_is_refused():
         make_config("ppo", logger="paper")
 
 
+@pytest.mark.slow
 def test_trainings_without_a_logger_import_none():
     text = (
         "import sys, cathsim_dmc.agents.training\n"

@@ -185,6 +185,7 @@ def short(monkeypatch):
     monkeypatch.setitem(protocols.PROTOCOLS, "varied", own)
 
 
+@pytest.mark.slow
 def test_a_replay_finds_what_was_not_played(short, script, tmp_path):
     path = tmp_path / "one.json"
     values = submission.submit("push", path, "type1_bca")
@@ -213,6 +214,7 @@ def test_a_replay_finds_what_was_not_played(short, script, tmp_path):
         entries.replay(entries.read(sealed(path, summed(values))))
 
 
+@pytest.mark.slow
 def test_a_policy_that_does_not_ship_is_replayed_by_its_actions(short, tmp_path):
     mine, out = tmp_path / "mine.npz", tmp_path / "one.json"
     submission.record_actions("push", mine, "type1_bca")
@@ -247,6 +249,7 @@ def test_a_policy_that_does_not_ship_is_replayed_by_its_actions(short, tmp_path)
     assert entries.replay(entry) is None
 
 
+@pytest.mark.slow
 def test_weights_that_do_not_ship_leave_their_actions(short, tmp_path):
     for path in pretrained.DIRECTORY.glob("navigator.*"):
         shutil.copy(path, tmp_path)

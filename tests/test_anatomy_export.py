@@ -35,6 +35,7 @@ def test_pieces_surround_the_lumen(tube, pieces):
     assert min(ConvexHull(piece * 1e3).volume for piece in pieces) > 1e-3
 
 
+@pytest.mark.slow
 def test_a_missing_piece_and_a_plug_are_found(tube, pieces):
     gap = [piece for piece in pieces if abs(piece[:, 2].mean() - 0.02) > 5e-3]
     assert export.fidelity(tube, gap)["open_places"] > 5
@@ -43,6 +44,7 @@ def test_a_missing_piece_and_a_plug_are_found(tube, pieces):
     assert found["closed_to_5fr"] == ["tube"]
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_model_that_other_engines_read(tube, tmp_path, cathsim):
     tube.save(tmp_path / "tube")
     path = tmp_path / "tube.xml"
@@ -65,6 +67,7 @@ def test_the_command_writes_a_model_that_other_engines_read(tube, tmp_path, cath
     assert "held" in touched and "free" not in touched
 
 
+@pytest.mark.slow
 def test_merging_opens_no_gap_and_stays_out_of_the_lumen(tube, pieces):
     prisms = export.wall_pieces(tube, "prisms")
     assert len(pieces) < len(prisms) / 3
@@ -77,6 +80,7 @@ def test_merging_opens_no_gap_and_stays_out_of_the_lumen(tube, pieces):
     assert export._within(middles, grown).all()
 
 
+@pytest.mark.slow
 def test_the_inlet_is_free_of_pieces_and_looked_at(tube, pieces):
     inlet = tube.inlet
     turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
@@ -133,6 +137,7 @@ def test_the_walls_of_the_phantoms(name):
     assert found["intrusion_mm"]["mean"] <= 0.05 and found["intrusion_mm"]["max"] <= 0.3
 
 
+@pytest.mark.slow
 def test_a_thin_wall_between_two_lumens_stays_out_of_both():
     def line(*points):
         steps = np.linspace(0.0, 1.0, 30)[:, None]

@@ -117,7 +117,9 @@ def test_necks_differ_and_are_repeated():
         check_septa(tree)
 
 
-@pytest.mark.parametrize("name", ["neck", "test_neck"])
+@pytest.mark.parametrize(
+    "name", ["neck", pytest.param("test_neck", marks=pytest.mark.slow)]
+)
 def test_the_branches_of_a_neck_begin_in_other_vessels(name):
     """A cross-section that lies outside of them is a lumen without a wall."""
     for seed in arch.arch_set(name)[:28]:

@@ -30,6 +30,7 @@ def imported(folder, tree, spacing, **options):
     return import_scan(path, notes=notes, **options), " | ".join(notes)
 
 
+@pytest.mark.slow
 def test_a_carotid_has_a_trunk_that_can_be_renamed(tmp_path):
     """CCA and ICA together are no aorta, and each of the three has its goal."""
     vessels = {

@@ -269,6 +269,7 @@ def test_importing_the_suite_is_all_dm_control_needs_and_is_light():
     }
 
 
+@pytest.mark.slow
 def test_imports_leave_the_environment_as_it_is():
     """`cathsim eval` and agents load torchrl before dm_control."""
     done = run(

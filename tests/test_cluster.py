@@ -59,7 +59,14 @@ def observation(rows):
     return TensorDict({environments.VECTOR: rows}, [len(rows)])
 
 
-@pytest.mark.parametrize("name", ["random", "expert", "pretrained:type1_lcca"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "random",
+        pytest.param("expert", marks=pytest.mark.slow),
+        pytest.param("pretrained:type1_lcca", marks=pytest.mark.slow),
+    ],
+)
 def test_episodes_played_apart_are_those_played_together(name):
     player, logs = load_policy(name, 7), [evaluation.ContactLog() for _ in range(2)]
     parts = protocols.parts(

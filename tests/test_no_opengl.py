@@ -111,6 +111,7 @@ def test_a_command_that_draws_nothing_needs_no_opengl(backend):
     assert f"MUJOCO_GL={backend}" in line and "MUJOCO_GL=disable" in line
 
 
+@pytest.mark.slow
 def test_bad_input_stays_bad_input_without_opengl():
     done = run_broken("osmesa", "eval", "no_such_policy", "--task", "type1_lcca")
     assert done.returncode == 2, done.stderr

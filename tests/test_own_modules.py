@@ -61,6 +61,7 @@ def module(tmp_path, monkeypatch, forget):
     return write
 
 
+@pytest.mark.slow
 def test_a_run_on_an_own_task_says_which_module_it_needs(cathsim, module, forget):
     module("own_one", "own_short")
     code, _, err = cathsim("train", "own_short", "--out", "run", *SMALL)

@@ -332,7 +332,13 @@ def test_a_projection_maps_points_to_their_pixels(right):
 
 
 @pytest.mark.parametrize(
-    "suffix", [".rrd", ".npz", ".webp", pytest.param(".gif", marks=pytest.mark.slow)]
+    "suffix",
+    [
+        ".rrd",
+        ".npz",
+        pytest.param(".webp", marks=pytest.mark.slow),
+        pytest.param(".gif", marks=pytest.mark.slow),
+    ],
 )
 def test_a_function_of_the_observation_is_recorded(pushed, tmp_path, suffix):
     env, _ = pushed

@@ -78,6 +78,7 @@ def test_what_success_is_stands_beside_the_scene(exported):
     assert task["substeps"] * 0.004 == pytest.approx(task["control_timestep"])
 
 
+@pytest.mark.slow
 def test_a_pair_is_written_as_its_chain_stands(tmp_path, cathsim):
     task, out = "simple1_lcca_pair", tmp_path / "pair"
     code, told, _ = cathsim("export", task, "--out", out, "--seed", "2")
