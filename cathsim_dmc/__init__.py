@@ -5,7 +5,7 @@
 
 Functions that look at an environment or an episode (`help(cathsim_dmc.show)`):
 
-    record       plays an episode with a policy and keeps it; films and recordings
+    record       plays an episode with a policy; writes it as a film or a recording
     show         draws anatomy, device, goal and contact forces of a state
     plot         draws forces, insertion and distance of an episode over time
     forces       contacts and forces of a state, in newtons
@@ -15,8 +15,8 @@ Packages (`help(cathsim_dmc.suite)`), imported when they are first used:
 
     suite        tasks by name: load, make_task, register
     simulation   many simulations at once; TorchRL and Gymnasium environments
-    policies     scripted policies, and what a policy is
-    agents       learners, training, evaluation, policies that ship: load_policy
+    policies     scripted policies, base class of all policies
+    agents       learners, training, evaluation, pretrained policies: load_policy
     tasks        rewards, observations, options and randomisation of a task
     entities     devices, sheath, phantom and follower robot
     anatomy      vessels: phantoms, random arches, scans
@@ -38,8 +38,8 @@ import warnings
 
 __version__ = "0.3.0.dev0"
 
-# MuJoCo's window library warns at import on a machine without a screen. Nothing here
-# needs one before a viewer is asked for, which then says so itself.
+# MuJoCo's window library warns at import on a machine without a display. Only viewers
+# need a display, and they raise errors of their own.
 warnings.filterwarnings("ignore", message=".*DISPLAY environment variable is missing.*")
 # TorchRL 0.14 warns of classes of its own at import.
 warnings.filterwarnings("ignore", message=".*WeightUpdaterBase is deprecated.*")
@@ -62,7 +62,7 @@ _SUBMODULES = (
     "tasks",
     "validation",
 )
-# What a notebook asks for first; see `cathsim_dmc.pictures`.
+# Functions of `cathsim_dmc.pictures` that the package itself offers too.
 _FUNCTIONS = ("fluoroscopy", "forces", "plot", "record", "show")
 
 

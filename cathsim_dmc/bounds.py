@@ -1,7 +1,7 @@
-"""Checks of values that a user gives: type, finite, within bounds.
+"""Checks of user input: type, finiteness, range.
 
-Every function returns the value as plain Python, or raises a ValueError that names the
-field, what was given and what is allowed.
+A check returns the value as a plain Python object or numpy array. It raises a
+ValueError that names the argument, the value given and the values allowed.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-# Seeds that numpy's RandomState takes.
+# Largest seed of numpy's RandomState.
 MOST_SEED = 2**32 - 1
 # Simulations or episodes; more would fill the memory.
 MOST_SIMULATIONS = 100_000
@@ -28,25 +28,25 @@ MOST_START_SHARE = 0.95
 # Largest distance of an anatomy from the origin, m.
 FAR = 10.0
 
-# Magnitude of a number of any kind: its square is finite in single precision, and no
+# Largest magnitude of any number: its square is finite in single precision, and no
 # quantity in SI units is larger (a Young's modulus is up to 1e12 Pa).
 LARGEST = 1e15
 
 _SHOWN = 80  # characters of a value in an error
-# Python and numpy count truths and durations among the integers.
+# Python and numpy register booleans and timedelta64 as integers.
 _NO_NUMBERS = bool, np.bool_, np.timedelta64
 
 
 def refuse(name: str, value: Any, allowed: str) -> NoReturn:
-    """Raise the ValueError of a value that is not allowed."""
+    """Raises a ValueError with the value given and the values allowed."""
     raise ValueError(f"{name} is {shown(value)}; it must be {allowed}")
 
 
 def shown(value: Any) -> str:
-    """A value as text: one line, at most 80 characters."""
+    """Returns the representation of a value, one line of at most 80 characters."""
     try:
         text = " ".join(repr(value).split())
-    except Exception:  # a class of the user
+    except Exception:  # from the __repr__ of a user's class
         text = f"a {type(value).__name__}"
     return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
 
@@ -60,7 +60,7 @@ def number(
     *,
     positive: bool = False,
 ) -> float:
-    """A finite number in a closed range; `positive` demands more than zero."""
+    """Returns a finite float in [low, high]; with `positive`, also above 0."""
     good = is_number(value) and low <= value <= high and (value > 0 or not positive)
     if good and abs(value) > LARGEST:
         refuse(name, value, f"at most {LARGEST:g} in magnitude")
@@ -75,13 +75,13 @@ def fields(
     prefix: str = "",
     positive: Sequence[str] = (),
 ) -> dict[str, float]:
-    """Attributes that are numbers within (low, high, unit); see `number`.
+    """Returns the checked numeric attributes of an object by name; see `number`.
 
     Args:
         owner: Object with the attributes.
-        limits: By the names of the attributes.
-        prefix: Before their names in errors.
-        positive: Names of those that may not be 0.
+        limits: (low, high, unit) by the name of the attribute.
+        prefix: Prefix of the names in error messages.
+        positive: Names of the attributes that must exceed 0.
     """
     return {
         name: number(
@@ -99,7 +99,7 @@ def fields(
 def whole(
     name: str, value: Any, low: int | None = None, high: int | None = None
 ) -> int:
-    """An integer in a closed range; a bool is refused."""
+    """Returns an integer in [low, high]; refuses a bool."""
     least, most = -math.inf if low is None else low, math.inf if high is None else high
     if not _is_whole(value) or not least <= value <= most:
         refuse(name, value, _allowed("an integer", least, most))
@@ -107,12 +107,12 @@ def whole(
 
 
 def seed(name: str, value: Any) -> int:
-    """A seed of numpy's RandomState."""
+    """Returns a seed of numpy's RandomState, from 0 to 2**32 - 1."""
     return whole(name, value, 0, MOST_SEED)
 
 
 def seeds(name: str, value: Any, count: int) -> list[int]:
-    """One seed for each of `count` simulations.
+    """Returns one seed for each of `count` simulations.
 
     Args:
         value: Seed of the first simulation, from which the others count up, or one
@@ -134,11 +134,11 @@ def seeds(name: str, value: Any, count: int) -> list[int]:
 def indices(
     name: str, value: Any, count: int, *, ascending: bool = False
 ) -> np.ndarray:
-    """Numbers (K,) of some of `count` simulations, sorted, each once.
+    """Returns sorted, unique indices (K,) int of some of `count` simulations.
 
     Args:
-        value: Integers in one row, at least one; None chooses all.
-        ascending: Refuses another order, and numbers that are there twice.
+        value: Sequence or 1-D array of at least one integer; None selects all.
+        ascending: Whether to refuse unsorted or repeated indices.
     """
     if value is None:
         return np.arange(count)
@@ -163,7 +163,7 @@ SIMULATION_DEVICES = "'cpu', 'cuda' or 'cuda:1'"
 
 
 def option_simulation_device(value: Any) -> dict[str, str]:
-    """Arguments for `make_env` of an option --simulation-device; tensors stay here."""
+    """Returns `make_env` arguments of --simulation-device; tensors stay on the CPU."""
     found = isinstance(value, str) and SIMULATION_DEVICE.fullmatch(value)
     if not found:
         name = "simulation_device (--simulation-device)"
@@ -172,28 +172,28 @@ def option_simulation_device(value: Any) -> dict[str, str]:
 
 
 def random_state(name: str, value: Any) -> np.random.RandomState:
-    """A RandomState: the given one, or one of a seed; None draws a seed."""
+    """Returns the RandomState given, or a new one of a seed; None draws the seed."""
     if isinstance(value, np.random.RandomState):
         return value
     return np.random.RandomState(None if value is None else seed(name, value))
 
 
 def switch(name: str, value: Any) -> bool:
-    """True or False; 0 and 1 are refused."""
+    """Returns True or False; refuses 0 and 1."""
     if not isinstance(value, bool | np.bool_):
         refuse(name, value, "True or False")
     return bool(value)
 
 
 def text(name: str, value: Any) -> str:
-    """A text of 1 to 200 characters."""
+    """Returns a string of 1 to 200 characters."""
     if not isinstance(value, str) or not 0 < len(value) <= 200:
         refuse(name, value, "a text of 1 to 200 characters")
     return value
 
 
 def choice(name: str, value: Any, choices: Sequence[str] | Mapping[str, Any]) -> str:
-    """One of `choices`."""
+    """Returns one of the names in `choices`."""
     if not isinstance(value, str) or value not in choices:
         refuse(name, value, f"one of {', '.join(choices)}")
     return value
@@ -207,7 +207,7 @@ def vector(
     high: float = math.inf,
     unit: str = "",
 ) -> tuple[float, ...]:
-    """`count` finite numbers in a closed range."""
+    """Returns `count` finite floats in [low, high]."""
     values = _entries(value, count, is_number, low, high)
     if values is None:
         allowed = _allowed("a finite number", low, high, unit)
@@ -224,7 +224,7 @@ def interval(
     *,
     integers: bool = False,
 ) -> tuple[float, float]:
-    """The ends (low, high) of a range within another."""
+    """Returns the ends of an interval that lies in [low, high]."""
     values = _entries(value, 2, _is_whole if integers else is_number, low, high)
     if values is None or not values[0] <= values[1]:
         kind = "an integer" if integers else "a finite number"
@@ -236,12 +236,12 @@ def interval(
 def array(
     name: str, value: Any, kinds: str = "fiu", shape: tuple[int, ...] | None = None
 ) -> np.ndarray:
-    """An array of finite numbers.
+    """Returns an array of finite numbers; its dtype stays as given.
 
     Args:
-        value: What was given.
-        kinds: Kinds of numpy's dtypes that are allowed.
-        shape: Shape that it must have, -1 for any size; None for any shape.
+        value: Array, or nested sequences.
+        kinds: Allowed values of `dtype.kind`.
+        shape: Required shape, -1 for any size; None for any shape.
     """
     try:
         given = np.asarray(value)
@@ -265,7 +265,7 @@ def array(
 
 
 def actions(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Finite actions of a shape as float64, clipped to [-1, 1] as the drives would."""
+    """Returns finite actions of a shape as float64, clipped to [-1, 1]."""
     try:
         given = array("the action", value, shape=shape)
     except ValueError as error:
@@ -273,19 +273,19 @@ def actions(value: Any, shape: tuple[int, ...]) -> np.ndarray:
             f"{error}, in [-1, 1]: tip motors from proximal to distal (x before y), "
             "translation, and rotation if the task has it"
         ) from None
-    # A fraction of the time of `np.clip`.
+    # Faster than `np.clip`.
     return np.minimum(np.maximum(given.astype(np.float64), -1.0), 1.0)
 
 
 def instance(name: str, value: Any, kind: type) -> Any:
-    """An object of a class."""
+    """Returns an object of the class `kind`."""
     if not isinstance(value, kind):
         refuse(name, value, f"a {kind.__name__}")
     return value
 
 
 def pixels(name: str, value: Any) -> tuple[int, int]:
-    """Rows and columns of an image, from (rows, columns) or one number for both."""
+    """Returns (rows, columns) of an image, given as a pair or one number for both."""
     given = [value, value] if _is_whole(value) else value
     values = _entries(given, 2, _is_whole, 1, MOST_PIXELS)
     if values is None:
@@ -297,14 +297,14 @@ def pixels(name: str, value: Any) -> tuple[int, int]:
 def mapping(
     name: str, value: Any, known: Iterable[str], others: str = ""
 ) -> Mapping[str, Any]:
-    """A mapping with some of the known names; `others` says what else is allowed."""
+    """Returns a mapping with keys in `known`; `others` precedes these in the error."""
     if not isinstance(value, Mapping) or set(value) - set(known):
         refuse(name, value, f"{others}a mapping with some of {', '.join(known)}")
     return value
 
 
 def made(name: str, value: Any, kind: type, others: str = "") -> Any:
-    """A dataclass from a mapping of its fields, see `mapping`, or an object of it."""
+    """Returns an object of a dataclass, given itself or as a mapping of its fields."""
     if isinstance(value, kind):
         return value
     known = [field.name for field in dataclasses.fields(kind)]
@@ -316,7 +316,7 @@ def made(name: str, value: Any, kind: type, others: str = "") -> Any:
 
 
 def options(name: str, value: Any) -> dict[str, Any]:
-    """A new dictionary of options by name; empty for None."""
+    """Returns a new dictionary of options by name; empty for None."""
     if value is None:
         return {}
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
@@ -327,7 +327,7 @@ def options(name: str, value: Any) -> dict[str, Any]:
 def _entries(
     value: Any, count: int, fits: Callable[[Any], bool], low: float, high: float
 ) -> list[Any] | None:
-    """The entries of a row of `count` that fit in a closed range; None for another."""
+    """Returns a row of `count` entries in [low, high] as a list; None for others."""
     row = _row(value)
     if row is None or len(row) != count:
         return None
@@ -336,7 +336,7 @@ def _entries(
 
 
 def _row(value: Any) -> list[Any] | None:
-    """The entries of a sequence or of an array with one axis."""
+    """Returns a sequence or 1-D array as a list; None for other values."""
     if isinstance(value, np.ndarray):
         return list(value) if value.ndim == 1 else None
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
@@ -375,7 +375,7 @@ def _allowed(
 
 
 def as_json(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Options as they are read from JSON, and those that are objects, as they are."""
+    """Splits options into JSON values and the objects that JSON cannot hold."""
     plain, objects = dict[str, Any](), dict[str, Any]()
     for name, value in given.items():
         if isinstance(value, np.generic | np.ndarray):
@@ -388,7 +388,7 @@ def as_json(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _as_mapping(value: Any) -> dict[str, Any]:
-    """An option that is a dataclass, as the mapping that makes it again."""
+    """Returns the fields of a dataclass that are not None; TypeError for others."""
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         raise TypeError
     return dataclasses.asdict(

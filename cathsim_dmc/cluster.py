@@ -21,8 +21,8 @@ def connect() -> None:
     import ray
 
     if not ray.is_initialized():
-        # The dashboard is what sends statistics of use. What jobs print is in Ray's own
-        # logs.
+        # Without the dashboard Ray sends no usage statistics. Ray's log files hold the
+        # output of the jobs.
         ray.init(
             include_dashboard=False,
             log_to_driver=False,
@@ -31,7 +31,7 @@ def connect() -> None:
 
 
 def processors() -> list[int]:
-    """Processors that each machine of the cluster offers, most first."""
+    """Return the number of processors of each live machine, in descending order."""
     import ray
 
     alive = (node["Resources"] for node in ray.nodes() if node["Alive"])
@@ -39,16 +39,16 @@ def processors() -> list[int]:
 
 
 def room(each: int) -> int:
-    """Number of jobs with so many processors each that fit at a time."""
+    """Return how many jobs of `each` processors can run at the same time."""
     return sum(count // each for count in processors())
 
 
 def require_room(count: int, each: int) -> None:
-    """Raise ValueError if so many jobs never fit at a time: they would wait for ever.
+    """Raise ValueError unless `count` jobs can run at the same time.
 
     Args:
         count: Number of jobs.
-        each: Number of processors of each, on one machine.
+        each: Number of processors of a job, which runs on one machine.
     """
     if room(each) < count:
         raise ValueError(
@@ -66,22 +66,22 @@ def over(
     say: Callable[[str], None] = lambda text: None,
     keep_going: bool = False,
 ) -> Iterator[tuple[int, Any]]:
-    """Results of independent jobs as they finish, each with the number of its job.
+    """Yield the index and the result of each independent job as it finishes.
 
-    A job whose process or machine is lost begins again elsewhere. Relative paths mean
-    on every machine what they mean here, if it has this folder.
+    A job whose process or machine is lost starts again elsewhere. Jobs run in the
+    current folder, so relative paths keep their meaning on machines that have it.
 
     Args:
         work: Function of one job, which the other machines can import; jobs and
             results are copied.
-        jobs: What it is called with.
+        jobs: Arguments of `work`, one for each job.
         each: Number of processors of a job; None for one.
         say: Receives a line for each finished job.
-        keep_going: Whether the exception of a failed job is its result, in place of
-            ending all.
+        keep_going: Whether to yield the exception of a failed job as its result
+            instead of raising it.
 
     Raises:
-        ValueError: no machine has so many processors.
+        ValueError: no machine has `each` processors.
         RuntimeError: a job was lost `RETRIES` + 1 times.
         Exception: that of a job, as it was raised.
     """
@@ -116,7 +116,7 @@ def over(
 
 
 def cause_of(error: Any) -> Exception:
-    """What was raised elsewhere, with the error that tells where as its cause."""
+    """Return the exception that a job raised, with Ray's error as its `__cause__`."""
     found = error.cause if isinstance(error.cause, Exception) else RuntimeError(error)
     found.__cause__ = error
     return found

@@ -1,7 +1,7 @@
-"""Compiled loops: what a function of plain loops over arrays is decorated with.
+"""Decorators that compile functions of plain loops over arrays with numba.
 
-Importing numba takes longer than loading a task, so a function is compiled when it is
-first called, and numba is imported with it.
+Importing numba takes longer than loading a task. A function is therefore compiled, and
+numba imported, at the first call.
 """
 
 import functools
@@ -11,7 +11,7 @@ from typing import Any
 
 
 class _Compiled:
-    """A function that is compiled when it is called, from Python or compiled code."""
+    """A function that is compiled at its first call, by Python or compiled code."""
 
     def __init__(self, function: Callable, cache: bool = True, **options: Any):
         functools.update_wrapper(self, function)
@@ -22,7 +22,7 @@ class _Compiled:
 
         from cathsim_dmc import compiled_parts
 
-        # Wrappers that nothing calls would take a fifth more time to compile.
+        # Wrappers that nothing calls would add a fifth to the compile time.
         options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
         own: Any = compiled_parts.PackageCompiler
         if part:
@@ -32,7 +32,7 @@ class _Compiled:
 
     @functools.cached_property
     def _compiled(self) -> Any:
-        """What Python calls."""
+        """The dispatcher that Python calls, cached on disk if `cache` is set."""
         made = self._made()
         if self._cache:
             from cathsim_dmc import compiled_cache
@@ -42,7 +42,7 @@ class _Compiled:
 
     @functools.cached_property
     def _inner(self) -> Any:
-        """What compiled code calls, which is kept with the caller."""
+        """The dispatcher that compiled callers use; their cached code includes it."""
         return self._made(part=True)
 
     def __call__(self, *arguments: Any) -> Any:
@@ -54,7 +54,7 @@ class _Compiled:
 
     @functools.cached_property
     def on_cuda(self) -> Any:
-        """What kernels of numba-cuda call; see `for_cuda`."""
+        """The device function for kernels of numba-cuda; see `for_cuda`."""
         from numba import cuda
 
         function, own = self._function, dict(self._function.__globals__)
@@ -79,16 +79,16 @@ class _Compiled:
 
     @property
     def cache_path(self) -> str | None:
-        """Folder in which what is compiled is kept; None where nothing is."""
+        """Folder of the cached code; None if it is not cached."""
         return self._compiled.stats.cache_path
 
 
 def compiled(function: Callable, cache: bool = True, checked: bool = False) -> Callable:
-    """Compiles a function, once on each machine where there is a place to keep it.
+    """Compiles a function at its first call; with `cache`, once on each machine.
 
-    Without `fastmath`: the same numbers bit for bit, alone and in a batch. A function
-    that refers to others which change from call to call must not be kept (`cache`).
-    `checked` has an index beyond an array raise IndexError.
+    `fastmath` is off, so results alone and in a batch are equal bit for bit. A function
+    that refers to functions which change between calls needs `cache=False`. With
+    `checked`, an index out of range raises IndexError.
     """
     return _Compiled(function, cache, boundscheck=checked)
 
@@ -96,29 +96,29 @@ def compiled(function: Callable, cache: bool = True, checked: bool = False) -> C
 def law(function: Callable) -> Callable:
     """Compiles a function that allocates nothing; numba refuses one that does.
 
-    Numba then counts no references to arrays, which takes longer than a small function.
+    Without allocations numba omits the reference counts of arrays, which cost more than
+    a small function.
     """
     return _Compiled(function, _nrt=False)
 
 
 def inlined(function: Callable) -> Callable:
-    """Compiles a small `law` as a part of those that call it.
+    """Compiles a small `law` that is inlined into its callers.
 
-    An array in an argument is seven words: where a function is called for every sample,
-    passing them takes longer than its work.
+    An array argument takes seven words. In a function that is called for every sample,
+    passing them costs more than the work.
     """
     return _Compiled(function, _nrt=False, forceinline=True)
 
 
 def for_cuda(function: Any) -> Any:
-    """A compiled function, and all compiled functions that it calls, for a GPU.
+    """Returns a compiled function, with those that it calls, as a device function.
 
-    Both have the same source: the names of compiled functions in it stand for their own
-    device functions. A function that is called by another module's name
-    (`module.function`) is not found.
+    The source is the same; the names of compiled functions in it refer to their device
+    functions. Calls through a module (`module.function`) are not replaced.
 
     Args:
-        function: What `compiled`, `law` or `inlined` has made.
+        function: Result of `compiled`, `law` or `inlined`.
 
     Returns:
         A device function of numba-cuda, for its kernels.
@@ -136,6 +136,6 @@ def for_cuda(function: Any) -> Any:
 
 
 def _names(code: types.CodeType) -> set[str]:
-    """Global names in the code of a function and of those within it."""
+    """Returns the names that a code object and its nested functions refer to."""
     inner = (each for each in code.co_consts if isinstance(each, types.CodeType))
     return set(code.co_names) | {name for each in inner for name in _names(each)}

@@ -1,8 +1,8 @@
-"""Where compiled loops are kept on disk, and what happens when they cannot be.
+"""Cache of compiled functions on disk.
 
-A damaged file of the cache is compiled anew and replaced. Where nothing can be written,
-each process compiles for itself. Both take one line of warning and stop nothing. One
-line on standard error says that something is being compiled.
+A damaged cache file is compiled again and replaced. If no cache can be written, each
+process compiles for itself. Both cases log one warning. One line on standard error
+announces a compilation.
 """
 
 import functools
@@ -17,14 +17,14 @@ from numba.core import caching
 
 _LOG = logging.getLogger(__name__)
 _PACKAGE = Path(__file__).parent
-# What a source that holds compiled loops, or helps to compile, has in it.
+# Texts that mark a source file with compiled functions or with compiler code.
 _MARKS = (b"\n@compiled", b"\n@callback", b"import numba", b"from numba")
 _SEAL = hashlib.sha256().digest_size
 
 
 @functools.cache
 def _stamp() -> bytes:
-    # Compiled code knows where the fields of MuJoCo's structs lie.
+    # Compiled code depends on the layout of MuJoCo's structs.
     digest = hashlib.sha256(metadata.version("mujoco").encode())
     for path in sorted(_PACKAGE.rglob("*.py")):
         source = path.read_bytes()
@@ -34,7 +34,7 @@ def _stamp() -> bytes:
 
 
 class _Together:
-    """A place for numba's cache of the package, with one stamp for all sources."""
+    """Locator of numba's cache for this package, with one stamp for all sources."""
 
     @classmethod
     def from_function(cls, py_func, py_file):
@@ -48,8 +48,8 @@ class _Together:
 
 @functools.cache
 def keep_together() -> None:
-    """Has numba compile all loops, which hold each other, anew when one changes."""
-    places = (  # the one of the environment, of the source, of the user
+    """Makes a change of one source invalidate all code: callers include callees."""
+    places = (  # NUMBA_CACHE_DIR, beside the source, the user's cache folder
         caching.UserProvidedCacheLocator,
         caching.InTreeCacheLocator,
         caching.UserWideCacheLocator,
@@ -60,9 +60,9 @@ def keep_together() -> None:
 
 
 class _Files(caching.IndexDataCacheFile):
-    """Files of one function, read only if they are whole and of the same sources.
+    """Cache files of one function; damaged or outdated files are not read.
 
-    numba writes the index first: after a full disk it may name a file of older code.
+    numba writes the index first, so after a full disk it may name a file of older code.
     """
 
     def _load_index(self) -> dict:
@@ -81,7 +81,7 @@ class _Files(caching.IndexDataCacheFile):
         whole = Path(self._data_path(name)).read_bytes()
         if whole[-_SEAL:] != self._seal(whole[:-_SEAL]):
             _warn_of_damage(self._data_path(name), "its checksum is wrong")
-            raise OSError  # as if it were not there
+            raise OSError  # numba treats the file as missing
         return super()._load_data(name)
 
     def _seal(self, content: bytes) -> bytes:
@@ -90,7 +90,7 @@ class _Files(caching.IndexDataCacheFile):
 
 
 class _Cache(caching.FunctionCache):
-    """numba's cache of one function, which stops nothing."""
+    """numba's cache of one function; only warns if it cannot be written."""
 
     def __init__(self, function: Any):
         super().__init__(function)
@@ -112,11 +112,11 @@ class _Cache(caching.FunctionCache):
 
 
 def keep(made: Any, function: Any) -> None:
-    """Has what numba makes of a function kept on disk, where there is a place.
+    """Caches the compiled code of a function on disk, if a folder is writable.
 
     Args:
-        made: Dispatcher or `CFunc`, before it is compiled.
-        function: The Python function that it is made of.
+        made: Dispatcher or `CFunc`, before its first compilation.
+        function: Its Python function.
     """
     keep_together()
     try:
@@ -126,11 +126,11 @@ def keep(made: Any, function: Any) -> None:
 
 
 def has_compiled() -> bool:
-    """Whether this process has compiled a loop that was not kept on disk."""
+    """Whether this process has compiled a function that the cache lacked."""
     return "compiling" in _told
 
 
-_told: set[str] = set()  # a warning for each of dozens of functions would hide the rest
+_told: set[str] = set()  # kinds of warnings given: dozens of functions share one
 
 
 def _tell_of_compiling() -> None:

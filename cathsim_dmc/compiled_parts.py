@@ -1,8 +1,8 @@
-"""How functions that only compiled code calls are compiled: as parts of their callers.
+"""Compilation of parts: functions that only compiled code calls.
 
-numba optimises every function, with all that it calls, and makes machine code of it,
-again for each level of calls. A part is lowered alone; its callers optimise it with
-themselves, once, and make machine code of the whole.
+By default numba optimises each function together with its callees and generates machine
+code, once more at each level of calls. A part is only lowered to LLVM; its callers
+optimise it with their own code and generate the machine code once.
 """
 
 import functools
@@ -14,7 +14,7 @@ from numba.core.compiler import Compiler, Flags
 
 
 class _Library(JITCodeLibrary):
-    """The code of a part, which nothing runs before a caller has taken it in."""
+    """Code of a part, neither optimised nor compiled to machine code by itself."""
 
     def _optimize_final_module(self) -> None:
         pass
@@ -24,28 +24,28 @@ class _Library(JITCodeLibrary):
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        return 0  # as of every function without a wrapper for Python
+        return 0  # numba's value for a function without a Python wrapper
 
     @property
     def codegen(self) -> Any:
         return self
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Sets nothing: an environment is for code that calls Python."""
+        """Does nothing: only code that calls Python needs an environment."""
 
 
 @functools.cache
 def _remembering(context: Any) -> Any:
-    """A context of types that looks an operator on some types up once.
+    """Returns a typing context that caches the signatures it resolves.
 
-    numba tries all that it knows of, dates and strings included, each time.
+    numba otherwise tries all overloads each time, those of dates and strings included.
     """
 
     class Context(type(context)):
-        """The context, with what was found in `known`."""
+        """Typing context that caches its results in `known`."""
 
         def resolve_function_type(self, func: Any, args: Any, kws: Any) -> Any:
-            """Signature of a function on some types, as numba finds it."""
+            """Returns numba's signature of a function for some argument types."""
             if not isinstance(func, types.Function) or kws:
                 return super().resolve_function_type(func, args, kws)
             if (func, args) not in known:
@@ -59,16 +59,17 @@ def _remembering(context: Any) -> Any:
 
 
 class _Flags(Flags):
-    """Flags of a compilation, which numba compares for each operator that it looks up.
+    """Compiler flags with a fast `values`, which numba calls for each operator.
 
-    Its own `values` asks a property for each of twenty, a tenth of the time to compile.
+    Its own version reads a property for each of twenty flags, a tenth of the time to
+    compile.
     """
 
     __slots__ = ()
     _DEFAULTS = Flags().values()
 
     def values(self) -> dict[str, Any]:
-        """Values of all options."""
+        """Returns the values of all flags by name."""
         return self._DEFAULTS | self._values
 
 
@@ -91,10 +92,10 @@ class PackageCompiler(Compiler):
 
 
 class PartCompiler(PackageCompiler):
-    """Compiler of a part."""
+    """Compiler of parts."""
 
     def compile_extra(self, func: Any) -> Any:
-        """Compiles a function into a library of its own kind."""
+        """Compiles a function into a `_Library`."""
         codegen = self.state.targetctx.codegen()
         self.state.library = _Library(codegen, func.__qualname__)
         return super().compile_extra(func)

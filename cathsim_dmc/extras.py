@@ -1,4 +1,4 @@
-"""Packages that an installation may lack, because an extra brings them."""
+"""Optional packages, which the extras of this package install."""
 
 import importlib
 
@@ -23,6 +23,6 @@ def require(extra: str, *modules: str) -> None:
 
 
 def adding(extra: str) -> str:
-    """Says how to install an extra."""
+    """Returns the instruction for installing an extra."""
     command = f"pip install -c constraints.txt -e '.[{extra}]'"
     return f"in a checkout of cathsim-dmc, `{command}` adds it"

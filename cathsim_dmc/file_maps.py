@@ -1,7 +1,7 @@
-"""Files mapped into memory: pages are read when they are touched, and may be dropped.
+"""Files mapped into memory: pages are read at the first access and can be dropped.
 
-`mmap.mmap` and `numpy.memmap` keep a descriptor open for each file, of which a process
-often has 1,024; these maps keep none.
+`mmap.mmap` and `numpy.memmap` keep a file descriptor open for each map, and a process
+is often limited to 1,024; these maps keep none.
 """
 
 import ctypes
@@ -18,10 +18,10 @@ if os.name == "posix":
 
 
 def mapped(stream: BinaryIO) -> np.ndarray:
-    """The bytes (n,) uint8 of a file that is complete.
+    """Maps a complete file into memory; returns its bytes (n,) uint8.
 
-    What is written into them stays in this process. Where the system has no `mmap`
-    they are read.
+    Writes to the array do not reach the file. On systems other than POSIX the file is
+    read instead.
 
     Raises:
         OSError: if the file is empty or cannot be mapped.
@@ -36,16 +36,16 @@ def mapped(stream: BinaryIO) -> np.ndarray:
     if start == ctypes.c_void_p(-1).value:
         raise OSError(ctypes.get_errno(), "cannot be mapped into memory")
     block = (ctypes.c_uint8 * size).from_address(start)
-    # Not at exit: other threads may still look at it.
+    # Not at exit: other threads may still read it.
     place = ctypes.c_void_p(start)
     weakref.finalize(block, _library.munmap, place, length).atexit = False
     return np.frombuffer(memoryview(block), np.uint8)
 
 
 def release(pages: np.ndarray) -> None:
-    """Drops the pages of what `mapped` returned; they are read again when touched.
+    """Drops the pages of an array of `mapped`; the next access reads the file again.
 
-    What has been written into them is lost.
+    Values written to the array are lost.
     """
     if os.name == "posix":
         place, size = ctypes.c_void_p(pages.ctypes.data), ctypes.c_size_t(pages.size)

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic writing of files, checks of paths, and safe reading of archives."""
 
 import contextlib
 import errno
@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 _PARTIAL = ".partial"
-# What a file may unpack to: bytes, or times its size. Positions and forces shrink to a
-# third or less, and zeros, which a file of zeros could hold for ever, to a thousandth.
+# Largest unpacked size of a file: bytes, or multiple of its size, whichever is larger.
+# Positions and forces compress to a third or less, zeros to a thousandth.
 _UNPACKED, _RATIO = 2**28, 100
 _BLOCK = 2**20  # bytes
 _HEADER_1 = np.lib.format.read_array_header_1_0
@@ -27,11 +27,11 @@ _HEADER_2 = np.lib.format.read_array_header_2_0
 def atomic_path(
     path: str | os.PathLike[str], suffix: str | None = None
 ) -> Iterator[Path]:
-    """Yield a temporary path whose content becomes `path` when the block ends well.
+    """Yield a temporary path, which is renamed to `path` when the block succeeds.
 
-    The temporary file lies in the same directory and is renamed. When the block raises,
-    it is removed and an older `path` stays as it was. Of several writers of one path
-    all succeed, and the last one's content stays.
+    The temporary file lies in the same directory. When the block raises, it is removed
+    and an older `path` stays as it was. If several processes write one path, all
+    succeed, and the last content stays.
 
     Args:
         suffix: Ending that `path` must have, such as ".npz"; None allows any.
@@ -47,7 +47,7 @@ def atomic_path(
     _check_folder(path.parent)
     _check_target(path)
     temporary = _temporary(path)
-    _create(temporary)  # before the work
+    _create(temporary)  # raises before the work, not after it
     try:
         with naming(path):
             yield temporary
@@ -60,9 +60,9 @@ def atomic_path(
 
 @contextlib.contextmanager
 def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary directory that becomes `path` when the block ends well.
+    """Yield a temporary directory, which is renamed to `path` on success.
 
-    When the block raises, it is removed; see `atomic_path` for a killed writer.
+    When the block raises, the temporary directory is removed.
 
     Raises:
         OSError: if `path` exists with something in it, or cannot be written.
@@ -88,14 +88,14 @@ def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def require_folder(folder: str | os.PathLike[str], make: bool = False) -> Path:
-    """A folder that takes new files; checked before work whose result goes there.
+    """Check that a folder takes new files, before work is done for it; return its path.
 
     Args:
-        make: Whether to make the folder, and those around it, where it is missing.
+        make: Whether to create the folder and its parents if they are missing.
 
     Raises:
-        FileNotFoundError: there is no such folder, and it is not to be made.
-        NotADirectoryError: it, or one around it, is a file.
+        FileNotFoundError: the folder is missing and `make` is False.
+        NotADirectoryError: the folder or one of its parents is a file.
         PermissionError: it is read-only, or takes no new file for another reason.
     """
     folder = Path(folder)
@@ -105,13 +105,13 @@ def require_folder(folder: str | os.PathLike[str], make: bool = False) -> Path:
             folder.mkdir(parents=True, exist_ok=True)
     _check_folder(folder)
     probe = _temporary(folder / "probe")
-    _create(probe)  # the bits of a network folder or of /proc do not tell
+    _create(probe)  # permission bits do not tell on network folders and /proc
     probe.unlink()
     return folder
 
 
 def _check_folder(folder: Path) -> None:
-    """Raises an error of `require_folder` that the state of a folder tells."""
+    """Raise the errors of `require_folder` that show without creating a file."""
     if not folder.is_dir():
         if folder.exists():
             raise NotADirectoryError(f"{folder} is a file; give a directory (--out)")
@@ -124,7 +124,7 @@ def _check_folder(folder: Path) -> None:
 
 
 def _create(path: Path) -> None:
-    """Creates an empty file; PermissionError if its folder takes none."""
+    """Create an empty file; PermissionError if its folder takes none."""
     try:  # not tempfile, whose files only their owner may read
         open(path, "xb").close()
     except OSError as error:
@@ -135,10 +135,10 @@ def _create(path: Path) -> None:
 
 
 def require_place(folder: str | os.PathLike[str]) -> Path:
-    """A folder that takes new files, or could be made where there is none yet.
+    """Check that a folder takes new files or could be created; return its path.
 
     Raises:
-        OSError: as of `require_folder`, for it or for the nearest folder around it.
+        OSError: as `require_folder`, for the folder or its nearest existing parent.
     """
     place = Path(folder)
     while not (place.exists() or place.is_symlink()) and place != place.parent:
@@ -150,14 +150,14 @@ def require_place(folder: str | os.PathLike[str]) -> Path:
 def require_file(
     path: str | os.PathLike[str], make: bool = False, later: bool = False
 ) -> Path:
-    """The path of a file that can be written, or replaced; see `require_folder`.
+    """Check that a file can be written or replaced; return its path.
 
     Args:
-        make: Whether to make its folder where it is missing.
-        later: Whether its folder may also be missing, and is made when it is written.
+        make: Whether to create its folder if it is missing.
+        later: Whether its folder may be missing, to be created with the file.
 
     Raises:
-        OSError: as of `require_folder`; IsADirectoryError if `path` is a directory.
+        OSError: as `require_folder`; IsADirectoryError if `path` is a directory.
         ValueError: `path` is a device or a pipe, which a new file would replace.
     """
     path = Path(path)
@@ -167,28 +167,28 @@ def require_file(
 
 
 def _check_target(path: Path) -> None:
-    """Raises an error of `require_file` that tells of the file itself."""
+    """Raise the errors of `require_file` that concern the file itself."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a directory; give a file name in it")
     _refuse_special(path)
 
 
 def _refuse_special(path: str | os.PathLike[str]) -> None:
-    """Raises ValueError if a path is a device, whose zeros may never end, or a pipe."""
+    """Raise ValueError for a device, whose data may never end, or a pipe."""
     path = Path(path)
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ValueError(f"{path} is a device or a pipe; give the name of a file")
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """The UTF-8 text of a file; ValueError for a device or a pipe."""
+    """Return the UTF-8 text of a file; ValueError for a device or a pipe."""
     _refuse_special(path)
     return Path(path).read_text(encoding="utf-8")
 
 
 @contextlib.contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Name the file in an OSError of the block that names none, as on a full disk."""
+    """Add the path to an OSError of the block that names none, as on a full disk."""
     try:
         yield
     except OSError as error:
@@ -203,7 +203,7 @@ def refused(
     text: str,
     errors: type[Exception] | tuple[type[Exception], ...],
 ) -> Iterator[None]:
-    """Raise errors of the block as another kind: one line, a text before their own."""
+    """Raise errors of the block as `kind`, with one line: `text` and their message."""
     try:
         yield
     except errors as error:
@@ -229,12 +229,12 @@ def write_json(path: str | os.PathLike[str], values: Any) -> Path:
 
 
 def fill(path: str | os.PathLike[str], size: int) -> None:
-    """Write so many random bytes, which no file system compresses.
+    """Write `size` random bytes, which no file system compresses.
 
-    It comes before a writer that a full disk ends without an error, as it does HDF5.
+    Called before a writer such as HDF5, which a full disk crashes without an error.
 
     Raises:
-        OSError: the disk is full, or a quota.
+        OSError: the disk or the quota is full.
     """
     block = os.urandom(min(size, _BLOCK))
     with open(path, "wb") as file:
@@ -247,15 +247,15 @@ def _temporary(path: Path) -> Path:
 
 
 def require_room(unpacked: int, stored: int) -> None:
-    """Refuse what unpacks to far more than its file holds, before it is unpacked.
+    """Refuse a file that unpacks to far more than its size, before it is unpacked.
 
     Args:
-        unpacked: Bytes in memory.
-        stored: Bytes of the file.
+        unpacked: Size in memory, bytes.
+        stored: Size of the file, bytes.
 
     Raises:
         ValueError: if it unpacks to more than 268 MB and to more than 100 times its
-            file.
+            size.
     """
     most = max(_UNPACKED, _RATIO * stored)
     if unpacked > most:
@@ -268,12 +268,14 @@ def require_room(unpacked: int, stored: int) -> None:
 def read_arrays(
     path: str | os.PathLike[str], names: Iterable[str] | None = None
 ) -> dict[str, np.ndarray]:
-    """Arrays of an .npz archive, all or those named; no pickle is read.
+    """Return the arrays of an .npz archive by name, all or those in `names`.
+
+    No pickle is read.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no archive, is damaged, lacks an array, or unpacks to far
-            more than it holds, see `require_room`.
+            more than its size, see `require_room`.
     """
     try:
         _refuse_special(path)
@@ -295,7 +297,7 @@ def read_arrays(
 
 
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
-    """The array of an entry, which numpy would make as large as its header says."""
+    """Return the array of an entry; ValueError if its header claims more data."""
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{entry.filename} is packed in a way that numpy does not use")
     with archive.open(entry) as stream:

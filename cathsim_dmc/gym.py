@@ -14,7 +14,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 VERSION = 0  # the same as in simulation.gymnasium, which is imported late
-# Ids with the names of their tasks.
+# Names of the tasks by Gymnasium id.
 IDS = {f"{suite.DOMAIN}/{task}-v{VERSION}": task for task in suite.SUITE}
 
 _MODULE = "cathsim_dmc.simulation.gymnasium"

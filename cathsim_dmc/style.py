@@ -20,7 +20,7 @@ COLOURS = (
 
 
 def tidy(axes: Any) -> None:
-    """Leaves matplotlib's axes the two sides that carry scales, and a faint grid."""
+    """Hides the top and right side of matplotlib axes and draws a faint grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
@@ -31,7 +31,7 @@ def save(figure: Any, path: str | Path, dpi: int = 110) -> None:
     require_file(path, make=True)
     figure.set_dpi(dpi)
     if layout := figure.get_layout_engine():
-        # Once: matplotlib would draw the figure a second time for it.
+        # Applied once: an active layout engine makes matplotlib draw twice.
         layout.execute(figure)
         figure.set_layout_engine("none")
     with atomic_path(path) as temporary:

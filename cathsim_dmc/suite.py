@@ -40,10 +40,10 @@ from cathsim_dmc.tasks.scene import (
 DOMAIN = "cathsim"
 SUITE = containers.TaggedTasks()
 
-# Rewards are distances, not in [0, 1], and nothing is coloured by them.
+# Rewards are distances outside [0, 1], which dm_control cannot visualise.
 _TAG = "no_reward_visualization"
 _CONFIG_FIELDS = tuple(field.name for field in dataclasses.fields(NavigationConfig))
-# Other names of options that an objective cannot have.
+# Further names that an option of an objective must not have.
 _TAKEN = "random", "environment_kwargs", "anatomy", "goal", "access", *OF_ARCHES
 
 TASKS: dict[str, TaskDefinition] = {}
@@ -54,13 +54,13 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
 
     Args:
         name: Name of the task.
-        definition: What the task is made of.
+        definition: Anatomy, goal, objective and options of the task.
         *tags: Tags of dm_control's suite, such as "easy".
 
     Raises:
-        ValueError: if the name is taken or has other signs than letters, digits and
-            _ : . -, or an option of the objective has the name of
-            one that tasks have.
+        ValueError: if the name is taken or has other characters than letters, digits
+            and _ : . -, or an option of the objective has the name of an option that
+            all tasks have.
     """
     if not re.fullmatch(r"[\w:.-]+", bounds.text("name", name)):
         bounds.refuse("name", name, "of letters, digits and the signs _ : . -")
@@ -84,15 +84,15 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
 
 
 def known(name: Any, modules: Sequence[str] | None = None) -> str:
-    """The name of a task that is registered.
+    """Returns the name of a registered task.
 
     Args:
-        name: What may be one.
-        modules: Modules that the settings of a run name, which may register it. They
+        name: Candidate.
+        modules: Modules in the settings of a run, which may register the task. They
             are not imported here: a file from elsewhere must not choose what runs.
 
     Raises:
-        ValueError: there is no such task; says which are like it, or what to import.
+        ValueError: there is no such task; lists similar names, or modules to import.
     """
     if isinstance(name, str) and name in TASKS:
         return name
@@ -116,11 +116,11 @@ def known(name: Any, modules: Sequence[str] | None = None) -> str:
 def make_task(
     name: str, random: np.random.RandomState | int | None = None, **options: Any
 ) -> Navigation:
-    """A task of the suite, without compiling an environment.
+    """Returns a task of the suite, without compiling an environment.
 
     Args:
         name: Name of a task in `SUITE`.
-        random: Seed or source of randomness.
+        random: Seed or RandomState; None draws a seed.
         **options: Fields of `NavigationConfig`, options of the task's objective (such
             as `reward` and `goal_radius`); for `navigate`, `anatomy`, `goal` (a name,
             or (x, y, z) in the unit and frame of the file that the anatomy was
@@ -167,7 +167,7 @@ def make_task(
 def _configured(
     name: str, given: Mapping[str, Any]
 ) -> tuple[dict[str, Any], NavigationConfig]:
-    """Options of a task that are not of the configuration, and that; or ValueError."""
+    """Splits options into those of the task and the configuration; or ValueError."""
     options = {**TASKS[name].options, **given}
     if unknown := sorted(set(options) - {*task_options(name)}):
         having = [task for task in TASKS if {*unknown} <= {*task_options(task)}]
@@ -183,14 +183,14 @@ def _configured(
 
 
 def num_actions(name: str, **options: Any) -> int:
-    """Number of entries of an action of a task, see `make_task`, which is not made."""
+    """Returns the number of entries of an action, without making the task."""
     return count_actions(_configured(known(name), options)[1])
 
 
 def _one_length(
     config: NavigationConfig, anatomies: Sequence[Anatomy], goals: Sequence[Goal]
 ) -> NavigationConfig:
-    """The configuration with a device as long as the farthest goal needs."""
+    """Returns the configuration with a working length for the farthest goal."""
     if len(anatomies) == 1 or config.working_length is not None:
         return config
     device = longest_tip(chosen_devices(config))
@@ -203,7 +203,7 @@ def _one_length(
 
 
 def task_options(name: str) -> tuple[str, ...]:
-    """Names of the options of a task beside `random` and `environment_kwargs`."""
+    """Returns the options of a task other than `random` and `environment_kwargs`."""
     definition = TASKS[name]
     of_objective = (o for o in definition.objective_options if o != "farthest_shift")
     return (*definition.own_options, *of_objective, *_CONFIG_FIELDS)
@@ -245,10 +245,10 @@ def load(
 
 
 def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environment:
-    """The composer environment of a task, with the settings that the suite uses.
+    """Returns the composer environment of a task, with the settings of the suite.
 
-    The MJCF model of the task is compiled once, here; later changes of it have no
-    effect.
+    The MJCF model of the task is compiled once, here; later changes of the model have
+    no effect.
 
     Args:
         task: Task that no other environment owns.
@@ -279,7 +279,7 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
     """Checks arguments of `composer.Environment`, which checks none of them."""
     endless = {"time_limit": math.inf, "n_sub_steps": None}
     for name, value in settings.items():
-        plain = isinstance(value, float | None)  # an array has no single truth
+        plain = isinstance(value, float | None)  # arrays have no truth value
         if plain and name in endless and value == endless[name]:
             continue
         if name == "time_limit":

@@ -17,7 +17,7 @@ if (
         "MUJOCO_GL=disable"
     )
 
-# With its collectors: after dm_control they would print deprecation warnings.
+# Imports the collectors too: after dm_control they print deprecation warnings.
 import torchrl.collectors  # noqa: F401
 
 # isort: on

@@ -1,4 +1,4 @@
-"""Checkpoints: weights and numbers only, complete or not there at all."""
+"""Checkpoints: weights and numbers only, written whole or not at all."""
 
 import hashlib
 import io
@@ -31,7 +31,7 @@ _POLICY = "policy.pt"
 _LEARNING = "learning.pt"
 _OTHER_NETWORK = "does not fit the network described beside it"
 _WRONG = ValueError, TypeError, AttributeError, RuntimeError, OSError
-# What a pickle of tensors, numbers and texts names.
+# Globals in a pickle of tensors, numbers and texts.
 _GLOBALS = {"torch._utils _rebuild_tensor_v2", "collections OrderedDict"}
 _STORAGE = re.compile(r"torch \w+Storage")
 
@@ -88,27 +88,27 @@ class Checkpoint:
             )
 
     def policy_state(self) -> dict[str, Any]:
-        """Weights and statistics on the CPU; CheckpointError if damaged or missing."""
+        """Return weights and statistics on the CPU; CheckpointError if damaged."""
         return self._load(_POLICY)
 
     def learning_state(self) -> dict[str, Any]:
-        """Everything else that continuing the run needs; raises as `policy_state`."""
+        """Return the rest of the state for resuming; raises as `policy_state`."""
         return self._load(_LEARNING)
 
     def policy(self) -> TensorDictSequential:
-        """The policy, raw observation in, action out; CheckpointError if damaged."""
+        """Return the policy, raw observation in, action out; or CheckpointError."""
         file = self.path / _POLICY
         return policy_of(file, self.policy_state(), self.shapes, self.config)
 
     def require_sizes(self) -> None:
-        """CheckpointError unless the files hold networks of the sizes in the config.
+        """Raise CheckpointError unless the networks have the sizes in the config.
 
-        Called before networks are made to continue from it.
+        Called before the networks of a resumed run are allocated.
         """
         file, state = self.path / _POLICY, self.policy_state()
         with files.refused(CheckpointError, f"{file} {_OTHER_NETWORK}", _WRONG):
             _require_sizes(state, self.shapes, self.config)
-            # Of images a critic alone has hidden layers, in the other file.
+            # For images only the critic has hidden layers, which are in the other file.
             widths = self.config.hidden
             least = 4 * sum(a * b for a, b in itertools.pairwise(widths))
             sizes = [(self.path / name).stat().st_size for name in self.sha256]
@@ -128,10 +128,10 @@ class Checkpoint:
 
 
 def _require_plain(data: bytes) -> None:
-    """Raises ValueError unless a file of `torch.save` holds tensors, uncompressed.
+    """Raise ValueError unless a file of `torch.save` holds uncompressed tensors only.
 
-    Torch's reader would inflate what is compressed, and make a buffer or a tensor of
-    any size that a file names.
+    Torch would decompress entries, and allocate a buffer or a tensor of any size that
+    the file names.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if sum(one.file_size for one in archive.infolist()) > len(data):
@@ -146,7 +146,7 @@ def _require_plain(data: bytes) -> None:
 
 
 def _require_stored(state: Any) -> None:
-    """Raises ValueError if a tensor is larger than the storage that it has."""
+    """Raise ValueError if a tensor is larger than its storage."""
     for one in tree_leaves(state):
         if isinstance(one, torch.Tensor):
             held = one.untyped_storage().nbytes()
@@ -157,7 +157,7 @@ def _require_stored(state: Any) -> None:
 
 
 def read_bytes(path: Path, sha256: str) -> bytes:
-    """Content of a file; CheckpointError if it is missing or its checksum differs."""
+    """Return a file's content; CheckpointError if missing or its checksum differs."""
     with files.refused(CheckpointError, f"{path} cannot be read", OSError):
         data = path.read_bytes()
     if hashlib.sha256(data).hexdigest() != sha256:
@@ -171,7 +171,7 @@ def read_bytes(path: Path, sha256: str) -> bytes:
 def policy_of(
     path: Path, state: Mapping[str, Any], shapes: NetworkShapes, config: TrainingConfig
 ) -> TensorDictSequential:
-    """A policy ready to act; CheckpointError if the weights are of another network."""
+    """Return a policy in evaluation mode; CheckpointError if the weights do not fit."""
     with files.refused(CheckpointError, f"{path} {_OTHER_NETWORK}", _WRONG):
         _require_sizes(state, shapes, config)
         policy = make_policy(shapes, config)
@@ -182,9 +182,9 @@ def policy_of(
 def _require_sizes(
     state: Mapping[str, Any], shapes: NetworkShapes, config: TrainingConfig
 ) -> None:
-    """Raises ValueError unless weights have the sizes of a network, which is not built.
+    """Raise ValueError unless weights have the shapes of the network described.
 
-    The description beside the weights may ask for a network of any size.
+    The network is not allocated: the description may ask for any size.
     """
     if len(config.hidden) + len(config.convolutions) > len(state):
         raise ValueError("it has fewer weights than the network has layers")
@@ -201,7 +201,7 @@ def _require_sizes(
 
 
 def checkpoints_in(run: Path) -> list[Path]:
-    """Complete checkpoints of a run, oldest first."""
+    """Return the complete checkpoints of a run, oldest first."""
     found = (Path(run) / _DIRECTORY).glob(f"*/{_DESCRIPTION}")
     complete = (file.parent for file in found if file.parent.name.isdecimal())
     return sorted(complete, key=lambda child: int(child.name))
@@ -210,12 +210,12 @@ def checkpoints_in(run: Path) -> list[Path]:
 def save_checkpoint(
     run: Path, learner: Learner, frames: int, seconds: float, learning: dict[str, Any]
 ) -> Path:
-    """Write a checkpoint into a run's directory and drop the oldest ones.
+    """Write a checkpoint into a run's directory and delete the oldest ones.
 
     A directory with a checkpoint's name is always complete.
 
     Returns:
-        Its directory.
+        Directory of the checkpoint.
     """
     directory = Path(run) / _DIRECTORY
     files.require_folder(directory, make=True)
@@ -236,7 +236,7 @@ def save_checkpoint(
     with files.atomic_directory(target) as temporary:
         states = {_POLICY: learner.policy_state(), _LEARNING: learning}
         for file, state in states.items():
-            # By way of memory: torch's own writer hides the cause on a full disk.
+            # Through memory: torch's file writer hides the cause on a full disk.
             stream = io.BytesIO()
             torch.save(dict(state), stream)
             data = stream.getvalue()

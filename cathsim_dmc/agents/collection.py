@@ -1,4 +1,4 @@
-"""Where the batches of a training come from: this process, or those of a cluster."""
+"""Sources of training batches: a collector in this process, or on a cluster."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -17,10 +17,10 @@ from cathsim_dmc.agents.learner import Learner
 
 
 class BatchSource(Protocol):
-    """Where batches (num_envs, steps) come from, with the learner's policy as it is."""
+    """Source of batches (num_envs, steps) of the learner's present policy."""
 
     def __iter__(self) -> Iterator[TensorDictBase]:
-        """The batches, without an end."""
+        """Yield batches without end."""
         ...
 
     def shutdown(self) -> Any:
@@ -28,10 +28,10 @@ class BatchSource(Protocol):
 
 
 def check_collector(config: TrainingConfig, learner: type[Learner]) -> None:
-    """Refuse collectors on a cluster that cannot do what the settings ask for.
+    """Check that collectors on a cluster can do what the settings ask for.
 
     Raises:
-        ConfigError: they cannot; the message says what can.
+        ConfigError: they cannot; the message says what to change.
     """
     if config.collector == "local":
         return
@@ -57,12 +57,12 @@ def make_collector(
     make_env: Callable[..., EnvBase],
     frames: int,
 ) -> BatchSource:
-    """A source of batches (num_envs, steps) with the learner's policy as it is.
+    """Return a source of batches (num_envs, steps) of the learner's present policy.
 
     Args:
         env: Environment, which the source closes.
-        make_env: What made it, for further ones on a cluster.
-        frames: Number of frames that earlier processes of the run have seen.
+        make_env: Function that made it, for further ones on a cluster.
+        frames: Number of frames that earlier processes of the run have collected.
     """
 
     def random_frames(frames: int) -> int:  # whole batches

@@ -14,15 +14,15 @@ from cathsim_dmc import bounds
 # Convolutions of the published agents: (filters, kernel size, stride) of each.
 PUBLISHED_CONVOLUTIONS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))
 
-# What the presets "tuned" learn from, found on type1_lcca (docs/training.md): the way
-# through the lumen as reward, episodes that are short and start anywhere along it.
+# Task options of the presets "tuned", found on type1_lcca (docs/training.md): reward by
+# the path through the lumen, short episodes that start anywhere along the route.
 TUNED_TRAINING: Mapping[str, Any] = {
     "training_reward": {"path": -1.0, "success": 10.0},
     "training_max_steps": 120,
     "training_start": (0.0, 0.9),
 }
-# What the presets "tuned_image" add: images without their background, whose first
-# convolution strides by its size (a fifth of the published cost), and a critic that
+# Additions of the presets "tuned_image": background subtraction, a first convolution
+# with a stride of its kernel size (a fifth of the published cost), and a critic that
 # reads the state.
 TUNED_IMAGES: Mapping[str, Any] = {
     "observation": "image",
@@ -32,7 +32,7 @@ TUNED_IMAGES: Mapping[str, Any] = {
     "cnn_features": 256,
 }
 _MOST = 2**62
-_MOST_WIDTH = 2**16  # of a layer, whose square is 17 GB
+_MOST_WIDTH = 2**16  # of a layer; a square weight matrix of this size takes 17 GB
 
 
 class ConfigError(ValueError):
@@ -46,12 +46,12 @@ def require(condition: bool, name: str, given: object, allowed: str) -> None:
 
 
 def positive(default: Any, **limits: Any) -> Any:
-    """A field of numbers greater than zero, with limits as for `within`."""
+    """Return a dataclass field of numbers above 0, with limits as for `within`."""
     return dataclasses.field(default=default, metadata={"positive": True, **limits})
 
 
 def within(default: Any, **limits: Any) -> Any:
-    """A field of numbers in a closed interval, from `low` to `high`."""
+    """Return a dataclass field of numbers from `low` to `high`, both included."""
     return dataclasses.field(default=default, metadata=limits)
 
 
@@ -75,13 +75,13 @@ def check_fields(config: Any) -> None:
 
 
 def checked(name: str, value: Any, kind: Any, **limits: Any) -> Any:
-    """A value of an annotated type, lists as tuples; or ValueError."""
+    """Return a value checked against an annotation, lists as tuples; or ValueError."""
     origin, kinds = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         if value is None and types.NoneType in kinds:
             return None
         kinds = [one for one in kinds if one is not types.NoneType]
-        # Of a name or names, the first is the name.
+        # In `str | tuple[str, ...]` the string comes first.
         return checked(name, value, kinds[-(not isinstance(value, str))], **limits)
     if origin is Literal:
         return bounds.choice(name, value, kinds)
@@ -178,10 +178,10 @@ class TrainingConfig:
     # Whether the deviation of the actions is an output of the network (SAC), or a
     # parameter of each action.
     state_dependent_std: ClassVar[bool] = False
-    # Settings by the name of a preset; what a preset leaves out has its default.
+    # Settings by the name of a preset; settings that it leaves out have their defaults.
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"published": {}}
-    # What may differ between a run and its continuation: nothing that learning
-    # depends on, apart from how long it lasts and where its dataset is.
+    # Settings that may change when a run is resumed: none that learning depends on,
+    # except for the number of frames and the path of the dataset.
     resumable: ClassVar[frozenset[str]] = frozenset(
         {"total_frames", "checkpoint_frames", "checkpoint_seconds", "keep_checkpoints"}
         | {"metrics_frames", "logger", "num_threads", "torch_threads", "torch_device"}
@@ -245,7 +245,7 @@ class TrainingConfig:
 
     @property
     def training_kwargs(self) -> dict[str, Any]:
-        """Options of the task while it is learnt."""
+        """Options of the task during training."""
         own = {
             "reward": self.training_reward,
             "max_steps": self.training_max_steps,
@@ -275,7 +275,7 @@ class TrainingConfig:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "TrainingConfig":
-        """A config from its fields by name; ConfigError if one is not allowed."""
+        """Make a config from its fields by name; ConfigError if one is not allowed."""
         valid = [item.name for item in dataclasses.fields(cls)]
         if unknown := sorted(set(values) - set(valid)):
             raise ConfigError(
@@ -284,7 +284,7 @@ class TrainingConfig:
         return cls(**values)
 
     def changed_for_resume(self, other: "TrainingConfig") -> dict[str, tuple]:
-        """Fields (name: (here, other)) that differ and may not on resuming."""
+        """Return fields (name: (own, other)) that differ but must not on resuming."""
         here, there = self.to_dict(), other.to_dict()
         names = sorted((here.keys() | there.keys()) - self.resumable)
         pairs = {name: (here.get(name), there.get(name)) for name in names}
@@ -311,7 +311,7 @@ class ActorCriticConfig(TrainingConfig):
 
     @property
     def collected_observation(self) -> str | tuple[str, ...]:
-        """Those of the policy and those of the critic."""
+        """Names of the observations of policy and critic."""
         if self.critic_observation is None:
             return self.observation
         both = self.observation, self.critic_observation

@@ -1,4 +1,4 @@
-"""Contacts with the wall of an evaluation, for its heatmap."""
+"""Wall contacts of an evaluation, for its heatmap."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ def _joined(steps: Sequence[_Step]) -> _Step:
 
 
 class ContactLog:
-    """An observer that keeps the contacts with the wall."""
+    """An observer that collects the contacts with the wall."""
 
     def __init__(self):
         self._steps: list[_Step] = [(np.zeros((0, 3)), np.zeros(0))]
@@ -33,7 +33,7 @@ class ContactLog:
         self._steps.append((found.position[present], found.magnitude[present]))
 
     def join(self, logs: Sequence["ContactLog"]) -> None:
-        """Adds contacts of episodes that were played apart, as if side by side."""
+        """Adds contacts of episodes that were played separately, step by step."""
         for number in range(max((len(log._steps) for log in logs), default=0)):
             found = [log._steps[number] for log in logs if number < len(log._steps)]
             self._steps.append(_joined(found))
@@ -43,9 +43,9 @@ class ContactLog:
         return _joined(self._steps)
 
     def draw(self, result: Any, path: Path) -> None:
-        """Writes the heatmap of an `EvaluationResult` in one anatomy as PNG."""
+        """Writes the heatmap of an `EvaluationResult` as PNG, if of one anatomy."""
         task = suite.make_task(result.task, **result.settings["task_kwargs"])
-        if task.num_anatomies > 1:  # whose contacts lie in different places
+        if task.num_anatomies > 1:
             return
         title = f"{result.task}, {result.policy}: {len(result.episodes)} episodes"
         anatomy = task.scene.anatomy

@@ -50,7 +50,7 @@ class DAggerConfig(CloningConfig):
     algorithm: ClassVar[str] = "dagger"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
-        # What learns in a minute: points along the device, few and short episodes.
+        # Learns in a minute: points along the device, few and short episodes.
         "demo": {"observation": "tracking", "training_max_steps": 250},
     }
 
@@ -121,7 +121,7 @@ class DAgger(CloningLearner):
 
     @override
     def _weights(self, target: torch.Tensor) -> torch.Tensor:
-        """Withdrawals weigh more: they are rare, and nothing else helps then."""
+        """Weights (n, 1): withdrawals weigh more, since they are rare but necessary."""
         withdrawn = (target[:, self._translations] < 0.0).any(1, keepdim=True)
         share = withdrawn.float().mean().clamp(1e-6, 1.0)
         weight = ((1.0 - share) / share).clamp(1.0, self.config.withdrawal_weight)
@@ -129,7 +129,7 @@ class DAgger(CloningLearner):
 
     @property
     def share(self) -> float:
-        """Share of the control steps of the present round that the expert acts in."""
+        """Fraction of the control steps of this round in which the expert acts."""
         rounds = self.gradient_steps // self.config.gradient_steps
         return self.config.expert_share**rounds
 

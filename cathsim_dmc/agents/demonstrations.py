@@ -31,24 +31,24 @@ from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.observation_kind import Sizes
 
 DEMONSTRATION_SEED = 2_000_000  # apart from the seeds of evaluation
-# Among the infos: what the expert would do, where noise was added to what it did.
+# Key of the infos with the expert's action before noise is added.
 EXPERT_ACTION = "expert_action"
-# Options that demonstrations share with what learns from them.
+# Options that must agree between demonstrations and training.
 _ALIKE = ("device", "devices", "goal", "access", "goal_radius")
 _SIMULATIONS = 16
 
 
 @dataclasses.dataclass(frozen=True)
 class Demonstrations:
-    """What was recorded.
+    """Summary of recorded demonstrations.
 
     Attributes:
         path: Directory of the dataset.
         episodes: Number of episodes.
-        successes: Number of those that reached the goal.
+        successes: Number of episodes that reached the goal.
         steps: Number of control steps in all.
-        mean_force: Mean over the episodes, N, see `EpisodeForces.mean_force`.
-        max_force: Largest one of all episodes, N, see `EpisodeForces.max_force`.
+        mean_force: Mean over the episodes of `EpisodeForces.mean_force`, N.
+        max_force: Maximum over the episodes of `EpisodeForces.max_force`, N.
     """
 
     path: Path
@@ -130,7 +130,7 @@ def record_demonstrations(
 
 
 def _summary(path: Path, buffers: Sequence[Any]) -> Demonstrations:
-    """Figures of a dataset of Minari's buffers."""
+    """Return the summary of a dataset from Minari's buffers."""
     means = [np.mean(buffer.infos["wall_force_mean_sum"][1:]) for buffer in buffers]
     largest = [np.max(buffer.infos["wall_force_mean_max"][1:]) for buffer in buffers]
     return Demonstrations(
@@ -144,7 +144,7 @@ def _summary(path: Path, buffers: Sequence[Any]) -> Demonstrations:
 
 
 def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
-    """An episode of the expert for each seed, side by side, as Minari's buffers."""
+    """Play an episode of the expert for each seed, in one batch; return the buffers."""
     simulation.seed(seeds.tolist())
     generators = [np.random.default_rng(int(seed)) for seed in seeds]
     expert, view = ExpertPolicy(), View(simulation)
@@ -177,7 +177,10 @@ def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
 
 
 def _buffer(seed: int, row: int, columns: Mapping[str, Any]) -> Any:
-    """The first episode of a simulation; its expert's last action is repeated."""
+    """Return the first episode of simulation `row` as Minari's buffer.
+
+    The expert's last action is repeated, since infos have a row more than actions.
+    """
     from minari.data_collector import EpisodeBuffer
 
     steps = sum(running[row] for running in columns["running"])
@@ -200,13 +203,13 @@ def _buffer(seed: int, row: int, columns: Mapping[str, Any]) -> Any:
 
 
 def alike(task_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Options that demonstrations must have been recorded with, None for a default."""
+    """Return the options that demonstrations must share, None for a default."""
     given = {name: dataset.chosen(task_kwargs, name) for name in _ALIKE}
     return {k: list(v) if isinstance(v, tuple) else v for k, v in given.items()}
 
 
 def require_dataset(path: str | Path | None) -> str | Path:
-    """The path; DatasetError if no dataset is there. It is not read."""
+    """Return the path without reading it; DatasetError if there is no dataset."""
     if not path:
         raise DatasetError(
             "demonstrations is not given: bc needs the directory of a dataset; "
@@ -223,11 +226,11 @@ def load_transitions(
     shapes: NetworkShapes,
     **options: Any,
 ) -> TensorDictBase:
-    """Transitions of a dataset's successful episodes, as a collector gives them.
+    """Return the transitions of a dataset's successful episodes, as a collector does.
 
     Args:
         path: Directory of a dataset, or of episodes as `cathsim play --out` writes
-            them, which are repeated; or "hf:OWNER/NAME@COMMIT".
+            them, which are simulated again; or "hf:OWNER/NAME@COMMIT".
         observation: Name or names of the observations that the networks read; the
             dataset may hold others beside them.
         **options: As for `read_episodes`.
@@ -264,13 +267,13 @@ def load_transitions(
 
 
 def _tensors(path: str | Path, episode: Any, names: Sequence[str]) -> TensorDict | None:
-    """Transitions of an episode; None if it did not succeed."""
+    """Return the transitions of an episode; None if it did not succeed."""
     given = set(episode.observations)
     single, coaxial = (
         set(observations.entry_specs(observations.resolve(names, kind), Sizes()))
         for kind in (None, True)
     )
-    # What only coaxial devices show tells their episodes.
+    # Entries that only coaxial devices have identify their episodes.
     keys = coaxial if (coaxial - single) & given else single
     missing = sorted(keys - given)
     if missing:

@@ -20,7 +20,7 @@ from cathsim_dmc.analysis.force_statistics import (
 )
 from cathsim_dmc.tasks.config import MAX_STEPS
 
-MOST_BYTES = 2**22  # of a submission; those of 100 episodes have 110 kB
+MOST_BYTES = 2**22  # of a submission; one of 100 episodes has 110 kB
 _WRONG = (
     OSError, LookupError, TypeError, ValueError, AttributeError, RecursionError,
     CheckpointError,
@@ -28,11 +28,11 @@ _WRONG = (
 
 
 class Entry(NamedTuple):
-    """A submission that keeps the rules.
+    """A submission that passed the checks of `read`.
 
     Attributes:
-        path: Its file.
-        values: What is in it.
+        path: Path of its file.
+        values: Content of the file.
         result: Its episodes, from which all figures are computed.
     """
 
@@ -45,8 +45,8 @@ class Replay(NamedTuple):
     """Episodes of an entry that were played again.
 
     Attributes:
-        result: The episodes as they are here.
-        equal: Number of them that are those of the entry, bit for bit.
+        result: The episodes played here.
+        equal: Number of episodes that equal those of the entry, bit for bit.
         source: What was played, "policy" or "actions".
     """
 
@@ -56,12 +56,12 @@ class Replay(NamedTuple):
 
 
 def read(path: str | Path) -> Entry:
-    """Reads a submission; nothing that it says of itself is taken for granted.
+    """Reads and checks a submission.
 
-    The digest must fit, the protocol, its seeds and the options of the task must be
-    those of the leaderboard, no two episodes may be equal, and the summary must be that
-    of the episodes. This finds errors and careless changes; that the episodes took
-    place is shown by `replay` alone.
+    The digest must match. Protocol, seeds and task options must be those of the
+    leaderboard, no two episodes may be equal, and the summary must follow from the
+    episodes. This finds errors and careless changes; only `replay` shows that the
+    episodes took place.
 
     Raises:
         ValueError: the file cannot be listed; says why.
@@ -79,8 +79,8 @@ def read(path: str | Path) -> Entry:
 def replay(entry: Entry, num_threads: int | None = None) -> Replay | None:
     """Plays the episodes of an entry again.
 
-    A policy that ships with the package is played itself, another one by the actions
-    in the `.npz` file beside the submission.
+    A policy that ships with the package acts itself; for another policy, the actions in
+    the `.npz` file beside the submission are played.
 
     Args:
         entry: What `read` returned.
@@ -90,8 +90,8 @@ def replay(entry: Entry, num_threads: int | None = None) -> Replay | None:
         The episodes, or None if neither policy nor actions are there.
 
     Raises:
-        ValueError: the actions are not those that were submitted, or an episode is
-            another one though the versions are the same.
+        ValueError: the actions are not those submitted, or an episode differs although
+            the versions are the same.
     """
     with files.refused(ValueError, f"{entry.path.name} is not listed", _WRONG):
         player = _player(entry)
@@ -172,7 +172,7 @@ def _result(values: Mapping[str, Any]) -> EvaluationResult:
 
 
 def _episode(index: int, row: Mapping[str, Any]) -> EpisodeOutcome:
-    """An episode of a submission; ValueError names what cannot be."""
+    """Returns an episode of a submission; ValueError for an impossible value."""
 
     def force(quantity: str, statistic: str) -> float | None:
         value = row["forces"][quantity][statistic]
@@ -183,7 +183,7 @@ def _episode(index: int, row: Mapping[str, Any]) -> EpisodeOutcome:
     forces = {
         quantity: Statistics(**{name: force(quantity, name) for name in STATISTICS})  # type: ignore[arg-type]
         for quantity in QUANTITIES
-        # Files of before 0.3 do not tell the means.
+        # Files from before 0.3 lack the means.
         if row["forces"].get(quantity) or not quantity.startswith("mean")
     }
     switches = "terminated", "success", "physics_error"

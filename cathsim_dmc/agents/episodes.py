@@ -1,4 +1,4 @@
-"""Episodes counted from batches of steps: what training logs and evaluation reports."""
+"""Outcomes of episodes from batches of steps, for training logs and evaluation."""
 
 from dataclasses import dataclass
 
@@ -18,12 +18,12 @@ class EpisodeOutcome:
         env: Index of the environment it ran in.
         reward: Sum of the rewards over the episode.
         length: Number of control steps.
-        terminated: Whether it was ended by the task, not by the clock.
+        terminated: Whether the task ended it, not the limit of steps.
         success: Whether the goal was reached.
         forces: Forces on the wall, N, such as `forces.mean_force`.
         physics_error: Whether the simulation diverged, which ended it.
-        path_ratio: Length of the head's path over the route that was left; below 1
-            where the head cuts the corner of the route at an ostium.
+        path_ratio: Length of the head's path divided by the shortest way to the goal;
+            below 1 where the head cuts the corner of the route at an ostium.
     """
 
     env: int

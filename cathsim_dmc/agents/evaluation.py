@@ -1,4 +1,4 @@
-"""Evaluation: fixed seeds, each episode counted once, intervals beside every mean."""
+"""Evaluation: fixed seeds, each episode counted once, success with its interval."""
 
 import contextlib
 import functools
@@ -59,20 +59,20 @@ def evaluate(
     """Play episodes with a policy, each with a seed of its own, all side by side.
 
     A trained policy acts deterministically (the middle of its distribution) with
-    frozen observation statistics. What an environment does after its episode, while
-    others finish, is not counted.
+    frozen observation statistics. Only the first episode of each environment counts,
+    not what follows while others finish.
 
     Args:
-        policy: Policy, or what names one, see `policies.load_policy`.
+        policy: Policy, or its name, path or function, see `policies.load_policy`.
         task: Name of the task; None takes the one that the policy was trained on.
         episodes: Number of episodes; None for that of the protocol.
         seed: Seed of the first episode; the others lie above it.
         protocol: Name of the conditions in `protocols.PROTOCOLS`.
         name: Name of the policy for the reports.
         observation: Name or names of observations; None takes the policy's own.
-        task_kwargs: Options of the task, in place of those that the policy was trained
-            with, which None takes; `policies.task_and_options` has both together, as
-            the command line does. A device among them is played in all episodes.
+        task_kwargs: Options of the task, which replace those of the policy's training;
+            None takes those. `policies.task_and_options` merges both, as the command
+            line does. A device among them is used in all episodes.
         num_threads: Number of threads of the simulation; None takes one per core.
         simulation_device: Where the simulations run: "cpu", or "cuda" for MuJoCo Warp
             on a GPU, "cuda:1" on the second one (docs/gpu.md); the policy acts on the
@@ -80,8 +80,8 @@ def evaluate(
         out_dir: Directory for evaluation.json and, in errors/, the last physics errors;
             None writes none.
         observer: Function that is called after every step, before any reset.
-        start: State in the middle of as many episodes, which are played on and counted
-            from there; None for the starts of the task.
+        start: Snapshot of running episodes, as many as are played, which continue and
+            are counted from there; None for the starts of the task.
         make_env: Function with the arguments of `environments.make_env`; "info" of its
             environment has "success", "physics_error", "path_ratio" and the forces
             `physics.forces.NAMES`.
@@ -95,7 +95,7 @@ def evaluate(
             `start` does not fit, or the cluster has too few processors, or there is no
             such device.
         ImportError: the device needs an extra that is not installed.
-        NotImplementedError: the task has what is not simulated on the device.
+        NotImplementedError: the device does not simulate a feature of the task.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     bounds.options("task_kwargs", task_kwargs)
@@ -125,7 +125,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _Plan:
-    """What an evaluation plays.
+    """Arguments of an evaluation, checked and complete.
 
     Attributes:
         player: The policy.
@@ -155,7 +155,7 @@ class _Plan:
         task_kwargs: Mapping[str, Any] | None,
         start: Snapshot | None,
     ) -> "_Plan":
-        """Checks the arguments of `evaluate`, and fills in what they leave open."""
+        """Checks the arguments of `evaluate` and fills in the defaults."""
         conditions = protocols.get(protocol)
         if start is not None:
             episodes = _started(start, episodes, protocol)
@@ -178,11 +178,11 @@ class _Plan:
         make_env: EnvFactory,
         start: Snapshot | None,
     ) -> list["_Group"]:
-        """The episodes of each part, side by side."""
+        """Returns a group for the episodes of each part."""
         bounds.option_threads(num_threads)
         errors = None
         if out_dir is not None:
-            # Now: an evaluation that cannot be written would be lost.
+            # Checked first: an evaluation that cannot be written would be lost.
             files.require_place(out_dir)
             errors = Path(out_dir).absolute() / "errors"
         make = functools.partial(
@@ -200,7 +200,7 @@ class _Plan:
     def result(
         self, name: str | None, outcomes: Sequence[EpisodeOutcome], started: bool
     ) -> EvaluationResult:
-        """What was played; `started` from a snapshot, or at starts of the task."""
+        """Returns the result; `started` means that episodes began at a snapshot."""
         trained = getattr(self.player, "checkpoint", None)
         first, count = self.parts[0].task_kwargs, sum(len(p.seeds) for p in self.parts)
         drawn = () if started else [one for p in self.parts for one in p.conditions]
@@ -222,16 +222,16 @@ class _Plan:
 
 @dataclass(frozen=True)
 class _Group:
-    """Episodes that are played side by side, some of those of a part or all.
+    """Episodes that are played in one batch, some or all of a part.
 
     Attributes:
-        part: Where they are from.
-        rows: Their numbers in it.
-        player: The policy of all its episodes.
-        varied: Whether each has a seed of its own, in place of those that count up.
+        part: Part that the episodes belong to.
+        rows: Indices of the episodes in the part.
+        player: Policy for all episodes of the part.
+        varied: Whether each episode has a seed of its own; otherwise seeds count up.
         make_env: Function of num_envs, num_threads, seed and task_kwargs.
         num_threads: Number of threads of the simulation; None for one per core.
-        torch_threads: Number of threads of torch, which rounding depends on.
+        torch_threads: Number of threads of torch; rounding depends on it.
         start: State at which the episodes of the part begin; None for their starts.
     """
 
@@ -245,7 +245,7 @@ class _Group:
     start: Snapshot | None
 
     def pieces(self, size: int) -> list["_Group"]:
-        """Groups of so many of its episodes each, or of fewer."""
+        """Splits the group into groups of at most `size` episodes."""
         starts = self.rows[::size]
         cut = (range(n, min(n + size, self.rows.stop)) for n in starts)
         threads = self.num_threads or 1
@@ -253,7 +253,7 @@ class _Group:
 
 
 def _recorded(make_env: EnvFactory, folder: Path | None, *args, **kwargs) -> EnvBase:
-    """An environment that writes physics errors to a folder, None for none."""
+    """Makes an environment that writes physics errors to a folder, None for none."""
     env = make_env(*args, **kwargs)
     if folder is not None:
         environments.record_errors(env, folder)
@@ -277,7 +277,7 @@ def _play(group: _Group, observer: Observer | None) -> list[EpisodeOutcome]:
 def _play_on_cluster(
     wholes: Sequence[_Group], observer: Observer | None
 ) -> list[EpisodeOutcome]:
-    """Plays groups in pieces, one for each place of the cluster."""
+    """Plays groups in pieces, as many as the cluster can run at the same time."""
     if not isinstance(observer, ContactLog | None):
         raise ValueError("on a cluster the observer must be a ContactLog or None")
     each = wholes[0].num_threads or 1
@@ -300,14 +300,14 @@ def _play_on_cluster(
 
 
 def _play_apart(job: tuple[_Group, bool]) -> tuple[list[EpisodeOutcome], "ContactLog"]:
-    """The episodes of a group, and their contacts if these are wanted."""
+    """Plays a group; returns its episodes, and their contacts if these are wanted."""
     (group, wanted), contacts = job, ContactLog()
     torch.set_num_threads(group.torch_threads)
     return _play(group, contacts if wanted else None), contacts
 
 
 def _started(start: Snapshot, episodes: int | None, protocol: str) -> int:
-    """Number of episodes that begin at a snapshot; ValueError for other settings."""
+    """Returns the number of episodes of a snapshot; ValueError for other settings."""
     if protocol != "published":
         raise ValueError(
             f"start has the conditions of its episodes, so the protocol {protocol!r} "
@@ -348,7 +348,7 @@ def _first_episodes(
 
 
 def _checked(policy: Policy, given: Any, env: EnvBase) -> torch.Tensor:
-    """Actions (N, A) float32 of a policy; ValueError for those of another shape."""
+    """Returns actions of a policy as (N, A) float32; ValueError for another shape."""
     actions = torch.as_tensor(given).to(torch.float32)
     if actions.shape != env.action_spec.shape:
         count, entries = env.action_spec.shape

@@ -1,10 +1,10 @@
 """Exploration noise that is correlated in time and between motors.
 
-White noise at 25 Hz on twenty motors averages out along the tip and over time: the head
-hardly leaves its way. Noise that keeps its direction for a while, and that motors which
-bend about the same axis share, carries it into other branches. Each action stays
-normally distributed about the policy's mean, and the learner takes its log-probability
-as if the noise were white (Hollenstein et al., Colored Noise in PPO, AAAI 2024).
+White noise at 25 Hz on twenty motors averages out along the tip and over time, so the
+head hardly leaves its path. Noise that is correlated in time, and shared by the motors
+that bend about one axis, moves the head into other branches. Each action stays normally
+distributed about the policy's mean, and the learner computes its log-probability as if
+the noise were white (Hollenstein et al., Colored Noise in PPO, AAAI 2024).
 """
 
 import math
@@ -29,6 +29,7 @@ class CorrelatedNoise:
         Args:
             correlation: Correlation between two consecutive steps, in [0, 1).
             shared: Share of the variance that actions of one group have in common.
+            groups: (actions,), group of each action, counted from 0.
         """
         self._correlation, self._shared = correlation, shared
         self._groups = torch.as_tensor(groups)
@@ -36,7 +37,7 @@ class CorrelatedNoise:
         self._noise: torch.Tensor | None = None
 
     def draw(self, like: torch.Tensor) -> torch.Tensor:
-        """The noise of the next step, of the shape and dtype of a tensor."""
+        """Return the noise of the next step, with the shape and dtype of a tensor."""
         fresh = torch.randn_like(like)
         if self._shared:
             common = torch.randn((*like.shape[:-1], self._count), dtype=like.dtype)
@@ -56,7 +57,7 @@ class CorrelatedExploration(TensorDictModuleBase):
     """A Gaussian policy that draws its actions with correlated noise."""
 
     def __init__(self, policy: TensorDictSequential, noise: CorrelatedNoise):
-        """Takes a policy whose last module gives "loc" and "scale" before the tanh."""
+        """Takes a policy whose actor writes "loc" and "scale" before the tanh."""
         super().__init__()
         self.policy = policy
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys

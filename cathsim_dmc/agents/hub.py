@@ -1,8 +1,8 @@
 """Policies and data sets on the Hugging Face Hub: `hf:OWNER/NAME@COMMIT`.
 
 Policies are safetensors with a card in JSON, data sets HDF5 or .npz: no file that can
-run code is fetched. What is fetched is pinned to a commit, kept in the hub's cache, and
-found there without a network.
+run code is downloaded. Downloads are pinned to a commit and kept in the hub's cache,
+which is also read without a network.
 """
 
 import contextlib
@@ -16,17 +16,17 @@ PREFIX = "hf:"
 _FORM = re.compile(
     r"hf:(?P<repository>[\w.-]+/[\w.-]+)(@(?P<commit>[0-9a-f]{40}))?(#(?P<name>[\w-]+))?"
 )
-# What of a data set is fetched, by its place in the repository.
+# Files of a data set that are downloaded, by their paths in the repository.
 _DATASET = ("data/*.hdf5", "data/metadata.json", "*.npz")
 
 
 class Reference(NamedTuple):
-    """What a text such as hf:OWNER/NAME@COMMIT#POLICY names.
+    """Parts of a text such as hf:OWNER/NAME@COMMIT#POLICY.
 
     Attributes:
         repository: "OWNER/NAME".
-        commit: 40 hexadecimal digits; None where none is given.
-        name: Name of the policy in it; that of the repository by default.
+        commit: 40 hexadecimal digits; None if none is given.
+        name: Name of the policy in the repository; by default that of the repository.
     """
 
     repository: str
@@ -40,7 +40,7 @@ def is_reference(text: str | Path) -> bool:
 
 
 def parse(text: str, pinned: bool = True) -> Reference:
-    """A reference; ValueError for another form, or where no commit is pinned."""
+    """Parse a reference; ValueError for another form, or without a commit if pinned."""
     found = _FORM.fullmatch(text)
     if found is None:
         form = "hf:OWNER/NAME, without a commit, which the upload makes,"
@@ -62,7 +62,7 @@ def parse(text: str, pinned: bool = True) -> Reference:
 
 
 def policy(text: str) -> Path:
-    """Weights of a policy on the hub, with its card beside them.
+    """Download a policy; return the path of its weights, with its card beside them.
 
     Raises:
         ValueError: the text is no reference, or the hub has no such policy.
@@ -85,7 +85,7 @@ def policy(text: str) -> Path:
 
 
 def dataset(text: str) -> Path:
-    """Directory of a data set on the hub; raises as `policy`."""
+    """Download a data set; return its directory; raises as `policy`."""
     place = parse(text)
     extras.require("hub", "huggingface_hub")
     from huggingface_hub import snapshot_download
@@ -110,7 +110,7 @@ def upload(folder: Path, text: str, kind: str, private: bool = True) -> str:
         private: Whether a repository that is made is private.
 
     Returns:
-        The reference of what was uploaded, with its commit.
+        The reference of the upload, with its commit.
 
     Raises:
         ValueError: the text is no reference, or the hub refuses.
@@ -133,5 +133,5 @@ def upload(folder: Path, text: str, kind: str, private: bool = True) -> str:
 
 
 def _named(text: str, what: str) -> contextlib.AbstractContextManager[None]:
-    """Errors of the hub's client, which are of many kinds, as one line."""
+    """Raise errors of the hub's client, which are of many kinds, as ValueError."""
     return files.refused(ValueError, f"{text}, {what}", Exception)

@@ -1,4 +1,4 @@
-"""Regression of a policy on actions that are known to be good."""
+"""Imitation learning: regression of a policy on an expert's actions."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from cathsim_dmc.agents.demonstrations import (
 from cathsim_dmc.agents.learner import Learner, means
 from cathsim_dmc.agents.networks import NetworkShapes, bounded, network_of
 
-# Beyond it an action counts as saturated: its deviation before the tanh says nothing.
+# Magnitude beyond which an action is saturated: its value before the tanh is unknown.
 _SATURATED = 0.99
 # Number of states from which the deviation of the policy is estimated.
 _SAMPLE = 4_096
@@ -49,8 +49,8 @@ class CloningConfig(TrainingConfig):
 class CloningLearner(Learner):
     """Fits PPO's policy to the expert's actions by least squares.
 
-    Its deviation, with which it explores while it collects, and from which PPO may
-    start, is that of the expert's actions around its own.
+    The standard deviation of the policy, with which it explores and from which PPO may
+    start, is that of the expert's actions around the policy's.
     """
 
     imitates: ClassVar[bool] = True
@@ -73,12 +73,12 @@ class CloningLearner(Learner):
         """Take gradient steps on the squared error of the action.
 
         Args:
-            sample: Function that draws so many states with "expert_action".
+            sample: Function that draws a number of states with "expert_action".
             rates: (steps,), learning rate of each step.
 
         Returns:
-            "loss", the mean, if there are steps, and "deviation", root mean square
-            error at the end.
+            "loss", mean over the steps, if there are any, and "deviation", root mean
+            square error of the action at the end.
         """
         losses = []
         for rate in rates.tolist():
@@ -95,7 +95,7 @@ class CloningLearner(Learner):
         return torch.ones_like(target[:, :1])
 
     def _means(self, states: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
-        """Means before the tanh and the actions that are wanted."""
+        """Return the means before the tanh and the target actions, each (n, A)."""
         states = states.select(*self.shapes.raw_keys, EXPERT_ACTION).to(self.device)
         self.normalise(states)
         mean, _ = self._actor(*(states[key] for key in self.shapes.keys))
@@ -113,7 +113,7 @@ class CloningLearner(Learner):
 
 
 def decaying(start: float, stop: float, steps: int) -> torch.Tensor:
-    """Learning rates (steps,) that fall linearly, without the last value."""
+    """Return learning rates (steps,), linear from `start` to `stop`, without `stop`."""
     return torch.linspace(start, stop, steps + 1)[:-1]
 
 
@@ -121,8 +121,8 @@ def decaying(start: float, stop: float, steps: int) -> torch.Tensor:
 class BCConfig(CloningConfig):
     """Behaviour cloning.
 
-    Nothing is learnt from the frames of the run: the clone plays between the stretches
-    of learning, so that metrics.csv shows what it reaches.
+    The frames of the run are not learnt from: the policy plays between blocks of
+    gradient steps so that metrics.csv shows its performance.
 
     Attributes:
         demonstrations: Directory of the dataset, as `cathsim demos` writes it, with
@@ -162,7 +162,7 @@ class BC(CloningLearner):
 
     @override
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        # The next part of all gradient steps; the batch is only looked at.
+        # The next part of all gradient steps; the batch only counts frames.
         config = self.config
         after = min(progress + batch.numel() / config.total_frames, 1.0)
         steps = math.ceil(config.gradient_steps * after) - self.gradient_steps

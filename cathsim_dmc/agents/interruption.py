@@ -1,4 +1,4 @@
-"""Interrupts of a training, which ends after the batch that it has begun."""
+"""Interrupts of a training, which ends after the current batch."""
 
 import contextlib
 import signal
@@ -16,7 +16,7 @@ def noted_interruption(say: bool) -> Iterator[threading.Event]:
     """Yield an event that the first SIGINT or SIGTERM of the main thread sets.
 
     Args:
-        say: Whether standard error then tells what happens next.
+        say: Whether to announce the end of the training on standard error.
     """
     requested = threading.Event()
     with contextlib.ExitStack() as handlers:

@@ -21,17 +21,17 @@ class Learner(abc.ABC):
     metrics: Names of the figures that `update` returns, columns of metrics.csv.
     remote: Whether the policy needs nothing but observations, so that it can act in
         another process.
-    imitates: Whether it learns all of the policy anew in every update. Otherwise a
-        policy that starts from another keeps its observation statistics: weights fit
-        these alone.
+    imitates: Whether an update fits the whole policy to its targets. Otherwise a policy
+        that starts from another one keeps that one's observation statistics, the only
+        ones that fit its weights.
     random_frames: Number of frames to collect with uniformly random actions first.
     device: Torch device of the networks.
-    shapes: Sizes of what the policy reads, and of the action.
+    shapes: Sizes of the policy's observation and of the action.
     network: The policy that is learnt: raw observation in, sampled action out.
     policy: The policy to collect with; `network`, or one around it.
-    critic_normalisers: Normalisers of what the critic alone reads.
+    critic_normalisers: Normalisers of the observations that only the critic reads.
     optimiser: Adam with the parameters of all networks, made by the subclass.
-    replay: `ReplayMemory` that is learnt from, if any; made by the subclass.
+    replay: `ReplayMemory` of the algorithm, if any; made by the subclass.
     gradient_steps: Number of gradient steps so far.
     """
 
@@ -52,9 +52,9 @@ class Learner(abc.ABC):
         """Makes the policy with fresh weights, drawn from torch's generator.
 
         Args:
-            shapes: Sizes of what the policy reads, and of the action.
-            directory: Directory of the run, for what the algorithm keeps on disk.
-            critic_shapes: Sizes of what the critic reads; None for the policy's.
+            shapes: Sizes of the policy's observation and of the action.
+            directory: Directory of the run, for files of the algorithm.
+            critic_shapes: Sizes of the critic's observation; None for the policy's.
         """
         self.config, self.shapes = config, shapes
         self.device = torch.device(config.torch_device)
@@ -69,7 +69,7 @@ class Learner(abc.ABC):
         """Adapt `policy` to the environment; called once, before the first batch."""
 
     def observe(self, batch: TensorDictBase) -> None:
-        """Take observation statistics from a batch without learning from it."""
+        """Update the observation statistics with a batch, without learning from it."""
         chosen: list[Any] = list(self.critic_normalisers)
         if self.imitates or self.config.initial_policy is None:
             chosen += self._policy_normalisers
@@ -77,7 +77,7 @@ class Learner(abc.ABC):
             module.module.update(batch[module.in_keys[0]].to(self.device))
 
     def normalise(self, batch: TensorDictBase, critic_only: bool = False) -> None:
-        """Add what policy and critic read to raw observations, or the critic alone."""
+        """Add the normalised observations of policy and critic, or of the critic."""
         chosen: list[Any] = list(self.critic_normalisers)
         if not critic_only or not chosen:
             chosen = [*self._policy_normalisers, *chosen]
@@ -85,11 +85,11 @@ class Learner(abc.ABC):
             module(batch)
 
     def compiled(self, loss: nn.Module) -> Callable[[TensorDictBase], TensorDictBase]:
-        """A loss, compiled by torch where the settings say so."""
+        """Return a loss, compiled by torch if the settings say so."""
         return torch.compile(loss) if self.config.torch_compile else loss
 
     def descend(self, loss: torch.Tensor, max_norm: float = math.inf) -> torch.Tensor:
-        """Take a gradient step, with a gradient of `max_norm` at most; its norm."""
+        """Take a gradient step; return the norm before clipping, 0 without a limit."""
         self.optimiser.zero_grad()
         loss.backward()
         norm = torch.zeros(())
@@ -109,16 +109,16 @@ class Learner(abc.ABC):
             progress: Share of the run that is done, in [0, 1].
 
         Returns:
-            Figures by the names in `metrics`, means over the gradient steps; what is
-            not known yet is left out.
+            Figures by the names in `metrics`, means over the gradient steps; figures
+            that are not known yet are left out.
         """
 
     def policy_state(self) -> dict[str, Any]:
-        """Weights and statistics that acting needs."""
+        """Return the weights and observation statistics of the policy."""
         return self.network.state_dict()
 
     def learning_state(self) -> dict[str, Any]:
-        """State of learning beside the policy: tensors, numbers, strings."""
+        """Return the state of learning beside the policy: tensors, numbers, strings."""
         return {
             "optimiser": self.optimiser.state_dict(),
             "gradient_steps": self.gradient_steps,
@@ -127,7 +127,7 @@ class Learner(abc.ABC):
         }
 
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
-        """Restore what policy_state and learning_state gave."""
+        """Restore the results of `policy_state` and `learning_state`."""
         self.network.load_state_dict(policy)
         self.optimiser.load_state_dict(learning["optimiser"])
         self.gradient_steps = learning["gradient_steps"]
@@ -137,6 +137,6 @@ class Learner(abc.ABC):
 
 
 def means(steps: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, float]:
-    """Means of the figures of gradient steps by name; empty without a step."""
+    """Return the means of the figures of gradient steps; empty without a step."""
     names = steps[0] if steps else ()
     return {n: float(torch.stack([one[n] for one in steps]).mean()) for n in names}

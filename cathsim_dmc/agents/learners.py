@@ -1,4 +1,4 @@
-"""The algorithms by name: a new one is two classes and a line here."""
+"""Algorithms by name; to add one, write two classes and add a line here."""
 
 import warnings
 from collections.abc import Mapping
@@ -36,15 +36,15 @@ LEARNERS: dict[str, Algorithm] = {
 def make_config(
     algorithm: str = "ppo", preset: str = "published", **overrides: Any
 ) -> TrainingConfig:
-    """A preset of an algorithm, with fields overridden; or ConfigError."""
+    """Return a preset of an algorithm with fields overridden; or ConfigError."""
     kind = _choice(LEARNERS, algorithm, "algorithm").config
     settings = _choice(kind.presets, preset, f"preset of {algorithm}")
     return kind.from_dict({**settings, **overrides})
 
 
 def config_from_dict(values: Mapping[str, Any]) -> TrainingConfig:
-    """The inverse of TrainingConfig.to_dict; ConfigError if a value is wrong."""
-    # A field of older cards that means nothing any more.
+    """Invert `TrainingConfig.to_dict`; ConfigError if a value is wrong."""
+    # A field of older cards without effect.
     values = {name: one for name, one in values.items() if name != "tensorboard"}
     kind = _choice(LEARNERS, values.pop("algorithm", None), "algorithm").config
     return kind.from_dict(values)
@@ -57,12 +57,13 @@ def _choice(table: Mapping[str, Any], name: object, what: str) -> Any:
 
 
 def check_usable(config: TrainingConfig) -> None:
-    """Refuses settings that cannot be used here.
+    """Check that the settings can be used on this machine.
 
     Raises:
-        ConfigError: modules, device, compiler, logger or collectors cannot; says what
+        ConfigError: device, compiler, logger or collectors cannot be used; says what
             can.
-        DatasetError: there are no demonstrations where they must be.
+        ValueError: the task is unknown, as while its modules are not imported.
+        DatasetError: the demonstrations are missing.
     """
     if config.modules:
         suite.known(config.task, config.modules)
@@ -72,7 +73,7 @@ def check_usable(config: TrainingConfig) -> None:
     if getattr(config, "torch_compile", False):
         text = "torch_compile=True needs a C++ compiler for torch; leave it out"
         with files.refused(ConfigError, text, RuntimeError), warnings.catch_warnings():
-            # Torch warns of what it imports itself.
+            # Torch warns about its own imports.
             warnings.simplefilter("ignore", DeprecationWarning)
             torch.compile(torch.neg)(one)
     loggers.require(config.logger)

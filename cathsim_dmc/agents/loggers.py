@@ -27,14 +27,14 @@ class FigureLogger:
     """Shows the rows of metrics.csv in one logger of TorchRL, or in none."""
 
     def __init__(self, logger: str | None, run: Path, rows: Iterable[Row]):
-        """Opens the logger and shows the rows that the run has already.
+        """Opens the logger and shows the rows that the run already has.
 
-        A run that is resumed is shown as one series: what the logger has written in
-        its directory before is written anew.
+        A resumed run is shown as one series: the directory of the logger is deleted and
+        written again.
 
         Args:
             logger: "csv", "tensorboard", "trackio", "wandb", or None for none.
-            run: Directory of the run; the logger's is in it, but that of trackio.
+            run: Directory of the run; contains that of the logger, except for trackio.
             rows: Rows of metrics.csv.
         """
         self._logger: Any = None
@@ -46,7 +46,7 @@ class FigureLogger:
         rows = list(rows)
         if logger != "trackio":
             shutil.rmtree(run / logger, ignore_errors=True)
-        # Weights & Biases keeps its runs apart by their names only where they differ.
+        # Weights & Biases keeps runs apart only if their names differ.
         name = f"{run.name}-from-{rows[-1]['frames']:.0f}" if rows else run.name
         place = name if logger in ("trackio", "wandb") else logger
         # Files only, unless the user's environment asks for the server.
@@ -68,6 +68,6 @@ class FigureLogger:
         self._logger.flush()
 
     def close(self) -> None:
-        """Write what is not written yet, and close the files."""
+        """Write pending rows and close the files."""
         if self._logger is not None:
             self._logger.shutdown()

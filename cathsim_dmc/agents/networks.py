@@ -21,7 +21,7 @@ from cathsim_dmc.agents.normalisation import ImageNormaliser, ObservationNormali
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.tasks import observations
 
-# What the networks read in place of VECTOR and PIXELS.
+# Keys of the normalised VECTOR and PIXELS, which the networks read.
 NORMAL = "observation_normal"
 NORMAL_PIXELS = "pixels_normal"
 
@@ -32,7 +32,7 @@ _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 
 
 def bounded(log_std: torch.Tensor) -> torch.Tensor:
-    """Logarithms of deviations, held where they can be learnt."""
+    """Return log standard deviations, clamped to a range that can be learnt."""
     return log_std.clamp(_LEAST_LOG_STD, _LARGEST_LOG_STD)
 
 
@@ -52,7 +52,7 @@ class NetworkShapes:
 
     @classmethod
     def of(cls, observation: Any, action: Any) -> "NetworkShapes":
-        """The sizes of an observation and an action, or of their specs."""
+        """Return the sizes of an observation and an action, or of their specs."""
         keys, pixels = list(observation.keys()), None
         if PIXELS in keys:
             channels, height, width = observation[PIXELS].shape[-3:]
@@ -62,21 +62,22 @@ class NetworkShapes:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "NetworkShapes":
-        """The inverse of to_dict; ValueError if a size is missing or no integer."""
+        """Invert `to_dict`; ValueError if a size is missing or no integer."""
         kinds = typing.get_type_hints(cls).items()
         return cls(**{n: checked(f"shapes.{n}", values.get(n), k) for n, k in kinds})
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able values."""
+        """Return the sizes as JSON-able values."""
         return asdict(self)
 
     def split(
         self, config: ActorCriticConfig
     ) -> "tuple[NetworkShapes, NetworkShapes | None]":
-        """Sizes of what the policy reads and of what the critic reads.
+        """Split the sizes of the collected observation between policy and critic.
 
         Returns:
-            The parts of what is collected; None for a critic that reads the same.
+            Sizes of the policy and of the critic; None for a critic that reads the
+            same.
 
         Raises:
             ConfigError: the critic is to read something else, but the policy does not
@@ -95,7 +96,7 @@ class NetworkShapes:
 
     @property
     def raw_keys(self) -> list[str]:
-        """Keys of the observation as the environment gives it."""
+        """Keys of the raw observation of the environment."""
         return [VECTOR] * (self.vector > 0) + [PIXELS] * (self.pixels is not None)
 
     @property
@@ -111,7 +112,7 @@ def _are_images(names: str | tuple[str, ...], images: bool) -> bool:
 
 
 class Convolutions(nn.Module):
-    """Normalised images (..., C, H, W) to features (..., features)."""
+    """Map normalised images (..., C, H, W) to features (..., cnn_features)."""
 
     def __init__(self, shape: tuple[int, int, int], config: TrainingConfig):
         super().__init__()
@@ -128,15 +129,15 @@ class Convolutions(nn.Module):
         self.head = nn.Sequential(nn.Linear(entries, config.cnn_features), nn.ReLU())
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Take any number of dimensions before the channels."""
+        """Return the features; any number of axes may precede the channels."""
         flat = pixels.reshape((-1, *pixels.shape[-3:]))
         return self.head(self.filters(flat)).reshape((*pixels.shape[:-3], -1))
 
 
 class Body(nn.Module):
-    """Observation (and action, for a Q function) to hidden features.
+    """Map an observation, and for a Q function an action, to hidden features.
 
-    Images alone go through the convolutions; wherever a vector is present, hidden
+    Images alone pass only through the convolutions; with a vector or an action, hidden
     layers follow.
     """
 
@@ -201,7 +202,7 @@ class Value(nn.Module):
 
 
 def orthogonal_(module: nn.Module, head: nn.Linear, gain: float) -> None:
-    """Initialise as PPO expects: orthogonal layers, zero biases, a small head."""
+    """Initialise orthogonally, with `gain` for the head, and with zero biases."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear | nn.Conv2d):
             nn.init.orthogonal_(layer.weight, gain if layer is head else 2**0.5)
@@ -212,7 +213,7 @@ def orthogonal_(module: nn.Module, head: nn.Linear, gain: float) -> None:
 def make_critic(
     shapes: NetworkShapes, config: TrainingConfig, actions: int = 0
 ) -> ValueOperator:
-    """State value, or with a number of actions the value of an action."""
+    """Return a state value, or with a number of actions a Q function."""
     keys = [*shapes.keys, "action"] if actions else shapes.keys
     return ValueOperator(Value(shapes, config, actions), in_keys=keys)
 
@@ -220,7 +221,7 @@ def make_critic(
 def make_normalisers(
     shapes: NetworkShapes, config: TrainingConfig
 ) -> list[TensorDictModule]:
-    """The modules that turn raw observations into what the networks read."""
+    """Return the modules that normalise raw observations for the networks."""
     made: dict[str, nn.Module] = {}
     if shapes.vector:
         made[VECTOR] = ObservationNormaliser(shapes.vector, config.observation_clip)
@@ -233,7 +234,7 @@ def make_normalisers(
 
 
 def make_policy(shapes: NetworkShapes, config: TrainingConfig) -> TensorDictSequential:
-    """Normalisers and stochastic actor: raw observation in, action in [-1, 1] out."""
+    """Return normalisers and stochastic actor: raw observation to action in [-1, 1]."""
     network = GaussianActor(shapes, config)
     actor = ProbabilisticActor(
         TensorDictModule(network, in_keys=shapes.keys, out_keys=["loc", "scale"]),
@@ -246,5 +247,5 @@ def make_policy(shapes: NetworkShapes, config: TrainingConfig) -> TensorDictSequ
 
 
 def network_of(policy: nn.Module) -> GaussianActor:
-    """The network of a policy."""
+    """Return the actor network of a policy."""
     return next(m for m in policy.modules() if isinstance(m, GaussianActor))

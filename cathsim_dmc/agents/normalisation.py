@@ -1,4 +1,4 @@
-"""Running statistics of observations, frozen wherever nothing learns."""
+"""Running statistics of observations, which only training updates."""
 
 import torch
 from torch import nn
@@ -9,8 +9,7 @@ RELATIVE_FLOOR = 1e-6
 # Spread below which an entry counts as constant whatever its mean. Inertias of the
 # links are about 1e-9 kg m^2 and must stay above it.
 ABSOLUTE_FLOOR = 1e-13
-# Grey levels of an image that the networks read as 1 after subtraction: about the
-# shadow of a device.
+# Grey levels that correspond to 1 after subtraction: about the shadow of a device.
 SHADOW = 32.0
 
 
@@ -20,7 +19,7 @@ class ObservationNormaliser(nn.Module):
     Entries mix metres with inertias of 1e-9 kg m^2, so no common epsilon fits: an
     entry whose spread cannot be told from rounding gives exactly zero instead of
     amplified noise. Statistics change only in `update`, never in `forward`, and are
-    buffers, so they travel with the weights.
+    buffers, so they are saved with the weights.
 
     Args:
         clip: largest magnitude of a normalised entry.
@@ -42,7 +41,7 @@ class ObservationNormaliser(nn.Module):
         self.register_buffer("scale", torch.ones(size))
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Normalise (..., size) float32; identity but for the clip before data."""
+        """Normalise (..., size) float32; before the first `update` it only clips."""
         centred = (observation - self.shift) * self.scale
         return centred.clamp(-self.clip, self.clip)
 
@@ -73,9 +72,9 @@ class ObservationNormaliser(nn.Module):
 class ImageNormaliser(nn.Module):
     """Images as networks read them: brightness, or difference from the mean image.
 
-    Of a fluoroscopic image only the few pixels at the device change, by some 30 of 255
-    levels; from the brightness a network learns next to nothing (docs/training.md).
-    Subtracting the mean of all images leaves them alone, as digital subtraction
+    In a fluoroscopic image only the few pixels at the device change, by about 30 of 255
+    levels; from the brightness a network learns hardly anything (docs/training.md).
+    Subtracting the mean of all images leaves only these pixels, as digital subtraction
     angiography does with a mask image. The mean changes only in `update`.
 
     Args:

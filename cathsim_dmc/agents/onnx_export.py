@@ -40,16 +40,16 @@ from cathsim_dmc.tasks.interface import action_table, observation_table
 
 FORMAT = 1
 TOLERANCE = 1e-5  # of an action in [-1, 1]: rounding of single precision
-_STEPS = 64  # of an episode, that the self-test keeps
+_STEPS = 64  # of an episode in the self-test, at most
 _OPSET = 18
 _PACKAGES = ("cathsim-dmc", "torch", "torchrl", "mujoco", "onnx", "onnxruntime")
 
 
 class Deterministic(nn.Module):
-    """The actions that a policy gives in evaluations, from raw observations."""
+    """A policy's deterministic actions, as in evaluations, from raw observations."""
 
     def __init__(self, policy: nn.Module):
-        """Takes the parts of a policy as `networks.make_policy` makes it."""
+        """Takes normalisers and actor from a policy of `networks.make_policy`."""
         super().__init__()
         self.normalisers = nn.ModuleList(_normalisers(policy))
         actor = network_of(policy)
@@ -74,11 +74,11 @@ def write_onnx(
     task_kwargs: Mapping[str, Any] | None = None,
     seed: int = 1_000_000,
 ) -> Path:
-    """Write a trained policy as ONNX, compared with itself over an episode.
+    """Write a trained policy as ONNX and compare it with the policy over an episode.
 
     `policy.onnx` takes raw observations, normalises them and returns the actions
-    (N, A) float32 in [-1, 1]; `card.json` says the rest, see `card_of`, and is also in
-    the metadata of the model; `selftest.npz` holds observations and actions of an
+    (N, A) float32 in [-1, 1]. `card.json` describes it, see `card_of`, and is also in
+    the metadata of the model. `selftest.npz` holds observations and actions of an
     episode, and `selftest.py` compares with them where the package is not installed.
 
     Args:
@@ -138,7 +138,7 @@ def write_onnx(
 
 
 def card_of(player: TrainedPolicy, task: Any) -> dict[str, Any]:
-    """What a program needs to use a policy; JSON-able, SI units.
+    """Return the description that a program needs to use a policy; JSON-able, SI units.
 
     Args:
         task: The task that the policy plays.
@@ -180,7 +180,7 @@ def card_of(player: TrainedPolicy, task: Any) -> dict[str, Any]:
 def _input(
     name: str, shapes: NetworkShapes, own: Any, table: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Layout of an input of the model, and its normaliser `own`."""
+    """Return the layout of an input of the model, and of its normaliser `own`."""
     images, place, entries = name == PIXELS, 0, []
     for row in table:
         if (row["dtype"] == "uint8") is images:
@@ -203,7 +203,7 @@ def _input(
 
 
 def _played(player: TrainedPolicy, env: Any) -> dict[str, np.ndarray]:
-    """Inputs of the network and its actions at up to 64 steps of an episode."""
+    """Return inputs of the network and its actions at up to 64 steps of an episode."""
     seen: list[dict[str, np.ndarray]] = []
     keys = (*_inputs(player), "action")
     handle = player.network.register_forward_hook(
@@ -219,7 +219,7 @@ def _played(player: TrainedPolicy, env: Any) -> dict[str, np.ndarray]:
 
 
 def _inputs(player: TrainedPolicy) -> list[str]:
-    """Names of the inputs, vector before pixels."""
+    """Return the names of the inputs, vector before pixels."""
     shapes = player.shapes
     return [VECTOR] * (shapes.vector > 0) + [PIXELS] * (shapes.pixels is not None)
 
@@ -254,7 +254,7 @@ def _put_card(path: Path, card: Mapping[str, Any]) -> None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps to itself what the exporter says of packages that nothing here needs."""
+    """Suppress the exporter's messages about packages that are not needed here."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

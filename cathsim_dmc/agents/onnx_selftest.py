@@ -2,8 +2,8 @@
 
 python selftest.py [FOLDER]
 
-Plays the observations of selftest.npz, those of an episode, through policy.onnx and
-compares with the actions that the policy itself gave. Exit code 1: they differ.
+Runs policy.onnx on the observations of an episode in selftest.npz and compares its
+actions with those of the policy itself. Exit code 1: they differ.
 """
 
 import json
@@ -16,7 +16,7 @@ MODEL, CARD, SAMPLES = "policy.onnx", "card.json", "selftest.npz"
 
 
 def differences(folder):
-    """Largest difference of each step's action (T,), in the unit of the action."""
+    """Return the largest difference of an action at each step, (T,)."""
     import onnxruntime
 
     folder = Path(folder)

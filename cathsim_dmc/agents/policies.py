@@ -18,8 +18,8 @@ from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError
 from cathsim_dmc.policies import POLICIES, Policy, View, make_policy
 from cathsim_dmc.simulation import environments
 
-# Gets the standard observations (N, ...), returns the actions (N, A) or the TensorDict
-# with "action" in it.
+# Function from the standard observations (N, ...) to the actions (N, A), or to a
+# TensorDict with "action".
 PolicyFunction = Callable[
     [TensorDictBase], TensorDictBase | torch.Tensor | npt.ArrayLike
 ]
@@ -29,22 +29,22 @@ PolicyLike = str | Path | Checkpoint | Policy | PolicyFunction
 class FunctionPolicy(Policy):
     """A function of the standard observations.
 
-    A function with randomness of its own, such as a network, acts deterministically:
-    with the middle of its distribution.
+    A stochastic function, such as a network, acts deterministically, with the middle of
+    its distribution.
     """
 
     def __init__(self, function: PolicyFunction, name: str | None = None):
-        """Wraps a function; its name for reports is its own by default."""
+        """Wraps a function; the name for reports is by default that of the function."""
         self._function = function
         self.name = name or getattr(function, "__name__", type(function).__name__)
 
     def among(self, first: int, count: int) -> Policy:
-        """One that calls the function with as many rows as there are episodes."""
+        """Returns a policy that calls the function with rows for all episodes."""
         return _Among(self, first, count)
 
     @torch.no_grad()
     def act(self, observation: Any) -> np.ndarray:
-        """Actions (N, A) float32."""
+        """Returns the actions (N, A) float32."""
         if not isinstance(observation, TensorDictBase):
             entries = {k: torch.as_tensor(one)[None] for k, one in observation.items()}
             observation = TensorDict(environments.standard(entries, 1), batch_size=[1])
@@ -61,10 +61,10 @@ class FunctionPolicy(Policy):
 
 
 class _Among(Policy):
-    """A function of some of several simulations, called as for all of them.
+    """Policy of some of several simulations; calls a function with rows for all.
 
-    Products of matrices round differently with another number of rows, but a row does
-    not depend on what the others hold.
+    Matrix products round differently with another number of rows, but a row of the
+    result does not depend on the values in other rows.
     """
 
     def __init__(self, policy: FunctionPolicy, first: int, count: int):
@@ -89,8 +89,8 @@ class TrainedPolicy(FunctionPolicy):
         network: Raw observation in, action out.
         config: Settings of its training.
         shapes: Sizes of its observation and action.
-        checkpoint: Where it is from; None for that of a file.
-        card: What the policy of a file reached, see `pretrained.read_card`.
+        checkpoint: Checkpoint of the policy; None if it is from a `.safetensors` file.
+        card: Card of a policy from such a file, see `pretrained.read_card`.
     """
 
     checkpoint: Checkpoint | None = None
@@ -113,11 +113,11 @@ class TrainedPolicy(FunctionPolicy):
         self.num_actions = self.shapes.actions
 
     def reset(self, view: View, which: np.ndarray) -> None:
-        """Refuse simulations of a device with other motors, as ValueError."""
+        """Raises ValueError if the simulations have another number of actions."""
         _require(self, "has actions of", self.shapes.actions, view.num_actions)
 
     def _answer(self, observation: TensorDictBase) -> TensorDictBase:
-        # In training its critic may have read numbers that it does not.
+        # In training the critic alone may have read the vector.
         if environments.VECTOR in self.network.in_keys:
             vector = observation.get(environments.VECTOR, None)
             size = 0 if vector is None else vector.shape[-1]
@@ -130,9 +130,9 @@ class TrainedPolicy(FunctionPolicy):
 
 
 def require_actions(policy: Policy, task: str, options: Mapping[str, Any]) -> None:
-    """ValueError if the actions of a policy have another size than those of a task.
+    """Raises ValueError if a policy has actions of another size than a task.
 
-    Making the task, by which the size is known otherwise, takes seconds.
+    The task is not made for this, which takes seconds.
     """
     if policy.num_actions is not None and task in suite.TASKS:
         given = suite.num_actions(task, **options)
@@ -140,7 +140,7 @@ def require_actions(policy: Policy, task: str, options: Mapping[str, Any]) -> No
 
 
 def _require(policy: Policy, what: str, own: Any, given: Any) -> None:
-    """ValueError unless a size, or a shape (channels, height, width), is that given."""
+    """Raises ValueError unless two sizes, or (channels, height, width), are equal."""
     if own != given:
         kind = " numbers" if isinstance(own, int) else " as (channels, height, width)"
         raise ValueError(
@@ -151,7 +151,7 @@ def _require(policy: Policy, what: str, own: Any, given: Any) -> None:
 
 
 def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
-    """A policy from its name, file, run or function.
+    """Returns a policy from its name, file, run or function.
 
     Args:
         policy: Name in `POLICIES`, "pretrained:NAME", "hf:OWNER/NAME@COMMIT" of the
@@ -160,9 +160,9 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
         seed: Seed of a named policy's own randomness.
 
     Raises:
-        CheckpointError: there is none of that name, or it is damaged.
-        TypeError: it is none of these.
-        ValueError: the hub has none of that name.
+        CheckpointError: there is no policy of that name, or it is damaged.
+        TypeError: the argument is none of these.
+        ValueError: the hub has no policy of that name.
         ModuleNotFoundError: the hub needs an extra that is not installed.
     """
     if isinstance(policy, Policy):
@@ -194,7 +194,7 @@ _DEVICES = ("device", "devices", "rotation")
 def task_and_options(
     policy: Policy, task: str | None, options: Mapping[str, Any] | None
 ) -> tuple[str, dict[str, Any]]:
-    """Task of a policy, and its options over those of the training.
+    """Returns the task to play with a policy, and the options merged with its own.
 
     Args:
         task: Name of the task; None takes the one that the policy was trained on, or
@@ -202,13 +202,13 @@ def task_and_options(
         options: Options of the task.
 
     Returns:
-        Name of the task, and its options. What chose the anatomy of the training stays
-        behind where the task is another one; the devices go with the policy to
-        `navigate`. Settings of `fluoroscopy` go over those of the training one by one.
+        Name of the task, and `options` over those of the training. For another task,
+        the training's options of the anatomy are dropped; for `navigate`, its devices
+        are kept. Settings of `fluoroscopy` are merged one by one.
 
     Raises:
-        ValueError: `task` is None, and the policy was trained on none; or it is one of
-            modules that are not imported, see `suite.known`.
+        ValueError: `task` is None, and the policy was trained on none; or the task is
+            from modules that are not imported, see `suite.known`.
     """
     options, trained = dict(options or {}), dict(policy.task_kwargs or {})
     definition = suite.TASKS.get(policy.task or "")
@@ -236,9 +236,10 @@ def task_and_options(
 
 
 def view_of(env: EnvBase) -> View:
-    """The view of the simulations of a TorchRL environment.
+    """Returns the view of the simulations of a TorchRL environment.
 
-    Of one that is not of this package only the numbers of simulations and actions.
+    For an environment of another package, the view has only the numbers of simulations
+    and actions.
     """
     base = getattr(env, "base_env", env)
     if hasattr(base, "simulation"):

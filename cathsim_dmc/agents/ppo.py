@@ -116,7 +116,7 @@ class PPOConfig(ActorCriticConfig):
         return self.steps_per_update
 
     def changed_for_resume(self, other: TrainingConfig) -> dict[str, tuple]:
-        """Settings that a resumed run may change; not the length of an annealed one."""
+        """Return fields that must not change, also the length of an annealed run."""
         changed = super().changed_for_resume(other)
         if self.anneal and self.total_frames != other.total_frames:
             changed["total_frames"] = (self.total_frames, other.total_frames)
@@ -124,7 +124,7 @@ class PPOConfig(ActorCriticConfig):
 
 
 class PPO(Learner):
-    """Updates from whole batches, collected with the policy of the moment."""
+    """Updates from whole batches, collected with the present policy."""
 
     metrics: ClassVar[tuple[str, ...]] = (
         *_TERMS, "grad_norm", "explained_variance", "learning_rate", "gradient_steps",
@@ -150,7 +150,7 @@ class PPO(Learner):
             # Per minibatch, as in the published agents.
             normalize_advantage=True,
             log_explained_variance=False,
-            # There is no second set of weights to swap in, which takes a tenth of a
+            # PPO has no second set of weights; swapping weights in takes a tenth of a
             # gradient step.
             functional=False,
         )
@@ -202,7 +202,7 @@ class PPO(Learner):
             limit = config.target_kl
             if limit is not None and means(last)["kl_approx"] > limit:
                 break
-        # Only now: learning needs the statistics that the actions were chosen under.
+        # After learning, which needs the statistics used when the actions were chosen.
         self.observe(batch)
         return {
             **means(kept),
@@ -215,8 +215,8 @@ class PPO(Learner):
     def _add_advantages(self, batch: TensorDictBase) -> float:
         """Add advantage and value target; return the explained variance.
 
-        A truncated episode continues in the value of its last observation, a
-        terminated one is worth nothing afterwards: GAE reads both flags.
+        GAE continues a truncated episode with the value of its last observation, and a
+        terminated one with 0.
         """
         for states in (batch, batch["next"]):
             self.normalise(states, critic_only=True)

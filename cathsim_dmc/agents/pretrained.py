@@ -29,12 +29,12 @@ _PARTS: Mapping[str, type] = {
 
 
 def pretrained_names(directory: str | Path = DIRECTORY) -> list[str]:
-    """Names of the policies that ship, as in "pretrained:NAME"."""
+    """Return the names of the policies that ship, as in "pretrained:NAME"."""
     return sorted(path.stem for path in Path(directory).glob(f"*{SUFFIX}"))
 
 
 def pretrained_path(policy: str | Path) -> Path | None:
-    """Weights of "pretrained:NAME", of "hf:…" or of a `.safetensors` file, else None.
+    """Return the path of "pretrained:NAME", "hf:…" or a `.safetensors` file, or None.
 
     Raises:
         CheckpointError: none ships under that name; lists those that do.
@@ -54,13 +54,13 @@ def pretrained_path(policy: str | Path) -> Path | None:
 def read_pretrained(
     weights: str | Path,
 ) -> tuple[dict[str, Any], TensorDictSequential, NetworkShapes, TrainingConfig]:
-    """Card, network, sizes and settings of a policy.
+    """Read a policy; return its card, network, sizes and settings.
 
     Args:
         weights: Path of the `.safetensors` file; the card lies beside it.
 
     Raises:
-        CheckpointError: there is none, or it is damaged.
+        CheckpointError: the policy is missing or damaged.
     """
     weights = Path(weights)
     card = read_card(weights.with_suffix(".json"))
@@ -73,7 +73,7 @@ def read_pretrained(
 
 
 def read_card(path: str | Path) -> dict[str, Any]:
-    """The card of a policy.
+    """Read the card of a policy.
 
     Returns:
         "name", "task", "task_kwargs" (options of the task as it was evaluated),
@@ -96,7 +96,7 @@ def read_card(path: str | Path) -> dict[str, Any]:
 def write(
     directory: Path, name: str, state: Mapping[str, Any], card: Mapping[str, Any]
 ) -> Path:
-    """Write weights and card of a policy; the card last, which makes them a policy.
+    """Write weights and card of a policy; the card last, which completes it.
 
     Args:
         state: Tensors by name.

@@ -13,13 +13,13 @@ from cathsim_dmc.physics.randomisation import Draw, Randomisation
 from cathsim_dmc.tasks.anatomies import arch_numbers
 from cathsim_dmc.tasks.start import START_SPACING, STARTS_ALONG_ROUTE
 
-# Strata of each quantity, and candidates for each episode to fill them from.
+# Number of strata of each quantity, and of candidate seeds for each episode.
 _STRATA, _CANDIDATES = 10, 20
-# What makes episodes distinct, and the step between its values.
+# Quantities that make episodes distinct, and the step between distinct values.
 _STEPS = dict.fromkeys(
     ("friction", "stiffness", "loss", "viscosity", "goal_shift", "roll"), 1e-9
 ) | {"delay": 1, "start_insertion": START_SPACING}
-# What a start may have less of than drawn; a displacement may be drawn anew.
+# Quantities that a start may reduce after the draw; a displacement may be redrawn.
 _REDUCED = "displacement", "insertion"
 
 
@@ -37,7 +37,7 @@ class Protocol(NamedTuple):
     devices: tuple[str, ...] = ()
 
     def beside(self, options: Mapping[str, Any], given: Mapping[str, Any]) -> dict:
-        """Options but those of the protocol; ValueError if one of these is given."""
+        """Return options without the protocol's own; ValueError if one is given."""
         ranges = Randomisation.make(self.task_kwargs.get("randomisation", False))
         drawn = () if ranges.friction is None else ("friction",)
         own = {*self.task_kwargs, *drawn}
@@ -53,7 +53,7 @@ VARIED_RANGES = Randomisation(
 )  # fmt: skip
 
 PROTOCOLS = {
-    # The task as it is; episodes differ by 1 mm of the start, so they are nearly one.
+    # The task unchanged; episodes differ by 1 mm of the start and are nearly equal.
     "published": Protocol(30),
     "varied": Protocol(
         100, {"randomisation": VARIED_RANGES}, ("steerable_5f", "steerable_4f")
@@ -76,7 +76,7 @@ class Part(NamedTuple):
 
 
 def get(name: str) -> Protocol:
-    """The protocol of a name; ValueError lists those that there are."""
+    """Return a protocol by its name; ValueError lists the names."""
     return PROTOCOLS[bounds.choice("protocol", name, PROTOCOLS)]
 
 
@@ -87,13 +87,12 @@ def parts(
     episodes: int,
     seed: int,
 ) -> tuple[Part, ...]:
-    """The episodes of an evaluation, those of each device together.
+    """Return the episodes of an evaluation, one part for each device.
 
     Args:
         task_kwargs: Options over the task's own; those of the protocol go over both.
-        seed: The seeds lie at or above it: one after the other without variation, and
-            otherwise those that fill every tenth of each range alike and take the
-            arches of a pool in turn.
+        seed: Smallest seed. Without variation the seeds are consecutive; otherwise they
+            are those of `stratified` and take the arches of a pool in turn.
     """
     definition = suite.TASKS.get(task)
     own = {} if definition is None else definition.options
@@ -117,7 +116,7 @@ def parts(
         played += count
         varied = () if ranges == Randomisation() else seeds
         drawn = tuple(_conditions(ranges, one, arches, own) for one in varied)
-        # Objects would not go into the files of an episode; the task has its own.
+        # Effects are objects, which files cannot hold; the task makes its own.
         kept = {
             name: value
             for name, value in own.items()
@@ -143,20 +142,20 @@ def _conditions(
 def stratified(
     ranges: Randomisation, wanted: Sequence[int], seed: int, arches: int
 ) -> tuple[int, ...]:
-    """Seeds whose draws fill every tenth of each range alike.
+    """Return seeds whose draws fill the tenths of each range evenly.
 
-    For each episode in turn, that of 20 candidates is taken whose draws lie where the
-    fewest are.
+    Each episode in turn takes, of 20 candidates, the one whose draws lie in the least
+    filled tenths.
 
     Args:
         wanted: Number of the arch of each episode in its pool.
-        seed: The candidates begin there.
+        seed: Smallest candidate.
         arches: Number of arches in the pool, one of which a seed draws.
 
     Returns:
         Seeds, in the order of `wanted`.
     """
-    # Candidates of each arch, as many as its episodes may choose from, and their bins.
+    # Candidates of each arch, 20 for each of its episodes, with their bins.
     left: dict[int, dict[int, np.ndarray]] = {arch: {} for arch in wanted}
     short = {arch: _CANDIDATES * wanted.count(arch) for arch in left}
     candidates = itertools.count(seed)
@@ -179,7 +178,7 @@ def stratified(
 
 
 def _bins(ranges: Randomisation, episode: Draw) -> np.ndarray:
-    """Which tenths of their ranges the draws lie in."""
+    """Return the index of the tenth of its range that each draw lies in."""
     shares = []
     for name in _STEPS:
         chosen = getattr(ranges, name)
@@ -190,9 +189,10 @@ def _bins(ranges: Randomisation, episode: Draw) -> np.ndarray:
 
 
 def distinct(task: str, task_kwargs: Mapping[str, Any], episodes: int) -> bool:
-    """Whether so many episodes can all differ by more than the jitter of the start.
+    """Whether all episodes can differ by more than the jitter of the start.
 
-    Noise and the C-arm do not count. Tasks outside the suite are taken to.
+    Differences in noise and C-arm do not count. For tasks outside the suite the answer
+    is True.
     """
     definition = suite.TASKS.get(task)
     if definition is None:

@@ -22,26 +22,26 @@ from cathsim_dmc import cluster, files
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.learner import Learner
 
-# So many losses of one collector without a batch end the process; the run can be
+# Losses of a collector in a row, without a batch, that end the process; the run can be
 # resumed.
 MOST_LOSSES = 3
-# Longest wait until the cluster knows whether a machine that is silent is lost, s.
+# Longest wait until the cluster knows whether an unresponsive machine is lost, s.
 _PATIENCE = 90.0
 
 
 class _Collector(Collector):
     def __bool__(self) -> bool:
-        # Ray asks where an actor fails; its length, without an end, is no number.
+        # Ray evaluates the truth of a failed actor; an endless collector has no len.
         return True
 
 
 class RaySource:
-    """Batches of collectors in processes of a cluster, which replaces lost ones.
+    """Batches of collectors in processes of a cluster; lost collectors are replaced.
 
     Each collector has its share of the simulations and a copy of the policy, and gets
     the learner's weights and observation statistics before every batch. When one is
-    lost, the others keep their part of the batch and their episodes; another one takes
-    its place, begins new episodes and collects its part.
+    lost, the others keep their parts of the batch and their episodes. A new collector
+    replaces it, begins new episodes and collects its part.
     """
 
     def __init__(
@@ -58,8 +58,9 @@ class RaySource:
         Args:
             make_env: As for `evaluation.evaluate`; the workers must be able to import
                 it.
-            frames: Number of frames that earlier processes of the run have seen.
-            random_frames: Frames still to be collected at random, after so many.
+            frames: Number of frames that earlier processes of the run have collected.
+            random_frames: Function from the number of frames so far to the number that
+                is still to be collected with random actions.
             options: Options of each collector.
 
         Raises:
@@ -87,14 +88,14 @@ class RaySource:
                 collector_class=_Collector,
                 collector_kwargs=[dict(own) for _ in range(config.collectors)],
                 remote_configs=_placed(self._threads),
-                # Weights go with each request of a batch, so that one collector can be
-                # replaced: the connections of a scheme know all of them.
+                # Weights are sent with each request of a batch: a sync scheme connects
+                # a fixed set of collectors, so none could be replaced.
                 weight_sync_schemes={},
                 **shared,
             )
 
     def __iter__(self) -> Iterator[TensorDictBase]:
-        """Batches (num_envs, steps), those of the first collector first.
+        """Yield batches (num_envs, steps), with the rows in the order of collectors.
 
         Raises:
             RuntimeError: a collector was lost several times without a batch.
@@ -143,7 +144,7 @@ class RaySource:
         return torch.cat([parts[number] for number in sorted(parts)])
 
     def _replace(self, lost: Mapping[int, Exception]) -> None:
-        """Put new collectors in the places of those that were lost."""
+        """Replace lost collectors by new ones."""
         actors, logger = self._collector.remote_collectors, logging.getLogger(__name__)
         for number in lost:
             _await_certainty(actors[number])
@@ -169,13 +170,13 @@ class RaySource:
             actors[number] = actors.pop()
 
     def _factory(self, number: int) -> Callable[[], EnvBase]:
-        """Function that makes the environment of one collector."""
+        """Return a function that makes the environment of one collector."""
         config, count = self._config, self._config.collectors
         share = config.num_envs // count
-        # Of their own: every process begins with the same state of torch's generator.
+        # Own seeds: every process starts with the same state of torch's generator.
         place = [config.seed, self._frames, self._losses]
         seed, *drawn = np.random.SeedSequence(place).generate_state(1 + count)
-        # Those that the user has imported here.
+        # Only modules that the user has imported here.
         modules = [name for name in config.modules or () if name in sys.modules]
         return functools.partial(
             _make_worker_env,
@@ -196,7 +197,7 @@ def _make_worker_env(
     *args: Any,
     **kw: Any,
 ) -> EnvBase:
-    """The environment of a collector, made in its process."""
+    """Make the environment of a collector, in its process."""
     seed, threads, modules = own
     for name in modules:
         importlib.import_module(name)
@@ -206,12 +207,12 @@ def _make_worker_env(
 
 
 def _placed(processors: int) -> dict[str, Any]:
-    """Where Ray is to run a collector."""
+    """Return Ray's options for running a collector."""
     return {"num_cpus": processors, "scheduling_strategy": "SPREAD"}
 
 
 def _await_certainty(actor: Any) -> None:
-    """Wait until the cluster knows whether a process that is silent has ended."""
+    """Wait until the cluster knows whether an unresponsive process has ended."""
     end = time.monotonic() + _PATIENCE
     while time.monotonic() < end:
         try:
@@ -224,6 +225,6 @@ def _await_certainty(actor: Any) -> None:
 
 
 def _line(error: Exception) -> str:
-    """The last line of an error of the cluster, which says most."""
+    """Return the last line of an error of the cluster, the most informative one."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[-1].strip()[:300]

@@ -21,16 +21,17 @@ class ReplayError(ValueError):
 
 
 class ReplayMemory:
-    """The newest transitions, on disk, sampled uniformly.
+    """Replay buffer of the newest transitions, on disk, sampled uniformly.
 
-    Transitions are written straight into memory-mapped files, one .npy for each key, so
-    a checkpoint only notes how far the ring was filled. What a killed process wrote
-    after its last checkpoint lies where the resumed run writes next, or replaces the
-    oldest transitions by newer genuine ones. Reading the files executes nothing.
+    Transitions are written into memory-mapped files, one .npy for each key, so a
+    checkpoint stores only the fill level of the ring. Transitions that a killed process
+    wrote after its last checkpoint lie where the resumed run writes next, or replace
+    the oldest ones; they are valid too. Reading the files executes nothing.
 
     Args:
         directory: Folder of the files; made on the first `extend`.
         keys: Entries of a transition, nested ones as tuples.
+        capacity: Largest number of transitions.
         max_bytes: Largest size of all files together; lowers the capacity if need be.
     """
 
@@ -49,7 +50,7 @@ class ReplayMemory:
         return self.size
 
     def extend(self, transitions: TensorDictBase) -> None:
-        """Append transitions (n,), over the oldest ones when the ring is full."""
+        """Append transitions (n,), which overwrite the oldest if the ring is full."""
         storage = self._storage
         if storage is None:
             each = transitions[:1].bytes()
@@ -72,7 +73,7 @@ class ReplayMemory:
         return self._storage[torch.randint(self.size, (count,))]
 
     def state(self) -> dict[str, Any]:
-        """How far the ring is filled, and which one it is."""
+        """Return cursor, size, capacity and digest, which identifies the files."""
         own = {"cursor": self.cursor, "size": self.size, "capacity": self.capacity}
         return {**own, "digest": self._digest}
 
@@ -82,7 +83,7 @@ class ReplayMemory:
         if size == 0:
             return
         storage, digest = TensorDict({}, [capacity]), self.directory / _DIGEST
-        self._digest = state.get("digest")  # a checkpoint may name none
+        self._digest = state.get("digest")  # which a checkpoint may lack
         for key, path in self._paths.items():
             text = (
                 f"the replay of {size:,} transitions is lost: {path} is missing, "
@@ -95,14 +96,14 @@ class ReplayMemory:
                 # "r+" would extend a file that is too short.
                 open_memmap(path, mode="r")
                 storage[key] = torch.from_numpy(open_memmap(path, mode="r+"))
-                # A process that began without it has made others in their place.
+                # A process that started without this replay has replaced the files.
                 if self._digest and self._digest != files.read_text(digest):
                     raise ValueError("they are those of another process")
         self._storage, self.capacity = storage, capacity
         self.cursor, self.size = cursor, size
 
     def _create(self, like: TensorDictBase) -> TensorDictBase:
-        """Files for `capacity` transitions, which take their room on the disk now."""
+        """Create files for `capacity` transitions and reserve their disk space."""
         needed = self.capacity * like[:1].bytes()
         shutil.rmtree(self.directory, ignore_errors=True)
         self.directory.mkdir(parents=True)

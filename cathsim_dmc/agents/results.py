@@ -1,4 +1,4 @@
-"""Results of an evaluation: figures over its episodes, with intervals."""
+"""Results of an evaluation: figures over its episodes, success with its interval."""
 
 import itertools
 from collections.abc import Mapping
@@ -39,11 +39,11 @@ class EvaluationResult:
     conditions: tuple[Mapping[str, Any], ...] = ()
 
     def values(self, name: str) -> np.ndarray:
-        """A figure of every episode, float64 (episodes,); NaN where unknown.
+        """Return a figure of every episode, float64 (episodes,); NaN where unknown.
 
         Args:
-            name: Name of an attribute of `EpisodeOutcome`, with dots for what lies
-                deeper, such as "reward" or "forces.peak_sum.maximum".
+            name: Name of an attribute of `EpisodeOutcome`, with dots for nested ones,
+                such as "reward" or "forces.peak_sum.maximum".
         """
 
         def value(outcome: Any) -> Any:
@@ -54,7 +54,7 @@ class EvaluationResult:
         return np.array([value(e) for e in self.episodes], dtype=np.float64)
 
     def mean_sd(self, name: str) -> tuple[float | None, float | None]:
-        """Mean and sample standard deviation over the episodes; None if unknown."""
+        """Return mean and sample standard deviation over the episodes, or None."""
         values = self.values(name)
         values = values[~np.isnan(values)]
         if not len(values):
@@ -64,24 +64,24 @@ class EvaluationResult:
 
     @property
     def successes(self) -> int:
-        """Episodes that reached the goal."""
+        """Number of episodes that reached the goal."""
         return sum(episode.success for episode in self.episodes)
 
     def safe_success(self, limit: float) -> float:
-        """Share of episodes that reach the goal with little force on the wall.
+        """Return the fraction of episodes that succeed with little force on the wall.
 
         Args:
-            limit: The sum of the magnitudes over all contacts, mean over a control step
-                (`EpisodeForces.largest_sum`), stays at or below it in all of them, N.
+            limit: Largest allowed sum of the magnitudes over all contacts, mean over a
+                control step (`EpisodeForces.largest_sum`), N.
 
         Returns:
-            As a fraction; an episode whose force is not known is not safe.
+            Fraction in [0, 1]; an episode whose force is not known is not safe.
         """
         safe = self.values("forces.largest_sum") <= limit
         return float(np.mean((self.values("success") > 0) & safe))
 
     def summary(self) -> dict[str, Any]:
-        """Means with deviations over the episodes, success rate with its interval.
+        """Return means with deviations over the episodes, success with its interval.
 
         The interval is None where the episodes are not distinct. Forces in N, by
         quantity and statistic as docs/forces.md defines them.
@@ -91,7 +91,7 @@ class EvaluationResult:
         result: dict[str, Any] = {"episodes": count}
         for name in ("reward", "length", "path_ratio"):
             result[name], result[f"{name}_sd"] = self.mean_sd(name)
-        # Files of before 0.3 do not tell the means over a control step.
+        # Files from before 0.3 lack the means over a control step.
         quantities = [
             name
             for name in QUANTITIES
@@ -109,7 +109,7 @@ class EvaluationResult:
         return result
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able: identity, summary and every episode."""
+        """Return identity, summary and every episode as JSON-able values."""
         drawn = [{"conditions": dict(one)} for one in self.conditions]
         drawn = drawn or [{}] * len(self.seeds)
         played = zip(self.seeds, self.episodes, drawn, strict=True)

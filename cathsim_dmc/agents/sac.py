@@ -89,7 +89,7 @@ class SACConfig(ActorCriticConfig):
         require(fits, "replay_frames", most, least)
 
     def changed_for_resume(self, other: TrainingConfig) -> dict[str, tuple]:
-        """Settings that a resumed run may not change; its dataset may have moved."""
+        """Return fields that must not change; the path of the dataset may."""
         changed = super().changed_for_resume(other)
         paths = self.demonstrations, vars(other).get("demonstrations")
         if None in paths and paths[0] != paths[1]:
@@ -100,7 +100,7 @@ class SACConfig(ActorCriticConfig):
 class SAC(Learner):
     """Updates from a replay memory.
 
-    The replay keeps raw observations; they are normalised with today's statistics
+    The replay keeps raw observations; they are normalised with the present statistics
     when sampled, so old and new transitions agree.
     """
 
@@ -170,7 +170,7 @@ class SAC(Learner):
         return {name: losses[name].detach() for name in _TERMS}
 
     def _sample(self, count: int) -> TensorDictBase:
-        """Transitions (count,), half of them demonstrations if there are any."""
+        """Draw transitions (count,), half of them demonstrations if there are any."""
         shown = self.demonstrations
         if shown is None:
             return self.replay.sample(count)

@@ -1,4 +1,4 @@
-"""What is uploaded to a hub: policies with a card and a page, data sets."""
+"""Upload to a hub: policies with a card and a page, data sets."""
 
 import json
 import shutil
@@ -69,7 +69,7 @@ def upload(source: str | Path, text: str, *, private: bool = True) -> str:
 
 
 def _data_of(source: str | Path) -> list[Path]:
-    """Files of a data set; none where the source is a policy."""
+    """Return the files of a data set; none if the source is a policy."""
     folder = Path(source)
     if not folder.is_dir() or (folder / "checkpoints").exists():
         return []
@@ -81,7 +81,7 @@ def _data_of(source: str | Path) -> list[Path]:
 
 
 def _write_policy(source: str | Path, folder: Path, name: str) -> dict[str, Any]:
-    """Weights and card of a policy under a name; the card."""
+    """Write weights and card of a policy under a name; return the card."""
     path = pretrained.pretrained_path(source)
     if path is not None:
         old, network, _, _ = pretrained.read_pretrained(path)
@@ -96,7 +96,7 @@ def _write_policy(source: str | Path, folder: Path, name: str) -> dict[str, Any]
             found = json.loads(judged.read_text())
             # `evaluate` writes one result, `cathsim eval` that of the baseline, too.
             found = found if "summary" in found else found.get("policy", {})
-            # Of this policy, not of another or of an earlier checkpoint.
+            # Only of this checkpoint, not of another policy or an earlier one.
             if found.get("settings", {}).get("frames") == one.frames:
                 evaluation = found
         card = {
@@ -117,7 +117,7 @@ def _write_policy(source: str | Path, folder: Path, name: str) -> dict[str, Any]
 
 
 def _summary(card: Mapping[str, Any]) -> str:
-    """What a policy is and reached, in two sentences."""
+    """Return two sentences: what the policy is, and its success and force."""
     config, training = card["config"], card["training"]
     text = (
         f"Policy of the task `{card['task']}` of cathsim_dmc, observation "

@@ -19,7 +19,7 @@ from cathsim_dmc.policies import POLICIES, Policy, View
 from cathsim_dmc.tasks.config import MAX_STEPS
 
 PROTOCOL = "varied"
-RECORDED = ".npz"  # ending of a file of actions
+RECORDED = ".npz"  # suffix of a file of actions
 _DECIDING = ("mujoco", "dm-control", "numpy", "numba", "torch")
 
 
@@ -89,7 +89,7 @@ def submit(
 
 
 def text(submission: dict[str, Any]) -> str:
-    """A submission as JSON: a line for each entry and each episode."""
+    """Returns a submission as JSON: a line for each entry and each episode."""
     episodes = ",\n  ".join(map(json.dumps, submission["episodes"]))
     lines = {key: json.dumps(value) for key, value in submission.items()}
     lines["episodes"] = f"[\n  {episodes}\n ]"
@@ -98,25 +98,25 @@ def text(submission: dict[str, Any]) -> str:
 
 
 def seal(submission: dict[str, Any]) -> str:
-    """SHA-256 of all entries of a submission but "sha256"."""
+    """Returns the SHA-256 of all entries of a submission but "sha256"."""
     rest = {key: value for key, value in submission.items() if key != "sha256"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def ships(policy: str) -> bool:
-    """Whether a policy comes with the package, under a name."""
+    """Whether a policy ships with the package, under a name."""
     shipped = pretrained.pretrained_names()
     return policy in POLICIES or policy in [pretrained.PREFIX + n for n in shipped]
 
 
 def versions() -> dict[str, str]:
-    """Versions of what decides an episode; other ones may give other episodes."""
+    """Returns the versions of the packages that determine the episodes."""
     others = {name: version(name) for name in _DECIDING}
     return {"cathsim-dmc": __version__, **others}
 
 
 def protocol_seeds(task: str, options: Mapping[str, Any], episodes: int) -> list[int]:
-    """Seeds of the episodes of the protocol, in the order in which they are played."""
+    """Returns the seeds of the protocol's episodes in the order of playing."""
     return list(_protocol_seeds(task, json.dumps(options, sort_keys=True), episodes))
 
 
@@ -134,7 +134,7 @@ def file_digest(path: Path) -> str:
 
 
 def digest_of(policy: str) -> str | None:
-    """SHA-256 of a policy's weights or recorded actions; None without a file."""
+    """Returns the SHA-256 of a policy's weights or actions; None without a file."""
     if policy in POLICIES:
         return None
     path = pretrained.pretrained_path(policy)
@@ -158,11 +158,13 @@ def _commit() -> str | None:
 
 
 class RecordedActions(Policy):
-    """Plays the actions of a file, episode after episode, the last one for ever.
+    """Plays the actions of a file, episode after episode.
+
+    Past the last step of the file, its last action is repeated.
 
     Attributes:
         actions: (episodes, steps, A) in [-1, 1]; zeros after the end of an episode.
-        seeds: Those of the episodes.
+        seeds: Seeds of the episodes.
     """
 
     def __init__(self, path: str | Path):
@@ -183,13 +185,13 @@ class RecordedActions(Policy):
         self._rows, self._step = slice(0, 0), 0
 
     def reset(self, view: View, which: np.ndarray) -> None:
-        """Begin episodes; those of other simulations follow those before."""
+        """Begin the next episodes of the file, if all simulations are reset."""
         if which.all():
             first = self._rows.stop
             self._rows, self._step = slice(first, first + view.num_simulations), 0
 
     def require(self, task: str, episodes: int | None = None) -> None:
-        """ValueError unless the actions are those of the protocol on a task."""
+        """Raise ValueError unless the actions are of the protocol on a task."""
         options = self.task_kwargs or {}
         count = episodes or protocols.get(PROTOCOL).episodes
         bounds.whole("max_steps", options.get("max_steps", MAX_STEPS), 1, MAX_STEPS)
@@ -201,14 +203,14 @@ class RecordedActions(Policy):
             )
 
     def act(self, observation: Any) -> np.ndarray:
-        """Actions (N, A) of the step."""
+        """Return the actions (N, A) of the next step."""
         step = min(self._step, self.actions.shape[1] - 1)
         self._step += 1
         return self.actions[self._rows, step]
 
 
 class _Recorder(Policy):
-    """Another policy, whose actions (N, A) are kept by batch and step."""
+    """Wraps a policy and records its actions (N, A) by batch and step."""
 
     def __init__(self, policy: Policy):
         self._policy, self.name, self.task = policy, policy.name, policy.task
@@ -228,7 +230,7 @@ class _Recorder(Policy):
         return action
 
     def write(self, path: Path, result: evaluation.EvaluationResult) -> None:
-        """Writes the actions of the episodes, with zeros behind their ends."""
+        """Writes the actions of the episodes, with zeros after their ends."""
         length = max(map(len, self.batches))
         found = [np.stack(batch, axis=1) for batch in self.batches]  # (N, steps, A)
         rest = [((0, 0), (0, length - one.shape[1]), (0, 0)) for one in found]
@@ -248,14 +250,14 @@ def record_actions(
     """Play the varied protocol and write the actions, for `cathsim submit`.
 
     Args:
-        policy: Policy, or what names one, see `policies.load_policy`.
+        policy: Policy, or its name, path or function, see `policies.load_policy`.
         out: File to write, ending in .npz.
         task: Name of the task; None takes the one that the policy was trained on.
         **options: Of `evaluate`: episodes (fewer than those of the protocol to try it
             out), observation, task_kwargs, num_threads.
 
     Returns:
-        What the policy reached.
+        Result of the evaluation.
     """
     recorder = _Recorder(load_policy(policy, evaluation.EVALUATION_SEED))
     if files.require_file(out).suffix != RECORDED:

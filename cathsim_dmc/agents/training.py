@@ -38,10 +38,10 @@ from cathsim_dmc.simulation import environments
 from cathsim_dmc.tasks import observations
 
 CONFIG_FILE = "config.json"
-# What must agree for the weights of another policy to mean the same.
+# Settings that must agree for a policy to take the weights of another.
 _ALIKE = ("hidden", "activation", "subtract_background",
           "convolutions", "cnn_features", "observation_clip")  # fmt: skip
-_COIN = 0.5  # deviation of an entry that is 0 or 1 equally often
+_COIN = 0.5  # standard deviation of an entry that is 0 or 1 equally often
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class TrainingResult:
         run: Directory of the run.
         checkpoint: Directory of the newest checkpoint.
         frames: Number of frames, over all processes of the run.
-        seconds: Wall time, likewise.
+        seconds: Wall time over all processes of the run, s.
         interrupted: Whether a signal ended it before total_frames.
         metrics: Last row of metrics.csv.
     """
@@ -84,19 +84,19 @@ def train(
     process at a time trains there.
 
     Args:
-        resume: Whether to continue the run there. One that was killed before its
-            first checkpoint starts anew.
+        resume: Whether to continue the run in `out_dir`. A run that was killed before
+            its first checkpoint starts anew.
         progress: Whether to show progress on standard error.
         make_env: As for `evaluate`.
         without_replay: Whether a run that is resumed starts with an empty replay
             (SAC, DAgger), as when its files are lost.
         on_checkpoint: Function that is called with the directory of each checkpoint
-            when it is complete; torch's random numbers are kept from it.
+            when it is complete; it does not change the state of torch's generator.
 
     Raises:
         ConfigError: the directory holds a run that was not to be resumed, or one with
             other settings, or none that could be resumed; another process trains in
-            it; the torch device cannot be used; or `without_replay` comes alone.
+            it; the torch device cannot be used; or `without_replay` lacks `resume`.
         CheckpointError: the checkpoint to continue from is damaged.
         ReplayError: the files of its replay are missing or damaged.
         FloatingPointError: a loss is not finite; the last checkpoint stays.
@@ -124,7 +124,7 @@ def train(
         collector = make_collector(config, learner, env, make_env, state["frames"])
         stack.callback(collector.shutdown)
         files.write_json(run / CONFIG_FILE, config.to_dict())
-        # After everything that draws numbers while being made.
+        # Seeded last, since making the networks and collectors draws numbers.
         if checkpoint:
             torch.set_rng_state(state["rng"])
         else:
@@ -137,8 +137,8 @@ def train(
 
 
 def _environment(config: TrainingConfig, make_env: EnvFactory, frames: int) -> EnvBase:
-    """The environment of a run that has collected so many frames."""
-    # A resumed run gets fresh episodes: another stretch of the same seeds.
+    """Make the environment of a run that has already collected `frames` frames."""
+    # The seed depends on the frames, so that a resumed run gets new episodes.
     stretch = [config.seed, frames]
     seed = int(np.random.SeedSequence(stretch).generate_state(1)[0]) % 2**31
     return make_env(
@@ -151,7 +151,7 @@ def _environment(config: TrainingConfig, make_env: EnvFactory, frames: int) -> E
 
 @contextlib.contextmanager
 def _only_process(run: Path) -> Iterator[None]:
-    """Make the directory of a run; lock it until this process ends, even killed."""
+    """Make and lock the directory of a run; a killed process releases the lock."""
     files.require_folder(run, make=True)
     lock = FileLock(run / ".lock")
     text = f"another process trains in {run}; wait for its end, or choose a new folder"
@@ -160,7 +160,7 @@ def _only_process(run: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        # Where no run was begun, as little as possible stays.
+        # If no run was begun, the lock and an empty directory are removed.
         if not (run / CONFIG_FILE).exists():
             with contextlib.suppress(OSError):
                 os.unlink(lock.lock_file)
@@ -169,7 +169,7 @@ def _only_process(run: Path) -> Iterator[None]:
 
 
 def no_run(path: str | Path) -> str:
-    """What is wrong with resuming in a directory without a run."""
+    """Return the error message for resuming in a directory without a run."""
     return (
         f"there is no run in {path} to resume: give the directory of one, or start a "
         "new one without resume."
@@ -177,11 +177,11 @@ def no_run(path: str | Path) -> str:
 
 
 def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | None:
-    """Check the directory against the request; return where to continue from."""
+    """Check the directory against the request; return the checkpoint to resume from."""
     existing, alone = checkpoints_in(run), config.initial_policy is None
     if config.initial_std is not None and alone and not existing:
         raise ConfigError("initial_std is of use with initial_policy alone: add it")
-    read_metrics(run / "metrics.csv")  # or an error before any work
+    read_metrics(run / "metrics.csv")  # raises before any work if damaged
     if existing and not resume:
         raise ConfigError(
             f"{run} already holds a run: resume it, or choose another directory."
@@ -214,7 +214,7 @@ def _differing(pairs: Mapping[str, tuple[Any, Any]]) -> str:
 def _start(
     learner: Learner, env: EnvBase, checkpoint: Checkpoint | None, without_replay: bool
 ) -> dict[str, Any]:
-    """Load a checkpoint or an initial policy; what earlier processes have counted."""
+    """Load a checkpoint or an initial policy; return the counts of the run so far."""
     if checkpoint is None:
         config = learner.config
         if config.initial_policy is not None:
@@ -242,15 +242,16 @@ def take_over(
 ) -> None:
     """Give a policy the weights and observation statistics of `initial_policy`.
 
-    It may observe more, if the entries that are new come last in alphabetical order, as
-    `route_retry` does after `route`: at first it does not react to them.
+    The policy may have more entries in its observation, if these come last in
+    alphabetical order, as those of `route_retry` after `route`. Their weights start
+    at 0.
 
-    A deviation that depends on the state (SAC) starts as one that does not (PPO,
-    cloning), and the other way round as its value in the middle of all states.
+    A state-dependent deviation (SAC) starts from a constant one (PPO, cloning) as the
+    same in all states; a constant one takes the bias of a state-dependent one.
 
     Raises:
         ConfigError: the other policy has another network, sizes or observation.
-        CheckpointError: there is none, or it is damaged.
+        CheckpointError: the initial policy is missing or damaged.
     """
     name = f"initial_policy={config.initial_policy!r}"
     source = load_policy(str(config.initial_policy))
@@ -295,10 +296,10 @@ def take_over(
 def _widened(
     key: str, given: Mapping[str, torch.Tensor], own: torch.Tensor, known: int
 ) -> torch.Tensor:
-    """A tensor with places for the entries of `own` that its policy has not seen.
+    """Return a tensor widened to the shape of `own` by entries new to its policy.
 
-    They come after the `known` numbers of the vector, before the features of images.
-    Weights of these are 0; their statistics are those of a coin, which is 0 or 1.
+    New entries come after the `known` numbers of the vector, before the features of
+    images. Their weights are 0; their statistics are mean 0 and deviation `_COIN`.
     """
     old = given[key]
     if old.shape == own.shape:
@@ -315,9 +316,9 @@ def _widened(
 
 
 def _entries(names: str | tuple[str, ...]) -> list[str]:
-    """Entries in the order in which networks read them, without their first word.
+    """Return the entries in the order of the networks, without their first word.
 
-    It differs between "route" and "biplane".
+    The first word differs between "route" and "biplane".
     """
     rows = observations.entries(observations.resolve(names))
     keys = sorted(entry.key for entry in rows)
@@ -332,7 +333,7 @@ def _loop(
     interruption: threading.Event,
     on_checkpoint: Callable[[Path], Any],
 ) -> TrainingResult:
-    """Collect, learn, log and save, to the last frame or until an event is set."""
+    """Collect, learn, log and save, to the last frame or to an interruption."""
     config = learner.config
 
     def save() -> Path:
@@ -379,6 +380,6 @@ def _loop(
 
 
 def _truncate_diverged(batch: TensorDictBase) -> None:
-    """Count a diverged simulation as cut off, not as ended by the task."""
+    """Mark diverged simulations as truncated, not as terminated."""
     # Rewards are negative distances: the agent would learn to break the simulation.
     batch["next", "terminated"] &= ~batch["next", "info", "physics_error"].bool()

@@ -25,7 +25,8 @@ _LINE = "{desc}: {n_fmt}{unit} [{elapsed}, {rate_fmt}{postfix}]\n"
 # Number of finished episodes over which the running figures are taken.
 EPISODE_WINDOW = 100
 
-# Columns of metrics.csv that are means over these, and what they are of.
+# Columns of metrics.csv that are means over these episodes, with the attributes of
+# `EpisodeOutcome`.
 _FIGURES = {
     "episode_reward": "reward",
     "episode_length": "length",
@@ -41,14 +42,14 @@ COLUMNS = (
 
 
 class TrainingLog:
-    """Counts frames, episodes and seconds of a run and writes them down.
+    """Counts frames, episodes and seconds of a run and writes metrics.csv.
 
     Attributes:
         frames: Number of frames so far, over all processes of the run.
         episodes: Number of finished episodes likewise.
-        window: Figures of the last `EPISODE_WINDOW` of these.
+        window: Figures of the last `EPISODE_WINDOW` episodes.
         row: Last row of metrics.csv; empty before the first.
-        bar: Shows the progress.
+        bar: Progress bar.
     """
 
     def __init__(
@@ -57,8 +58,8 @@ class TrainingLog:
         """Opens the files, shows the progress and starts the clock.
 
         Args:
-            state: What earlier processes of the run have counted: frames, seconds,
-                episodes and the figures ("window") of the last of these.
+            state: Counts of earlier processes of the run: "frames", "seconds",
+                "episodes", and the figures ("window") of the last episodes.
             progress: Whether to show progress on standard error.
         """
         config: TrainingConfig = learner.config
@@ -98,8 +99,11 @@ class TrainingLog:
         """Logs a batch.
 
         Args:
+            frames: Number of frames of the batch.
+            finished: Episodes that ended in it.
+            step_reward: Mean reward of its control steps.
             losses: Figures of the learner's update.
-            last: Whether no other batch follows, so that a row is due anyway.
+            last: Whether this is the last batch, which always gets a row.
         """
         before, self.frames = self.frames, self.frames + frames
         self.episodes += len(finished)
@@ -136,7 +140,7 @@ class TrainingLog:
 
 
 def progress_bar(label: str, unit: str, **options: Any) -> tqdm:
-    """A bar of tqdm on standard error; a log file gets a line every 15 s."""
+    """Return tqdm's bar on standard error; a log file gets a line every 15 s."""
     terminal = sys.stderr.isatty()
     interval = 0.1 if terminal else LINE_INTERVAL
     return tqdm(
@@ -146,7 +150,7 @@ def progress_bar(label: str, unit: str, **options: Any) -> tqdm:
 
 
 def read_metrics(path: Path) -> list[dict[str, float | None]]:
-    """The complete rows of a metrics.csv if there is one; or ConfigError."""
+    """Return the complete rows of a metrics.csv, none if missing; or ConfigError."""
     if not path.exists():
         return []
     text, wrong = f"{path} holds no metrics; mend or remove it", (ValueError, csv.Error)
@@ -167,7 +171,7 @@ def crossed(before: int, after: int, interval: int) -> bool:
 
 
 def _episode_means(window: Iterable[Sequence[float | None]]) -> dict[str, float | None]:
-    """Means over the last finished episodes; None where nothing is known."""
+    """Return the means over the last finished episodes; None where unknown."""
     means: dict[str, float | None] = dict.fromkeys(_FIGURES)
     rows = list(window)
     for column, name in enumerate(_FIGURES if rows else ()):

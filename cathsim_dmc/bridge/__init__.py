@@ -1,4 +1,4 @@
-"""A device and what drives it, in two programs: messages over TCP, both sides."""
+"""A device and its driver in two programs, which exchange messages over TCP."""
 
 from cathsim_dmc.bridge.device import Device, SimulatedDevice, State
 from cathsim_dmc.bridge.driver import Driven, DriveOptions, drive

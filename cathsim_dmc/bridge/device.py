@@ -1,4 +1,4 @@
-"""What a device is to its driver, and a simulated one."""
+"""Interface of a device to its driver, and a simulated device."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -9,7 +9,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.interface import action_table, observation_table
 
-HANDSHAKE = 5.0  # s, in which a driver says hello
+HANDSHAKE = 5.0  # s, time limit of each message of the handshake
 MOST_FRAMES = 50  # in one period; more are a flood
 # Proposed threshold of rupture (arXiv 2604.20151).
 FORCE_LIMIT = 1.5  # N
@@ -17,20 +17,20 @@ LIMITED = ("largest", "push")
 
 
 def require_watchdog(watchdog: float, period: float) -> None:
-    """ValueError unless a watchdog, s, lasts longer than a period of the device."""
+    """Raise ValueError unless a watchdog, s, exceeds the period of the device, s."""
     if watchdog <= period:
         allowed = f"longer than a period of the device, {period:g} s"
         bounds.refuse("watchdog", watchdog, allowed)
 
 
 class State(NamedTuple):
-    """What a device measures once in a period.
+    """Measurements of a device in one period.
 
     Attributes:
-        observation: Arrays by key, as the device's table says.
-        force: Newtons by name, those that are measured: "largest", the largest contact
-            with the wall, and "sum", of all contacts, means over the period, and
-            "push", at the base.
+        observation: Arrays by key, as in `Device.observation`.
+        force: Measured forces by name, N: "largest", the largest contact with the wall,
+            and "sum", over all contacts, are means over the period; "push" is the force
+            at the base.
         time: Clock of the device, s.
         end: Why the episode is over: "success", "truncated", "physics_error" or
             "force_limit"; None while it goes on.
@@ -43,14 +43,14 @@ class State(NamedTuple):
 
 
 class Device(Protocol):
-    """What can be served: a simulation, or a robot.
+    """Interface of a device that can be served: a simulation or a robot.
 
     Attributes:
-        name: Name for people.
+        name: Name for display.
         period: Duration of a control step, s.
         action: A dictionary for each entry of an action, see `interface.action_table`:
             "name" and "unit"; "scale", "low" and "high" where they are known. Entries
-            whose unit holds "/s", such as m/s, are 0 where the device is to hold still.
+            whose unit holds "/s", such as m/s, are 0 when the device must hold still.
         observation: A dictionary for each array, see `interface.observation_table`:
             "key", "shape" and "dtype", and "unit" where it is known.
     """
@@ -61,19 +61,19 @@ class Device(Protocol):
     observation: Sequence[Mapping[str, Any]]
 
     def start(self, seed: int | None) -> State:
-        """Go to the start of an episode."""
+        """Go to the start of an episode; return its state."""
         ...
 
     def command(self, action: np.ndarray) -> None:
-        """Take the action (A,) of the present period; called as soon as it is there."""
+        """Apply the action (A,) of the present period; called when it arrives."""
         ...
 
     def read(self) -> State:
-        """Measure at the end of a period."""
+        """Return the measurements at the end of a period."""
         ...
 
     def stop(self) -> None:
-        """Stand still now; called whenever an episode is over, for whatever reason."""
+        """Stop all motion; called after every episode, also after an error."""
         ...
 
 
@@ -83,28 +83,28 @@ class SimulatedDevice:
     period = CONTROL_TIMESTEP
 
     def __init__(self, environment: Any, name: str):
-        """Takes what `suite.load` returns."""
+        """Takes a composer environment of `suite.load`."""
         self.name, self._env = name, environment
         task, chain = environment.task, environment.task.scene.catheter
         self.action: Sequence[Mapping[str, Any]] = action_table(chain)
         self.observation: Sequence[Mapping[str, Any]] = observation_table(task)
 
     def start(self, seed: int | None) -> State:
-        """Reset; a seed gives the same episode as the suite's `random`."""
+        """Reset; a seed gives the same episode as the suite's option `random`."""
         if seed is not None:
             self._env.random_state.seed(seed)
         return self._state(self._env.reset())
 
     def command(self, action: np.ndarray) -> None:
-        """Keep the action until `read`."""
+        """Store the action for `read`."""
         self._action = action
 
     def read(self) -> State:
-        """Simulate the period with the action."""
+        """Simulate a period with the stored action; return the measurements."""
         return self._state(self._env.step(self._action))
 
     def stop(self) -> None:
-        """Nothing moves between two steps of a simulation."""
+        """Do nothing: a simulation does not move between two steps."""
 
     def _state(self, timestep: Any) -> State:
         task = self._env.task

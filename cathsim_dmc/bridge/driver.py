@@ -1,4 +1,4 @@
-"""The side of the driver: a loop from states to actions that stops when in doubt."""
+"""The driver's side: a loop from states to actions that stops at any fault."""
 
 import contextlib
 import dataclasses
@@ -22,9 +22,9 @@ from cathsim_dmc.bridge.device import (
 from cathsim_dmc.bridge.messages import BridgeError, Connection
 from cathsim_dmc.bridge.records import Log, milliseconds
 
-# Time in which a device goes to its start, s.
+# Longest time in which a device reaches its start, s.
 START = 60.0
-# From the observation, arrays by key, to the action (A,).
+# Function from the observation, arrays by key, to the action (A,).
 Choose = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 
 
@@ -57,14 +57,14 @@ class DriveOptions:
 
 @dataclasses.dataclass(frozen=True)
 class Driven:
-    """How an episode went.
+    """Outcome of a driven episode.
 
     Attributes:
-        end: Why it ended: what the device said ("success", "truncated", …), or
+        end: Why it ended: what the device reported ("success", "truncated", …), or
             "stopped", "watchdog", "force_limit", "overrun".
-        reason: Why the device has stopped, as it says; None where it has not.
+        reason: Why the device stopped, as it reported; None if it did not stop.
         steps: Number of states that were answered.
-        skipped: Number of states that were not answered, because newer ones were there.
+        skipped: Number of states that were skipped for newer ones.
         late: Number of answers that took longer than a period.
         force: Largest force that the device reported, N.
         compute: Percentiles of the time from a state to its action, ms.
@@ -82,7 +82,7 @@ class Driven:
 
 
 def connect(address: str) -> Connection:
-    """A connection to "host:port"; ValueError for another text, OSError if none."""
+    """Connect to "host:port"; ValueError for another text, OSError if none answers."""
     host, colon, port = address.rpartition(":")
     if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65536:
         bounds.refuse("address", address, "host:port, such as 127.0.0.1:5555")
@@ -106,7 +106,7 @@ class _Run:
     gaps: list[float] = dataclasses.field(default_factory=list)
 
     def arrived(self, message: Mapping[str, Any], now: float) -> None:
-        """Count a state that may be answered."""
+        """Count a state; BridgeError if it is not newer than the last one."""
         if message["step"] <= self.answered:
             text = f"state {message['step']} came after state {self.answered}"
             raise BridgeError("out_of_order", text)
@@ -117,15 +117,15 @@ class _Run:
 
 
 class Driver:
-    """A connection to a device that has said what it is.
+    """A connection to a device after the handshake.
 
     Attributes:
-        welcome: What the device says of itself: "name", "period", "action",
+        welcome: The device's description of itself: "name", "period", "action",
             "observation".
     """
 
     def __init__(self, link: Connection, log: Log | None = None):
-        """Shakes hands; BridgeError if the device is busy or of another version."""
+        """Do the handshake; BridgeError if the device is busy or of another version."""
         self._link, self._log = link, log or Log(None)
         hello = {"protocol": messages.PROTOCOL, "name": f"cathsim_dmc {__version__}"}
         link.send(HANDSHAKE, "hello", **hello)
@@ -148,11 +148,11 @@ class Driver:
         self._log.write("welcome", **{k: self.welcome[k] for k in ("name", "period")})
 
     def read_only(self, keys: Collection[str]) -> None:
-        """Leave all arrays but these out of what a policy gets."""
+        """Restrict the observation of the policy to the arrays with these keys."""
         self._table = {key: self._table[key] for key in self._table if key in keys}
 
     def warm_up(self, choose: Choose, count: int) -> dict[str, float] | None:
-        """Compute actions from zeros; percentiles of their times, ms."""
+        """Compute actions from zeros; return percentiles of their durations, ms."""
         kinds = {
             k: np.uint8 if d == "uint8" else float for k, (_, d) in self._table.items()
         }
@@ -170,13 +170,14 @@ class Driver:
         seed: int | None = None,
         options: DriveOptions | None = None,
     ) -> Driven:
-        """Drive an episode; whatever ends it here, the device is told to stop.
+        """Drive an episode.
 
-        So do SIGTERM and Ctrl-C.
+        If the driver ends it, also by an error, SIGTERM, SIGHUP or Ctrl-C, it sends the
+        device a stop.
 
         Raises:
-            BridgeError: the device is gone or sends what is no state, or the action is
-                not finite or of another size.
+            BridgeError: the connection is lost, the device sends no valid state, or the
+                action is not finite or of another size.
             ValueError: if the watchdog is not longer than a period of the device.
         """
         options = options or DriveOptions()
@@ -221,7 +222,7 @@ class Driver:
             except BridgeError as error:
                 if error.fault != "peer_lost":
                     raise
-                continue  # it may have said why: its last state is there to be read
+                continue  # the device may have sent the reason in a last state
             run.times.append(time.monotonic() - arrived)
             self._log.write(
                 "sent", step=step, action=values, force=message["force"],
@@ -233,7 +234,7 @@ class Driver:
                     return self._ended(run, "overrun")
 
     def _newest(self, message: dict[str, Any], run: "_Run") -> dict[str, Any]:
-        """The last of the messages that are there, or the one that ends the episode."""
+        """Return the newest message received, or the one that ends the episode."""
         for _ in range(MOST_FRAMES):
             final = message["kind"] != "state" or message["end"] is not None
             newer = None if final else self._link.receive(0.0)
@@ -277,7 +278,7 @@ class Driver:
         self._log.write("stop", reason=reason)
         with contextlib.suppress(BridgeError):  # it may be gone
             self._link.send(0.2, "stop", reason=reason)
-            # What the device had sent before is not of the next episode.
+            # Discard states sent before the stop: they are not of the next episode.
             until = time.monotonic() + 0.2
             while (left := self._link.receive(until)) and left["kind"] == "state":
                 if left["end"] is not None:
@@ -303,19 +304,19 @@ def drive(
     """Drive one episode of the device at an address.
 
     Args:
-        choose: From the observation, arrays by key, to the action (A,).
+        choose: Function from the observation, arrays by key, to the action (A,).
         address: "host:port".
         seed: Seed of the episode; None leaves it to the device.
-        log: What was sent.
-        begin: Function that is called with what the device says of itself, before the
-            warm-up; it may refuse it.
+        log: Log of the messages sent; None keeps none.
+        begin: Function that is called with the device's `welcome` before the warm-up;
+            it may raise to refuse the device.
 
     Returns:
-        How it went.
+        Outcome of the episode.
 
     Raises:
-        ValueError: if the address is none, or the watchdog is not longer than a period
-            of the device.
+        ValueError: if the address is invalid, or the watchdog is not longer than a
+            period of the device.
         OSError: if no device answers there.
         BridgeError: see `Driver.episode`.
     """

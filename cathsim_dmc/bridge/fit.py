@@ -1,4 +1,4 @@
-"""Whether a device is one that a policy can drive, by what it announces of itself."""
+"""Comparison of a device, by its welcome, with what a policy was trained with."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 from cathsim_dmc import bounds
 from cathsim_dmc.bridge.messages import BridgeError
 
-_NEAR = 0.05  # of a number, to which periods and scales agree
+_NEAR = 0.05  # relative tolerance of periods, scales and bounds
 _WELCOME = ("action", "observation")
 
 
 class Interface(NamedTuple):
-    """What a policy was trained with.
+    """Period, action and observation that a policy was trained with.
 
     Attributes:
         period: Duration of a control step, s.
@@ -26,16 +26,18 @@ class Interface(NamedTuple):
 
 
 def sizes(wanted: Interface, welcome: Mapping[str, Any]) -> list[str]:
-    """What forbids to drive a device at all: arrays that lack or have other sizes.
+    """Lists the differences in size that rule out driving the device.
+
+    Arrays that the device lacks are not listed.
 
     Args:
-        welcome: What a device says of itself.
+        welcome: Welcome of the device.
 
     Returns:
-        A phrase for each, empty if there is none.
+        A phrase for each difference, empty if there is none.
 
     Raises:
-        BridgeError: the welcome holds no tables.
+        BridgeError: an entry of the action or observation is not an object.
     """
     for name in _WELCOME:
         if not all(isinstance(one, Mapping) for one in welcome[name]):
@@ -56,10 +58,10 @@ def sizes(wanted: Interface, welcome: Mapping[str, Any]) -> list[str]:
 
 
 def meanings(wanted: Interface, welcome: Mapping[str, Any]) -> list[str]:
-    """What a device announces otherwise than a policy was trained with.
+    """Lists the differences in period, names, units, scales and bounds.
 
-    What it does not announce, or as None, is not looked at. Arguments and result as of
-    `sizes`, of which there must be none.
+    Fields that the device leaves out or announces as None are not compared. Arguments
+    and result as for `sizes`, which must have found no difference.
     """
     wrong = []
     period = welcome.get("period", wanted.period)
@@ -88,7 +90,7 @@ def _same(given: Any, own: Any) -> bool:
 
 
 def _plain(unit: str) -> str:
-    """A unit without the signs between its parts: N·m, N m and Nm are one."""
+    """Returns a unit without separators: N·m, N m and Nm become equal."""
     return unit.translate(dict.fromkeys(map(ord, " ·*⋅.")))
 
 

@@ -1,6 +1,6 @@
 """Messages between a device and its driver: JSON objects over TCP, length first.
 
-A frame is the number of bytes that follow, unsigned, 4 bytes, big-endian, and a JSON
+A frame is the length of the rest in bytes (unsigned, 4 bytes, big-endian) and a JSON
 object in UTF-8 with a "kind" (docs/robot_messages.md). Numbers are finite.
 """
 
@@ -28,7 +28,7 @@ _NAMES: Mapping[type, str] = {
     int: "a whole number", float: "a number", str: "a text", list: "a list",
     dict: "an object", type(None): "null",
 }  # fmt: skip
-# Why an episode is over, beside a stop.
+# Ends of an episode that a state may report.
 ENDS = ("success", "truncated", "physics_error", "force_limit")
 # Fields that a message must have, and their types.
 KINDS: Mapping[str, Mapping[str, tuple[type, ...]]] = {
@@ -49,12 +49,12 @@ KINDS: Mapping[str, Mapping[str, tuple[type, ...]]] = {
 
 
 class BridgeError(RuntimeError):
-    """The other program cannot be talked to.
+    """Communication with the other program fails.
 
     Attributes:
-        fault: Name of what is wrong: "frame_too_long", "not_json", "not_finite",
+        fault: Name of the fault: "frame_too_long", "not_json", "not_finite",
             "bad_message", "wrong_shape", "wrong_version", "out_of_order", "flood",
-            "slow_peer", "peer_lost", "busy", "idle", or what the other side said.
+            "slow_peer", "peer_lost", "busy", "idle", or what the other side reports.
     """
 
     def __init__(self, fault: str, text: str):
@@ -63,7 +63,7 @@ class BridgeError(RuntimeError):
 
 
 def pack(message: Mapping[str, Any]) -> bytes:
-    """A message as a frame; BridgeError if it is too long or holds NaN."""
+    """Return a message as a frame; BridgeError if it is too long or not finite."""
     try:
         text = json.dumps(
             message, allow_nan=False, separators=(",", ":"), default=np.generic.item
@@ -76,7 +76,7 @@ def pack(message: Mapping[str, Any]) -> bytes:
 
 
 def parse(data: bytes) -> dict[str, Any]:
-    """The message in a frame, without its length; BridgeError if it is none."""
+    """Return the message in a frame without its length; BridgeError if invalid."""
     try:
         # From bytes, json.loads would take UTF-16 and UTF-32 as well.
         message = json.loads(data.decode(), parse_constant=_no_constant)
@@ -107,7 +107,7 @@ def parse(data: bytes) -> dict[str, Any]:
 
 
 def require_end(end: Any) -> None:
-    """BridgeError unless it is why an episode is over, or None."""
+    """Raise BridgeError unless an end is one of `ENDS` or None."""
     if end is not None and end not in ENDS:
         _refuse("end of state", end, f"null, {', '.join(ENDS)}")
 
@@ -118,10 +118,10 @@ def _refuse(name: str, value: Any, allowed: str) -> NoReturn:
 
 
 def _shown(value: Any) -> str:
-    """A value as in the JSON that came, at most 80 characters."""
+    """Return a value as JSON text of at most 80 characters."""
     try:
         text = json.dumps(value, ensure_ascii=False)
-    except (TypeError, ValueError):  # of a function in this program
+    except (TypeError, ValueError):  # an object of this program
         return bounds.shown(value)
     return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
 
@@ -138,7 +138,7 @@ def _require_length(length: int) -> None:
 
 
 def to_json(array: Any) -> Any:
-    """An array as JSON: numbers as lists, images uint8 as base64 with their shape."""
+    """Return an array as JSON values: lists, or for uint8 base64 with the shape."""
     array = np.asarray(array)
     if array.dtype != np.uint8:
         return array.tolist()
@@ -147,13 +147,13 @@ def to_json(array: Any) -> Any:
 
 
 def to_array(name: str, value: Any, shape: Sequence[int], dtype: str) -> np.ndarray:
-    """The inverse of `to_json`; BridgeError for another shape, type, or NaN."""
+    """Invert `to_json`; BridgeError for another shape or type, or NaN or infinity."""
     if dtype == "uint8":
         return _image(name, value, tuple(shape))
     try:
         found = np.array(value)
         if found.dtype.kind not in "iuf" or _has_switch(value):
-            raise ValueError(found.dtype)  # texts, integers without end
+            raise ValueError(found.dtype)  # texts, integers beyond 64 bits
         found = found.astype(np.float64)
     except (ValueError, TypeError) as error:
         odd, given = _odd(name, value, len(shape)) or (name, value)
@@ -185,16 +185,16 @@ def _require_shape(name: str, found: np.ndarray, shape: tuple[int, ...]) -> None
 
 
 def _has_switch(value: Any) -> bool:
-    """Whether numbers have true or false among them, which would count as 1 and 0."""
+    """Whether nested lists hold booleans, which numpy would count as 1 and 0."""
     return type(value) is bool or (
         isinstance(value, list) and any(map(_has_switch, value))
     )
 
 
 def _odd(name: str, value: Any, depth: int) -> tuple[str, Any] | None:
-    """Name and value of the first entry that is no finite number, if there is one.
+    """Return name and value of the first entry that is not a finite number, or None.
 
-    Lists deeper than `depth` are not looked into: there may be hundreds in each other.
+    Lists nested deeper than `depth` are not searched: a message may nest hundreds.
     """
     if not isinstance(value, list):
         return None if bounds.is_number(value) else (name, value)
@@ -204,16 +204,16 @@ def _odd(name: str, value: Any, depth: int) -> tuple[str, Any] | None:
 
 
 class Connection:
-    """Frames over a socket, none of which is waited for longer than asked."""
+    """Frames over a socket, each with a time limit."""
 
     def __init__(self, sock: socket.socket):
-        """Takes a connected socket over."""
+        """Takes a connected socket, which `close` closes."""
         self._socket, self._held = sock, bytearray()
-        with contextlib.suppress(OSError):  # a pair of local sockets has no delay
+        with contextlib.suppress(OSError):  # local socket pairs lack this option
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, within: float, kind: str, **fields: Any) -> None:
-        """Send a message; BridgeError if it is not taken within so many seconds."""
+        """Send a message; BridgeError if that takes longer than `within` s."""
         data = pack({"kind": kind, **fields})
         self._socket.settimeout(within)
         try:
@@ -225,11 +225,14 @@ class Connection:
             raise BridgeError("peer_lost", f"{kind} cannot be sent: {error}") from error
 
     def receive(self, until: float) -> dict[str, Any] | None:
-        """The next message, or None if none comes until a time of `time.monotonic`.
+        """Return the next message; None if none comes until `until`.
+
+        Args:
+            until: Time of `time.monotonic`, s.
 
         Raises:
-            BridgeError: the other side is gone, or has sent what is no message, or has
-                said what is wrong ("error").
+            BridgeError: the connection is lost, the message is invalid, or it is an
+                "error" of the other side.
         """
         while True:
             if (message := self._next()) is not None:
@@ -261,7 +264,7 @@ class Connection:
         return parse(data)
 
     def close(self, error: BridgeError | None = None) -> None:
-        """Close, after saying what was wrong with the other side's messages."""
+        """Close the socket, after reporting an error to the other side if given."""
         if error is not None:
             with contextlib.suppress(BridgeError):
                 self.send(0.1, "error", fault=error.fault, reason=error.text[:1000])
@@ -269,7 +272,7 @@ class Connection:
 
 
 def require_version(message: Mapping[str, Any]) -> None:
-    """BridgeError unless a hello or welcome speaks this protocol."""
+    """Raise BridgeError unless a hello or welcome has this protocol version."""
     if message["protocol"] != PROTOCOL:
         raise BridgeError(
             "wrong_version",
@@ -278,7 +281,7 @@ def require_version(message: Mapping[str, Any]) -> None:
 
 
 def require_kind(message: Mapping[str, Any] | None, *kinds: str) -> dict[str, Any]:
-    """A message of one of these kinds; BridgeError for another one or none."""
+    """Return a message of one of some kinds; BridgeError for another one or None."""
     if message is None:
         raise BridgeError("idle", f"no {' or '.join(kinds)} came in time")
     if message["kind"] not in kinds:

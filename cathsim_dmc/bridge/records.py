@@ -1,4 +1,4 @@
-"""What was sent and when: a log that outlives a crash, and percentiles of times."""
+"""A log of messages that survives a crash, and percentiles of durations."""
 
 import json
 import time
@@ -15,13 +15,13 @@ PERCENTILES = (50, 95, 99)
 
 
 class Log:
-    """Lines of JSON, each written at once, so that they outlive a crash.
+    """File of JSON lines, each flushed at once so that it survives a crash.
 
-    Each has "t", the seconds since the log was opened.
+    Each line has "t", the time since the log was opened, s, and "event".
     """
 
     def __init__(self, path: str | Path | None):
-        """Opens a new file; None keeps no log. FileExistsError if it is there."""
+        """Open a new file; None keeps no log. FileExistsError if it exists."""
         self._began = time.monotonic()
         self._file = None
         if path is not None:
@@ -29,12 +29,12 @@ class Log:
 
     @staticmethod
     def require(path: str | Path | None) -> None:
-        """Raises OSError if there can be no new log; called before the work."""
+        """Raise OSError if no new log can be written; called before the work."""
         if path is not None and files.require_file(path, later=True).exists():
             raise FileExistsError(f"{path} exists; give a new file (--log)")
 
     def write(self, event: str, **values: Any) -> None:
-        """Add a line."""
+        """Add a line with an event and its values."""
         if self._file is not None:
             line = {"t": round(time.monotonic() - self._began, 6), "event": event}
             with files.naming(self._file.name):  # on a full disk
@@ -43,7 +43,7 @@ class Log:
                 self._file.flush()
 
     def __enter__(self) -> "Log":
-        """The log itself."""
+        """Return the log itself."""
         return self
 
     def __exit__(
@@ -52,7 +52,7 @@ class Log:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Say what ended it, and close the file."""
+        """Log the exception, if any, and close the file."""
         if error is not None:
             self.write("error", reason=f"{type(error).__name__}: {error}")
         if self._file is not None:
@@ -60,7 +60,7 @@ class Log:
 
 
 def milliseconds(seconds: Sequence[float]) -> dict[str, float] | None:
-    """Percentiles and the largest of some times, ms; None of none."""
+    """Return percentiles and maximum in ms of durations in s; None without any."""
     if not len(seconds):
         return None
     times = 1e3 * np.asarray(seconds)

@@ -1,4 +1,4 @@
-"""The side of the device: it keeps the clock, and stops when its driver does not."""
+"""The device's side: it keeps the clock, and stops if its driver falls silent."""
 
 import contextlib
 import dataclasses
@@ -24,7 +24,7 @@ from cathsim_dmc.bridge.messages import BridgeError, Connection
 from cathsim_dmc.bridge.records import Log, milliseconds
 
 IDLE = 60.0  # s, for which a driver may wait between episodes
-_SLICE = 0.2  # s, after which a wait looks around
+_SLICE = 0.2  # s, longest wait on a socket before other drivers are looked for
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,18 +65,18 @@ def serve(
 ) -> list[dict[str, Any]]:
     """Serve one driver after the other.
 
-    What ends it from outside, SIGTERM as well as Ctrl-C, stops the device before.
+    SIGTERM, SIGHUP and Ctrl-C stop the device before they end the function.
 
     Args:
-        listener: A socket that listens, see `listen`.
-        episodes: Number of episodes after which it returns; None for ever.
-        log: What was received and applied.
-        say: Function that is called with a line of progress.
+        listener: A listening socket, see `listen`.
+        episodes: Number of episodes after which it returns; None for no limit.
+        log: Log of connections, of applied actions and of the ends of episodes.
+        say: Function that is called with each line of progress.
 
     Returns:
         For each episode "end", "reason" (why it was stopped, else None), "steps",
-        "missed", "late", "force" (largest, N), and percentiles of "answer" (from a
-        state to its action) and "tick" (by how much a period begins late), ms.
+        "missed", "late", "force" (largest, N), and percentiles of "answer" (time from a
+        state to its action) and "tick" (delay of the start of a period), ms.
 
     Raises:
         ValueError: if the watchdog is not longer than a period of the device.
@@ -116,18 +116,19 @@ def serve(
 
 
 def _told(episode: Mapping[str, Any]) -> str:
-    """How an episode went, in words."""
+    """Return the outcome of an episode as text."""
     reason = "" if episode["reason"] is None else f": {episode['reason']}"
     return f"{episode['end']} after {episode['steps']} steps{reason}"
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens; OSError if the port is taken, 0 takes a free one.
+    """Return a listening socket; port 0 takes a free one.
 
-    A host with colons, in brackets or not, is one of IPv6.
+    A host with colons, in brackets or not, is an IPv6 address.
 
     Raises:
-        ValueError: the port is none, or the host is empty, which would let all in.
+        ValueError: the port is invalid, or the host is empty, which would admit all.
+        OSError: the address cannot be used, as when the port is taken.
     """
     bounds.text("host", host)
     bounds.whole("port", port, 0, 65535)
@@ -153,7 +154,7 @@ class _Running:
 
 
 class _Session:
-    """One driver."""
+    """Session with one driver."""
 
     running: _Running | None = None
     played: int | None = None  # steps of the last episode
@@ -199,7 +200,7 @@ class _Session:
         return True
 
     def _require_past(self, step: int) -> None:
-        """BridgeError for an action between episodes that answers none of the last."""
+        """Raise BridgeError for an action that answers no state of the last episode."""
         if self.played is None:
             raise BridgeError("out_of_order", "action came, expected start")
         if step > self.played:
@@ -207,7 +208,7 @@ class _Session:
             raise BridgeError("out_of_order", text)
 
     def episode(self) -> dict[str, Any]:
-        """Play one; whatever happens, the device stands still afterwards."""
+        """Run one episode and return its summary; stop the device in any case."""
         device, options = self._device, self._options
         self.running = run = _Running()
         self._heard = due = time.monotonic()
@@ -271,16 +272,16 @@ class _Session:
         )  # fmt: skip
 
     def _apply(self, action: np.ndarray, state: State) -> None:
-        """Give the device an action, and log it with the forces that led to it."""
+        """Give the device an action; log it with the forces of the last state."""
         self._device.command(action)
         step, force = (self.running or _Running()).step, dict(state.force)
         self._log.write("applied", step=step, action=action.tolist(), force=force)
 
     def _action(self, due: float, state: State) -> tuple[np.ndarray | None, str | None]:
-        """The action of the present period, if it comes, and why to stop, or None.
+        """Return the action of the present period and the reason to stop, each or None.
 
-        It is applied as it comes. The rest of the period is listened to as well, so
-        that a stop or a loss of the driver counts at once.
+        The action is applied when it arrives. Messages are received for the rest of the
+        period too, so that a stop or the loss of the driver takes effect at once.
         """
         run, options = self.running or _Running(), self._options
         action, frames = None, 0
@@ -308,7 +309,7 @@ class _Session:
                 text = f"action of step {message['step']}, but step {run.step} runs"
                 raise BridgeError("out_of_order", text)
             if message["step"] < run.step or action is not None:
-                run.late += 1  # of a state that is over, or answered
+                run.late += 1  # for an earlier state, or one already answered
                 continue
             run.answers.append(self._heard - self._sent)
             action = np.clip(given, -1.0, 1.0)
@@ -317,7 +318,7 @@ class _Session:
                 return action, None
 
     def _wait(self, seconds: float, *kinds: str) -> dict[str, Any]:
-        """The first message of the first of some kinds, without those of the others."""
+        """Return the first message of `kinds[0]`; skip those of the other kinds."""
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
             message = self._link.receive(time.monotonic() + min(left, _SLICE))
@@ -327,13 +328,13 @@ class _Session:
             message = messages.require_kind(message, *kinds)
             if message["kind"] == kinds[0]:
                 return message
-            # Those on their way when the last episode ended have no effect.
+            # Messages in transit when the last episode ended have no effect.
             if message["kind"] == "action":
                 self._require_past(message["step"])
         raise BridgeError("idle", f"no {kinds[0]} came within {seconds:g} s")
 
     def _turn_away(self) -> None:
-        """Tell another driver that there is one already."""
+        """Refuse another driver that connects meanwhile."""
         self._listener.settimeout(0.0)
         with contextlib.suppress(OSError):
             sock, _ = self._listener.accept()

@@ -1,4 +1,4 @@
-"""Signals that end a program, as exceptions: what moves is told to stop before."""
+"""Signals that end a program as exceptions, so that a moving device is stopped."""
 
 import contextlib
 import signal
@@ -6,12 +6,12 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-# Of systemd, docker and timeout, and of a terminal that is closed.
+# Sent by systemd, docker and timeout, and by a terminal that is closed.
 _ENDING = ("SIGTERM", "SIGHUP")
 
 
 class Ended(SystemExit):
-    """The program is ended by a signal; its exit code is 128 and the signal's number.
+    """A signal ends the program; the exit code is 128 plus its number.
 
     Attributes:
         name: Name of the signal.
@@ -29,10 +29,11 @@ class Ended(SystemExit):
 
 @contextlib.contextmanager
 def raised() -> Iterator[None]:
-    """SIGTERM and SIGHUP end what runs in it as Ctrl-C does, by an exception.
+    """Make SIGTERM and SIGHUP raise `Ended` in the block.
 
-    So in the main thread, and where the program neither ignores nor handles them
-    itself. Only the first is raised: a second one must not end the stop of a device.
+    This holds in the main thread, for signals that the program neither ignores nor
+    handles itself. Only the first one is raised: a second one must not interrupt the
+    stop of a device.
     """
     before = {}
     if threading.current_thread() is threading.main_thread():

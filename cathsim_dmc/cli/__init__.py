@@ -20,7 +20,7 @@ _DESCRIPTION = (
     "`cathsim COMMAND --help` explains a command, `cathsim --version` names it."
 )
 _LONGEST = 1500  # characters of an error
-# Where each command is, and what it does.
+# Module and function of each command, and its summary.
 COMMANDS = {
     "train": ("training:command", "Train an agent."),
     "list": ("listing:show", "List the tasks, or the devices with their properties."),
@@ -58,15 +58,15 @@ def main() -> None:
         if out := sys.stdout:  # None where it is closed
             out.flush()
     except BrokenPipeError:
-        # The reader, such as `head`, has seen enough; nor may the exit flush again.
+        # The reader, such as `head`, has closed the pipe; do not flush again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     except KeyboardInterrupt:
         code = _interrupted(interrupts)
     except (ValueError, OSError, RuntimeError, ImportError, ArithmeticError,
             MemoryError) as error:  # fmt: skip
-        # Errors with a message for the user; anything else is ours, with traceback. An
-        # interrupt may make an import fail.
+        # Errors with a message for the user; others are bugs and keep their traceback.
+        # An interrupt may make an import fail.
         code = _interrupted(interrupts) if interrupts.came else _refused(error)
     sys.exit(code)
 
@@ -116,7 +116,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _line(summary: str) -> Callable[[], int]:
-    """A command that is only listed."""
+    """Returns a placeholder for a command that is only listed."""
 
     def listed() -> int:
         raise AssertionError("another command is called")

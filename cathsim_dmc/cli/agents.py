@@ -128,7 +128,7 @@ def evaluate(
 def _observer(
     who: Any, log: evaluation.ContactLog | None, on_cluster: bool
 ) -> Iterator[Callable[[Any, np.ndarray], None] | None]:
-    """What observes the episodes of a policy: its log, and progress on one machine."""
+    """Yields an observer of episodes: the log and, on one machine, the progress."""
     if on_cluster:
         with told_of_losses():
             yield log
@@ -152,7 +152,7 @@ def _print(
     json: bool,
 ) -> None:
     if json:
-        # No figure of a policy has a bar to keep.
+        # Figures of a policy have no bounds, so there are no checks.
         print_json({"checks": [], **values})
         return
     print_results(list(results.values()))
@@ -228,7 +228,7 @@ def record(
     player = agents.load_policy(policy, seed)
     task, task_kwargs = task_and_options(player, task, options.given)
     suite.known(task)
-    # Now: an episode that cannot be written would be lost.
+    # Checked first: an episode that cannot be written would be lost.
     for path in targets:
         files.require_file(path, later=True)
     episode, env = _played(player, task, task_kwargs, seed)
@@ -254,7 +254,7 @@ def record(
 def _played(
     player: Any, task: str, task_kwargs: Mapping[str, Any], seed: int
 ) -> tuple[Episode, Any]:
-    """An episode of a policy, and the environment that it was played in."""
+    """Plays an episode of a policy; returns it and its environment."""
     require_actions(player, task, task_kwargs)
     options = dict(task_kwargs)
     if player.observation is not None:

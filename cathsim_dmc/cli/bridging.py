@@ -69,9 +69,9 @@ def serve(
     if not how.lockstep:
         require_watchdog(how.watchdog, CONTROL_TIMESTEP)
     suite.known(task)
-    listen(host, port).close()  # now: what is compiled below may take a minute
+    listen(host, port).close()  # checked first: compiling below may take a minute
     env = suite.load(suite.DOMAIN, task, options.given)
-    env.reset()  # compiles what a first reset compiles
+    env.reset()  # compiles before a driver connects
     device = bridge.SimulatedDevice(env, task)
     with listen(host, port) as listener, bridge.Log(log) as kept:
         at, taken = listener.getsockname()[:2]
@@ -156,7 +156,7 @@ def _choose(player: Policy) -> Any:
 
 
 def _table(episodes: Sequence[Mapping[str, Any]]) -> Table:
-    """Figures of episodes that were driven, side by side."""
+    """Returns a table of driven episodes, one column each."""
     table = Table("", *(f"episode {n}" for n in range(1, len(episodes) + 1)))
     for name in ("end", "reason", "steps", "skipped", "late"):
         if any(one[name] is not None for one in episodes):
@@ -180,16 +180,16 @@ def require_fit(
     """Require that a device gives what a policy reads and takes its actions.
 
     Args:
-        player: A policy; nothing is checked where it names no observation.
-        welcome: What the device says of itself, see `bridge.Driver`.
-        unchecked: Whether its period and the names, units and scales of what it gives
-            and takes may be others than those of the training.
+        player: A policy; nothing is checked if it names no observation.
+        welcome: Welcome of the device, see `bridge.Driver`.
+        unchecked: Whether period, names, units and scales may differ from those of the
+            training.
 
     Returns:
-        Keys of the arrays that the policy reads; None where they are not known.
+        Keys of the arrays that the policy reads; None if they are not known.
 
     Raises:
-        ValueError: it does not fit; says what was given, what is wanted, and a way out.
+        ValueError: the device does not fit; says what was given and what is wanted.
     """
     if player.observation is None:
         return None
@@ -236,11 +236,15 @@ def _misfit(
 
 
 def _interface(player: Policy) -> fit.Interface:
-    """What a policy was trained with; ValueError or OSError if its task is not here."""
+    """Returns the interface of a policy's training.
+
+    Raises:
+        ValueError, OSError: the task or its anatomy is not available here.
+    """
     given = {"observation": player.observation}
     name, options = task_and_options(player, None, given)
     if suite.TASKS[suite.known(name)].random_arch and "numbers" not in options:
-        options["pool"] = 1  # one arch tells, and more take longer
+        options["pool"] = 1  # one arch suffices, and more take longer
     task = suite.make_task(name, **options)
     chain = task.scene.catheter
     return fit.Interface(CONTROL_TIMESTEP, action_table(chain), observation_table(task))

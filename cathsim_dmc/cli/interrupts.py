@@ -1,8 +1,8 @@
-"""Interrupts (Ctrl-C) that get lost.
+"""Interrupts (Ctrl-C) that do not get lost.
 
-Code that is called from C, as imports of extension modules do, may drop the exception
-of an interrupt or make another one of it. So it is raised again as long as nobody
-handles it.
+Code that is called from C, as in the import of extension modules, may drop a
+KeyboardInterrupt or turn it into another exception. It is therefore raised again until
+it is handled.
 """
 
 import signal
@@ -20,7 +20,7 @@ class Interrupts:
     """
 
     def __init__(self) -> None:
-        """Listens, unless interrupts are ignored or somebody else listens."""
+        """Installs the handler, unless SIGINT is ignored or handled elsewhere."""
         self.came = False
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, self._interrupt)
@@ -34,13 +34,13 @@ class Interrupts:
 
     def _again(self, _number: int, _frame: FrameType | None) -> None:
         error: BaseException | None = sys.exc_info()[1]
-        while error is not None:  # what is being handled, as in a `finally`
+        while error is not None:  # exceptions being handled, as in a `finally`
             if isinstance(error, KeyboardInterrupt):
                 return
             error = error.__context__
         raise KeyboardInterrupt
 
     def handled(self) -> None:
-        """Ends the attempts."""
+        """Stops raising the interrupt again."""
         if self.came and hasattr(signal, "setitimer"):
             signal.setitimer(signal.ITIMER_REAL, 0.0)

@@ -30,7 +30,7 @@ def show(devices: bool = False, json: Json = False, modules: Modules = ()) -> in
         print_json({"devices": rows} if devices else tasks)
         return 0
     if devices:
-        # Unlimited width where the output is no terminal.
+        # Wide enough for all columns where the output is no terminal.
         width = None if sys.stdout.isatty() else 240
         console(width).print(_device_table(rows))
         return 0
@@ -65,7 +65,7 @@ def _device_table(rows: dict[str, dict[str, Any]]) -> Table:
 
 
 def figures(device: Device) -> dict[str, Any]:
-    """Properties of a device, in the units of data sheets."""
+    """Returns the properties of a device by name, in the units of data sheets."""
     return {
         "outer_diameter_mm": 2e3 * device.outer_radius,
         "lumen_diameter_mm": 2e3 * device.inner_radius,
@@ -83,7 +83,7 @@ def figures(device: Device) -> dict[str, Any]:
 
 
 def shape(device: Device) -> str:
-    """The arcs of the tip from proximal to distal, "straight" if there are none."""
+    """Returns the arcs of the tip as text, proximal to distal, or "straight"."""
     parts = []
     for arc in device.tip_shape:
         length, turn = f"{1e3 * arc.length:.2g} mm", round(math.degrees(arc.angle))

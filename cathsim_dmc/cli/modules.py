@@ -1,7 +1,7 @@
 """Modules of users that are imported before a command: tasks, devices, algorithms.
 
-Those of installed packages, by entry points of the group `cathsim.tasks`, and those
-that `--import` names. What a file names is never imported.
+They are entry points of installed packages in the group `cathsim.tasks`, and modules
+named by `--import`. Modules that a file names are never imported.
 """
 
 import argparse
@@ -23,7 +23,7 @@ COMMANDS = (
 
 
 class Own(NamedTuple):
-    """What is to be imported for a command.
+    """Modules to import for a command.
 
     Attributes:
         names: Modules that `--import` names.
@@ -35,7 +35,7 @@ class Own(NamedTuple):
 
     @classmethod
     def of(cls, arguments: list[str]) -> "Own":
-        """That of the arguments of the command line, the command first.
+        """Reads the arguments of the command line, the command first.
 
         Called before the module of the command is imported.
         """
@@ -44,15 +44,15 @@ class Own(NamedTuple):
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         parser.add_argument("--import", action="append", nargs="?", dest="names")
         named = parser.parse_known_args(arguments)[0].names or []
-        names = [one for one in named if one is not None]  # refused by the other parser
+        names = [one for one in named if one is not None]  # None: refused by tyro later
         own = cls(tuple(names), tuple(metadata.entry_points(group=GROUP)))
         if any(own):
-            # They may import torchrl, which goes before dm_control.
+            # The modules may import torchrl, which must precede dm_control.
             importlib.import_module("torchrl")
         return own
 
     def load(self) -> None:
-        """Imports them; an installed package that fails is named and left out.
+        """Imports the modules; reports and skips installed packages that fail.
 
         Raises:
             ValueError: a named module does not exist or cannot be imported.
@@ -66,7 +66,7 @@ class Own(NamedTuple):
 def _import(name: str) -> None:
     here = os.getcwd()
     if here not in sys.path:
-        sys.path.append(here)  # last: a file here hides no package
+        sys.path.append(here)  # last, so that no local file hides a package
     if not all(part.isidentifier() for part in name.split(".")):
         raise ValueError(
             f"--import {name}: give the name of a module, as in Python's import, "
@@ -76,7 +76,7 @@ def _import(name: str) -> None:
         importlib.import_module(name)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{name}.".startswith(f"{error.name}."):
-            raise  # a module that it imports itself
+            raise  # the missing module is one that the named module imports
         raise ValueError(
             f"--import {name}: no such module where Python looks, nor in {here}"
         ) from error

@@ -1,4 +1,4 @@
-"""Commands run where `MUJOCO_GL` names an OpenGL library that is not there."""
+"""Commands run even if `MUJOCO_GL` names an OpenGL library that is missing."""
 
 import importlib
 import os
@@ -13,10 +13,10 @@ _LOADERS = ("OpenGL.", "dm_control._render.", "glfw.", "mujoco.")
 
 
 def import_command(module: str, arguments: list[str]) -> ModuleType:
-    """The module of a command; the process begins anew where OpenGL cannot be loaded.
+    """Imports the module of a command; restarts the process if OpenGL fails to load.
 
-    MuJoCo loads OpenGL at import, no command draws with it, and modules that have been
-    imported in part cannot be imported again.
+    MuJoCo loads OpenGL at import, but no command draws with it. Modules that have been
+    imported in part cannot be imported again, so the process starts anew without it.
     """
     try:
         return importlib.import_module(module)

@@ -40,13 +40,13 @@ def say(text: str) -> None:
 
 
 def told_of_losses() -> contextlib.redirect_stdout:
-    """A context in which Ray tells of lost processes on standard error."""
+    """Return a context in which Ray reports lost processes on standard error."""
     return contextlib.redirect_stdout(sys.stderr)
 
 
 @contextlib.contextmanager
 def told_of_replaced(paths: Iterable[Path]) -> Iterator[None]:
-    """A context that tells on standard error which of some files it has replaced."""
+    """Report on standard error which of some files the block has replaced."""
     before = {path: path.stat().st_mtime_ns for path in paths if path.is_file()}
     yield
     for path, written in before.items():
@@ -62,17 +62,17 @@ def require_png(path: Path, later: bool = False) -> None:
 
 
 def console(width: int | None = None) -> Any:
-    """A console on standard output, which raises BrokenPipeError as `print` does."""
+    """Return a console on standard output that raises BrokenPipeError like `print`."""
     from rich.console import Console
 
     class OwnConsole(Console):
-        """A console whose broken pipe is told to the caller."""
+        """A console that raises BrokenPipeError."""
 
         def on_broken_pipe(self) -> None:
             # Rich's own ends with exit code 1, which is that of a failed check.
             raise BrokenPipeError
 
-    # What another program said is no markup.
+    # Texts of other programs are no markup.
     return OwnConsole(width=width, markup=False)
 
 

@@ -34,7 +34,7 @@ _Paths = Annotated[tuple[tuple[Path, ...], ...], conf.UseAppendAction]
 _Numbers = Annotated[tuple[tuple[int, ...], ...], conf.UseAppendAction]
 _Words = Annotated[tuple[tuple[str, ...], ...], conf.UseAppendAction]
 _FIRST = ("lcca", "bca")  # goals that are tried first
-_FILE, _PICTURE = "anatomy.npz", "check.png"  # of an anatomy: itself, three views
+_FILE, _PICTURE = "anatomy.npz", "check.png"  # an anatomy, and its three views
 
 
 @phantoms.command(name="import")
@@ -81,7 +81,7 @@ def import_phantom(
     bore = None if device is None else devices.get(device, "--device")
     if out is None:
         out = Path(stem(mesh))
-        # What is no file is told by the import.
+        # The import itself reports a missing file.
         if mesh.is_file() and out.exists() and not (out / _FILE).is_file():
             raise ValueError(
                 f"{out} exists and is no anatomy; give a directory (--out)"
@@ -93,7 +93,7 @@ def import_phantom(
             raise ValueError(
                 f"rename is {wishes}; give computed=wanted, e.g. branch_1=lra"
             )
-    _require_place(out)  # now: the import would be lost
+    _require_place(out)  # checked first: the import would be lost
     notes: list[str] = []
     anatomy = import_scan(
         mesh, tuple(chain.from_iterable(centreline)), units=units, mesh_frame=frame,
@@ -112,7 +112,7 @@ def import_phantom(
 
 
 def _require_place(out: Path) -> None:
-    """An error if no anatomy can be written there, or a task would take another."""
+    """Raises an error if a folder cannot be written or has the name of a phantom."""
     if str(out) in shipped.PHANTOMS:
         raise ValueError(
             f"the directory would be called {str(out)!r}, as a phantom is, which tasks "
@@ -128,9 +128,9 @@ def _save(anatomy: Anatomy, out: Path) -> None:
 
 
 def _next_commands(anatomy: Anatomy, out: Path, device: str | None) -> list[str]:
-    """What to type after an import: the navigator to a goal, and the picture.
+    """Returns the commands after an import: an evaluation, and one for the picture.
 
-    The navigator steers one device; others are pushed.
+    The policy is the navigator for the device that it steers, and push for others.
     """
     picture = shlex.join([sys.executable, "-m", "webbrowser", str(out / _PICTURE)])
     if not anatomy.goals:
@@ -139,7 +139,7 @@ def _next_commands(anatomy: Anatomy, out: Path, device: str | None) -> list[str]
     goal = goal or next(iter(anatomy.goals))
     narrow = float(anatomy.route(goal).radii.min())
     if device is None and narrow < devices.STEERABLE_5F.outer_radius:
-        device = "wire_014_micro"  # as the import has it
+        device = "wire_014_micro"  # the device that the import checks in this case
     own = device in (None, devices.STEERABLE_5F.name)
     policy = "pretrained:navigator" if own else "push"
     command = ["cathsim", "eval", policy, "--anatomy", str(out), "--goal", goal]

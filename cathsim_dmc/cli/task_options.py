@@ -13,7 +13,7 @@ from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import Cannulation
 
 _OWN = " Text or JSON; by default, and with null, as the task or policy has it."
-_CONSTANTS = {"True": "true", "False": "false", "None": "null"}  # Python's, of JSON
+_CONSTANTS = {"True": "true", "False": "false", "None": "null"}  # Python to JSON
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class TaskOptions:
 
 
 def _several(text: str) -> list[float] | list[str] | None:
-    """The parts of a text such as 12,-30.5,110, a place, or lcca,any; None of one."""
+    """Returns the parts of "12,-30.5,110" (a place) or "lcca,any"; None of one part."""
     parts = text.strip("[]() ").split(",")
     try:
         place = [float(part) for part in parts]
@@ -78,14 +78,14 @@ _VALUE = PrimitiveConstructorSpec(
 
 
 def task_kind(omitted: Iterable[str] = ("observation",)) -> type[TaskOptions]:
-    """`TaskOptions` with the fields of `NavigationConfig` and of the objective.
+    """Returns `TaskOptions` with the fields of `NavigationConfig` and the objective.
 
     Args:
         omitted: Names of options that the command has no use for.
     """
     helps = field_helps(NavigationConfig)
     helps |= {name: _helps(Cannulation.to)[name] for name in ("reward", "goal_radius")}
-    # No text stands for objects.
+    # Effects are objects, which no text can name.
     fields: list[tuple[str, Any, Any]] = [
         (name, Annotated[Any, _VALUE, conf.arg(help=text + _OWN)], None)
         for name, text in helps.items()
@@ -97,7 +97,7 @@ def task_kind(omitted: Iterable[str] = ("observation",)) -> type[TaskOptions]:
 
 
 def field_helps(kind: type) -> dict[str, str]:
-    """Descriptions of the fields in the docstrings of a dataclass and its bases."""
+    """Returns the descriptions of fields in the docstrings of a class and its bases."""
     helps: dict[str, str] = {}
     for one in reversed(kind.__mro__):
         if dataclasses.is_dataclass(one):

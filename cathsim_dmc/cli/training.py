@@ -54,7 +54,7 @@ class _Run:
 
 
 def command(arguments: list[str]) -> Any:
-    """The command, whose options depend on the algorithm among its arguments.
+    """Returns the command, whose options depend on the algorithm in the arguments.
 
     Raises:
         ValueError: the run to be resumed has no readable settings, or there is no such
@@ -117,7 +117,7 @@ def command(arguments: list[str]) -> Any:
 
 
 def _filming(folder: Path, suffix: str) -> Callable[[Path], Any]:
-    """What films a checkpoint, if films of that kind can be written."""
+    """Returns a function that films a checkpoint; raises if films cannot be written."""
     # Imported late: trainings without films draw nothing.
     from cathsim_dmc.cli.agents import film_checkpoint
     from cathsim_dmc.pictures.films import check_film
@@ -127,7 +127,7 @@ def _filming(folder: Path, suffix: str) -> Callable[[Path], Any]:
 
 
 def _settings(arguments: list[str]) -> tuple[agents.TrainingConfig, bool]:
-    """Settings that the options start from, and whether they are those of a run."""
+    """Returns the defaults of the options, and whether they are those of a run."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     # Wrong values are refused by the parser of all options.
     for name in ("--algo", "--preset", "--out"):
@@ -146,14 +146,14 @@ def _settings(arguments: list[str]) -> tuple[agents.TrainingConfig, bool]:
         and found.out
         and not (path.is_file() or checkpoints_in(Path(found.out)))
     ):
-        raise ValueError(no_run(found.out))  # or its task would be missed first
+        raise ValueError(no_run(found.out))  # before the parser requires a task
     given = {"algorithm": found.algo, "preset": found.preset}.items()
     chosen = {name: value for name, value in given if value is not None}
     return agents.make_config(**chosen), False
 
 
 def _refuse_others(arguments: list[str], settings: agents.TrainingConfig) -> None:
-    """ValueError for a setting that only other algorithms have."""
+    """Raises ValueError for a setting that only other algorithms have."""
     known = {item.name for item in dataclasses.fields(settings)}
     for option in (word.partition("=")[0] for word in arguments):
         name = option.removeprefix("--").removeprefix("no-").replace("-", "_")
@@ -177,7 +177,7 @@ def _setting_kind(settings: agents.TrainingConfig) -> type:
     for item in dataclasses.fields(settings):
         if item.name in ("task", "task_kwargs"):
             continue
-        if item.name == "modules":  # None does not repeat
+        if item.name == "modules":  # repeated options need a tuple, not None
             default = functools.partial(tuple, settings.modules or ())
             field = dataclasses.field(default_factory=default)
             fields.append((item.name, Modules, field))

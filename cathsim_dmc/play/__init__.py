@@ -1,4 +1,4 @@
-"""Cannulation by hand: keys, a window, a record of what was done."""
+"""Cannulation by hand: input devices, a fluoroscopy window, recorded episodes."""
 
 from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.play.session import play

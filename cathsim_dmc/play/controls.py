@@ -1,13 +1,13 @@
-"""Actions of a task from keys that are held, and from a hand that leans."""
+"""Actions of a task from held keys and from a gamepad or SpaceMouse."""
 
 import numpy as np
 
 from cathsim_dmc.play.hands import Hand
 from cathsim_dmc.tasks.scene import Scene
 
-# Key of Tk that acts while it is held: the axis that it moves, and its sign, for a
-# steerable device (bend about x and y, translation, rotation) and for coaxial ones
-# (translation and rotation of the innermost, and of the outermost).
+# Tk keys that act while held: axis, sign for a steerable device, sign for coaxial
+# devices. The axes of a steerable device are bend about x and y, translation, rotation;
+# those of coaxial devices translation and rotation of the innermost, then outermost.
 HELD = {
     "w": (2, 1.0, 1.0),
     "s": (2, -1.0, -1.0),
@@ -18,7 +18,7 @@ HELD = {
     "Left": (1, -1.0, 1.0),
     "Right": (1, 1.0, -1.0),
 }
-# Keys that act once.
+# Keys that act once per press.
 ONCE = {"space": "straight", "r": "restart", "Escape": "quit"}
 _ALWAYS = "R: again", "Esc: quit"
 
@@ -29,16 +29,16 @@ _INNERMOST = "arrows: push/pull (up/down) and rotate (left/right) the guidewire"
 
 
 class Controls:
-    """Keys of a task: speeds while a key is held; the bend of a steerable tip stays.
+    """Maps held keys to speeds and to the bend of a steerable tip, which persists.
 
     In the AP view, "Right" bends the tip to the right of the image and "Up" towards
-    the observer, as long as the base is not rotated. Of coaxial devices the keys move
-    the innermost and the outermost; one device alone is both.
+    the observer, as long as the base is not rotated. With coaxial devices, the keys
+    move the innermost and the outermost; a single device is both.
 
     Attributes:
-        help: What the keys do.
+        help: Text that explains the keys.
         requested: "restart" or "quit" since the last `restart`, or None.
-        bend: Deflection (2,) of the tip about x and y, shares of the full one.
+        bend: Deflection (2,) of the tip about x and y in [-1, 1], of the full one.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Controls:
     def of(
         cls, scene: Scene, *, watching: bool = False, hand: Hand | None = None
     ) -> "Controls":
-        """The controls of the devices in a scene."""
+        """Returns the controls for the devices of a scene."""
         chain, how = scene.catheter, {"watching": watching, "hand": hand}
         if scene.catheter.coaxial:
             return cls(devices=len(chain.devices), **how)
@@ -78,7 +78,7 @@ class Controls:
         return cls(len(chain.tip_motors) // 2, turns, **how)
 
     def _keys(self) -> list[str]:
-        """What the keys of the task's own actions do."""
+        """Returns the explanations of the keys that drive the device."""
         if self._devices == 1:
             return ["arrows or W/S and A/D: push/pull and rotate the device"]
         if self._devices:
@@ -89,7 +89,7 @@ class Controls:
         return [*bend, "W/S: push/pull", *turn, *straighten]
 
     def press(self, key: str) -> None:
-        """Begins to hold a key until `release`; others than those above do nothing."""
+        """Holds a key of `HELD` until `release`; performs one of `ONCE`."""
         if key in HELD:
             self._held.add(key)
         elif ONCE.get(key) == "straight":
@@ -98,11 +98,11 @@ class Controls:
             self.requested = ONCE.get(key, self.requested)
 
     def release(self, key: str) -> None:
-        """Lets a key go."""
+        """Releases a key."""
         self._held.discard(key)
 
     def poll(self) -> None:
-        """Reads the hand; a button that is down acts once."""
+        """Reads the gamepad or SpaceMouse; a button acts once per press."""
         if self._hand is not None:
             self._leaning, down = self._hand.read()
             for key in down - self._down:
@@ -110,23 +110,23 @@ class Controls:
             self._down = down
 
     def feel(self, force: float) -> None:
-        """Lets the hand feel the largest contact force, N."""
+        """Makes the gamepad vibrate with the largest contact force, N."""
         if self._hand is not None:
             self._hand.feel(force)
 
     def restart(self) -> None:
-        """Lets all keys go and straightens the tip."""
+        """Releases all keys and straightens the tip."""
         self._held.clear()
         self._leaning: dict[str, float] = {}
         self.requested: str | None = None
         self.bend = np.zeros(2)
 
     def action(self, duration: float) -> np.ndarray:
-        """Action of the next control step of a duration in seconds.
+        """Returns the action of the next control step, of a duration in seconds.
 
         Returns:
-            (A,) float64 that float32 holds exactly, so that a demonstration can be
-            repeated through interfaces of single precision. A is 2 K with coaxial
+            (A,) float64 in [-1, 1], rounded to single precision so that a demonstration
+            can be repeated exactly through float32 interfaces. A is 2 K with coaxial
             devices.
         """
         held = np.zeros(4)

@@ -1,4 +1,4 @@
-"""Gamepads and SpaceMouses: what hands hold, and force as vibration."""
+"""Gamepad and SpaceMouse as input devices; the gamepad vibrates with the force."""
 
 import math
 import os
@@ -7,14 +7,14 @@ from typing import Any, Protocol
 from cathsim_dmc import extras
 
 HANDS = ("keyboard", "gamepad", "spacemouse")
-# Share of an axis that rest and wear move it by.
+# Largest reading of a resting or worn axis, as a fraction of its range.
 DEAD_ZONE = 0.15
-# Largest contact that vibrates with full strength, N: the proposed threshold of
-# rupture. Strength grows with the root, so that 15 mN are felt (a tenth).
+# Contact force of the strongest vibration, N: the proposed threshold of rupture. The
+# strength grows with the square root of the force, so 15 mN give a tenth.
 FULL_FORCE = 1.5
-FELT = 0.1  # s, of a vibration; a control step begins the next one
+FELT = 0.1  # s, duration of a vibration; each control step starts a new one
 _FULL_AXIS = 32767
-# Buttons that act once, by what they do (keys of `controls.ONCE`).
+# Buttons that act once per press, with the keys of `controls.ONCE` that do the same.
 _BUTTONS = {"A": "space", "START": "r", "BACK": "Escape"}
 
 
@@ -22,18 +22,18 @@ class Hand(Protocol):
     """A device in the operator's hand.
 
     Attributes:
-        help: What it does.
+        help: Text that explains its axes and buttons.
     """
 
     help: str
 
     def read(self) -> tuple[dict[str, float], set[str]]:
-        """How far it leans and what is pressed.
+        """Read the deflections and the buttons.
 
         Returns:
-            By the key that does the same ("Up", "Right", "w", "a"), a share of what
-            the key does while it is held, negative for the opposite key; and the keys
-            of buttons that are down and act once.
+            Deflections in [-1, 1] by the key with the same effect ("Up", "Right", "w",
+            "a"), 1 as the held key, negative as the opposite key; and the keys of the
+            buttons that are down and act once.
         """
         ...
 
@@ -42,12 +42,12 @@ class Hand(Protocol):
         ...
 
     def close(self) -> None:
-        """Let it go."""
+        """Release the device."""
         ...
 
 
 def without_rest(value: float) -> float:
-    """A reading in [-1, 1] without the dead zone, which is 0."""
+    """Return a reading in [-1, 1] with the dead zone as 0 and the rest rescaled."""
     beyond = abs(value) - DEAD_ZONE
     return math.copysign(min(max(beyond / (1 - DEAD_ZONE), 0.0), 1.0), value)
 
@@ -58,7 +58,7 @@ def strength(force: float) -> float:
 
 
 def hand(name: str) -> Hand | None:
-    """A device by its name in `HANDS`; None for the keyboard.
+    """Open an input device by its name in `HANDS`; return None for the keyboard.
 
     Raises:
         ModuleNotFoundError: the extra `hands` is not installed.
@@ -70,9 +70,9 @@ def hand(name: str) -> Hand | None:
 
 
 class Gamepad:
-    """The first gamepad that SDL knows, by way of pygame.
+    """The first gamepad that SDL recognises, read by pygame.
 
-    A gamepad that is pulled out is at rest, and goes on when it is back.
+    A disconnected gamepad reads as at rest, and works again once reconnected.
     """
 
     help = (
@@ -83,7 +83,7 @@ class Gamepad:
 
     def __init__(self) -> None:
         extras.require("hands", "pygame")
-        # SDL reads gamepads by its video system, and pygame opens no window of it.
+        # SDL reads gamepads in its video system; the dummy driver opens no window.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -136,13 +136,13 @@ class Gamepad:
         return axes, pressed
 
     def feel(self, force: float) -> None:
-        """Vibrate: the heavy motor with the force, the light one above half of it."""
+        """Vibrate the low-frequency motor, and above half strength the other one."""
         if self._pad is not None and self._pad.attached():
             heavy = strength(force)
             self._pad.rumble(heavy, max(0.0, 2 * heavy - 1), round(1e3 * FELT))
 
     def close(self) -> None:
-        """Let it go, and SDL."""
+        """Release the gamepad and SDL."""
         if self._pad is not None:
             self._pad.stop_rumble()
         self._kind.quit()
@@ -150,9 +150,9 @@ class Gamepad:
 
 
 class SpaceMouse:
-    """The first SpaceMouse, by way of pyspacemouse; it has no motor.
+    """The first SpaceMouse, read by pyspacemouse.
 
-    One that is pulled out is at rest.
+    A disconnected SpaceMouse reads as at rest.
     """
 
     help = (
@@ -179,11 +179,11 @@ class SpaceMouse:
     def read(self) -> tuple[dict[str, float], set[str]]:
         """See `Hand.read`."""
         before = None
-        # Reports that have come since the last call; the newest counts.
+        # Read all reports since the last call; the newest one counts.
         for _ in range(100):
             try:
                 state = self._mouse.read()
-            except Exception:  # of hidapi: it is gone
+            except Exception:  # hidapi's, where the device is disconnected
                 return {}, set()
             if state.t == before:
                 break
@@ -199,8 +199,8 @@ class SpaceMouse:
         return axes, {key for key, on in zip(("space", "r"), down, strict=False) if on}
 
     def feel(self, force: float) -> None:
-        """Nothing: it cannot vibrate."""
+        """Do nothing: a SpaceMouse has no motor."""
 
     def close(self) -> None:
-        """Let it go."""
+        """Release the SpaceMouse."""
         self._mouse.close()

@@ -1,4 +1,4 @@
-"""Cannulation by hand, episode after episode, recorded."""
+"""Sessions of cannulation by hand: episodes that are recorded."""
 
 import contextlib
 import itertools
@@ -33,7 +33,7 @@ def play(
     policy: Policy | None = None,
     hands: str = "keyboard",
 ) -> list[Path]:
-    """Plays a task by hand, at the pace of the clock, and records demonstrations.
+    """Plays a task by hand in real time and records the episodes.
 
     Args:
         out: Directory for the episodes (npz), made if it is not there; None for none.
@@ -41,8 +41,8 @@ def play(
         episodes: Number of episodes, None until the operator quits.
         speed: Speed of the simulation, in multiples of real time.
         policy: Policy that plays while the operator watches; None for the operator.
-        hands: What the operator holds, of `hands.HANDS`; the keys act beside it, and a
-            gamepad vibrates with the largest contact.
+        hands: Input device, one of `hands.HANDS`; the keys act too, and a gamepad
+            vibrates with the largest contact force.
 
     Returns:
         The files written, one for each episode of at least one step.
@@ -77,7 +77,7 @@ def _play(
     policy: Policy | None,
     held: Hand | None,
 ) -> list[Path]:
-    # The screen is the operator's observation; the task's own would only cost.
+    # The operator observes the window, so the task needs only a cheap observation.
     observation = (policy and policy.observation) or "tracking"
     env = suite.load(suite.DOMAIN, task, {"observation": observation, **options})
     controls = Controls.of(env.task.scene, watching=policy is not None, hand=held)

@@ -12,7 +12,8 @@ from cathsim_dmc.play.controls import Controls
 
 SIZE = 512  # px
 
-# X repeats a held key as release and press; a release counts if none follows in, s:
+# X repeats a held key as release and press. A release counts if no press follows
+# within this time, s.
 _REPEAT = 0.06
 _PANEL = 230  # px
 # Colours of the bar of the largest contact, N: mean tip force of trained navigation,
@@ -21,7 +22,7 @@ FORCE_LEVELS = ((0.15, "green"), (0.85, "orange"), (1.5, "red"))
 
 
 class FluoroscopyWindow:
-    """Shows the task as an operator sees it and turns keys into actions.
+    """Shows fluoroscopy and forces of a task; passes keys on to the controls.
 
     Attributes:
         closed: Whether the operator has closed the window.
@@ -35,7 +36,7 @@ class FluoroscopyWindow:
         Args:
             task: Navigation task; its fluoroscopy options are used, with as many
                 pixels as the window has and with quantum noise.
-            controls: What the keys act on.
+            controls: Controls that receive the keys.
 
         Raises:
             ValueError: if there is no Tk or no display.
@@ -77,7 +78,7 @@ class FluoroscopyWindow:
         self._released[_name(event.keysym)] = time.monotonic()
 
     def poll(self) -> None:
-        """Reads the keys pressed since the last call, and the hand."""
+        """Reads the keys since the last call, and the gamepad or SpaceMouse."""
         self._root.update()
         self._controls.poll()
         for key, when in list(self._released.items()):
@@ -135,7 +136,7 @@ def _name(keysym: str) -> str:
 
 
 def lines_of(task: Any) -> list[tuple[str, str]]:
-    """Name and value of every quantity after a control step or a reset."""
+    """Returns the names and values of the panel, after a control step or a reset."""
     state, wall, devices = task.readings, task.wall_force, task.devices
     lines = [
         ("goal", task.scene.goal.name),
@@ -153,7 +154,7 @@ def lines_of(task: Any) -> list[tuple[str, str]]:
         "largest contact": wall.mean_max,
         f"peak of {1e3 * task.config.physics_timestep:g} ms steps": wall.peak_max,
     }
-    # Plus zero: no minus before it.
+    # Adding 0.0 turns -0.0 into 0.0.
     texts = {n: f"{round(float(f), 3) + 0.0:6.3f} N" for n, f in forces.items()}
     return [*lines, *texts.items()]
 

@@ -1,4 +1,4 @@
-"""Policies that are not learnt, and what every policy is: numpy, no torch."""
+"""Scripted policies and the base class of all policies; numpy without torch."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ from cathsim_dmc.policies.expert import ExpertPolicy, Teacher
 from cathsim_dmc.policies.policy import Policy, View, in_environment
 from cathsim_dmc.policies.scripted import Curl, Idle, Push, Random, RandomCurl
 
-# Policies by name: a new one is a class and a line here.
+# Policies by name; to add one, write a class and add a line here.
 POLICIES: dict[str, Callable[[int], Policy]] = {
     "random": Random,
     "push": Push,
@@ -19,14 +19,14 @@ POLICIES: dict[str, Callable[[int], Policy]] = {
 
 
 def make_policy(name: str, seed: int = 0) -> Policy:
-    """The policy of a name.
+    """Returns a new policy by its name in `POLICIES`.
 
     Args:
-        seed: Seed of the policy's own randomness, for the first simulation; those of
-            the others count up.
+        seed: Seed of the policy for the first simulation; those of the others count
+            up.
 
     Raises:
-        ValueError: there is none of that name; lists those that exist.
+        ValueError: there is no policy of that name; lists the names.
     """
     return POLICIES[bounds.choice("policy", name, POLICIES)](bounds.seed("seed", seed))
 

@@ -1,4 +1,4 @@
-"""How fast a pursuit drives in an attempt, and which point of the route it pursues.
+"""Translation and look-ahead of the scripted expert within an attempt.
 
 `tasks.retry` decides when an attempt ends. Pure functions of arrays with leading batch
 axes, written `...`; metres.
@@ -16,26 +16,26 @@ from cathsim_dmc.tasks.route import Place, Route, locate
 
 @dataclasses.dataclass(frozen=True)
 class AttemptSettings:
-    """How fast to drive.
+    """Settings of the translation in an attempt.
 
     Attributes:
-        retry: Of the attempts, and how far ahead they look, see `tasks.retry`.
-        speed: fastest translation, as a part of what the carriage can do.
-        creep: slowest, as a part of `speed`, when misaligned or pressing.
-        aligned, misaligned: cosines of the error of direction between which the speed
-            falls from full to creeping.
-        soft_force, hard_force: largest contact, N, between which it falls likewise; the
-            mean over a control step. The published forces lie below 0.2 N, with
-            outliers above 0.4 N.
-        press: slowest, as a part of `speed`, when the head is stuck inside the tube;
-            it grows from nothing between `stuck` control steps without progress.
-        stuck: see `press`.
-        soft_push, hard_push: force of the base, N, between which pressing ceases.
-        straightening: control steps in which the device stands and its tip straightens
-            before it is withdrawn.
-        withdrawal: fastest translation then, as `speed`.
-        relaxing: what is left of the bend of the tip after each control step then, and
-            where it presses on the wall with `hard_force`.
+        retry: settings of the attempts and of the look-ahead, see `tasks.retry`.
+        speed: fastest translation, as a fraction of the full speed of the carriage.
+        creep: slowest advance, misaligned or in hard contact, as a fraction of `speed`.
+        aligned, misaligned: cosines of the direction error between which the speed
+            falls from `speed` to `creep`.
+        soft_force, hard_force: largest contact force, N, mean over a control step,
+            between which the speed falls likewise. The published forces lie below
+            0.2 N, with outliers above 0.4 N.
+        press: slowest advance when the head is stuck inside the route's tube, as a
+            fraction of `speed`; it rises from 0 over the steps `stuck`.
+        stuck: (first, last) control step without progress of this rise.
+        soft_push, hard_push: force of the base, N, between which `press` falls to 0.
+        straightening: control steps of standstill, in which the tip straightens,
+            before a withdrawal.
+        withdrawal: speed of a withdrawal, as a fraction of the full speed.
+        relaxing: factor of the tip's bends per control step in a withdrawal, and at a
+            contact force of `hard_force`.
     """
 
     retry: RetrySettings = retry.SINGLE
@@ -55,13 +55,13 @@ class AttemptSettings:
 
 
 class State(NamedTuple):
-    """Memory of the expert beside that of the task, for each simulation, arrays (...).
+    """State of the expert in each simulation, beside the task's `retry.Memory`.
 
     Attributes:
-        arc_length: of the place on the route at the last step, m; NaN before the
-            first.
-        insertion: at the last step, m; NaN before the first.
-        bend: (..., M, 2), told to the hinges of a steerable tip, rad.
+        arc_length: (...), of the head's place on the route at the last step, m; NaN
+            before the first.
+        insertion: (...), at the last step, m; NaN before the first.
+        bend: (..., M, 2), last command to the hinges of a steerable tip, rad.
     """
 
     arc_length: np.ndarray
@@ -70,7 +70,7 @@ class State(NamedTuple):
 
     @classmethod
     def fresh(cls, shape: tuple[int, ...], joints: int = 0) -> "State":
-        """State (...) at the start of an episode, of a tip of so many joints."""
+        """Returns the state at the start of an episode, for a tip of M `joints`."""
         unknown = np.full(shape, np.nan)
         return cls(unknown, unknown, np.zeros((*shape, joints, 2)))
 
@@ -82,7 +82,7 @@ def aim(
     memory: Memory,
     head: np.ndarray,
 ) -> tuple[Place, np.ndarray]:
-    """Place of a head (..., 3) on the route, and way (...) to the point pursued, m."""
+    """Returns the place of a head (..., 3) on the route and the look-ahead (...), m."""
     steady = np.where(np.isnan(memory.steady), np.nan, state.arc_length)
     place = locate(route, head, steady)
     return place, retry.lookahead(settings.retry, memory, route, place.arc_length)
@@ -95,12 +95,12 @@ def translation(
     push: np.ndarray,
     cosine: np.ndarray,
 ) -> np.ndarray:
-    """Translation (...) in [-1, 1].
+    """Returns the command of the translation (...) in [-1, 1].
 
     Args:
-        contact: (...), largest contact with the wall, N.
+        contact: (...), largest contact force on the wall, N.
         push: (...), force of the base, N.
-        cosine: (...), of the error of direction.
+        cosine: (...), cosine of the direction error.
     """
     s, free = settings, freedom(settings, contact)
     clear = _ramp(cosine, s.misaligned, s.aligned)
@@ -113,24 +113,24 @@ def translation(
 
 
 def freedom(settings: AttemptSettings, contact: np.ndarray) -> np.ndarray:
-    """1 where the largest contact (...), N, is soft, 0 where it is hard."""
+    """Returns a ramp (...), 1 at `soft_force` and 0 at `hard_force`; contact in N."""
     return _ramp(contact, settings.hard_force, settings.soft_force)
 
 
 def ease(settings: AttemptSettings, push: np.ndarray) -> np.ndarray:
-    """1 where the base is pushed softly, (...), N, 0 where it is pushed hard."""
+    """Returns a ramp (...), 1 at `soft_push` and 0 at `hard_push`; push in N."""
     return _ramp(push, settings.hard_push, settings.soft_push)
 
 
 def relaxed(
     settings: AttemptSettings, memory: Memory, contact: np.ndarray
 ) -> np.ndarray:
-    """What is left (...) of the bends of the tip after a control step."""
+    """Returns the factor (...) of the tip's bends in a control step, at most 1."""
     held = memory.retracting | memory.given_up
     free = np.where(held, 0.0, freedom(settings, contact))
     return settings.relaxing + (1.0 - settings.relaxing) * free
 
 
 def _ramp(value: np.ndarray, none: float, full: float) -> np.ndarray:
-    """Linear from 0 at `none` to 1 at `full`, constant beyond either."""
+    """Returns a linear ramp from 0 at `none` to 1 at `full`, constant beyond."""
     return np.clip((value - none) / (full - none), 0.0, 1.0)

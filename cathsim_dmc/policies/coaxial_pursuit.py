@@ -1,29 +1,29 @@
-"""Pursuit of a route by coaxial devices that are pushed and turned at their bases.
+"""Pursuit of a route by coaxial devices that are pushed and rotated at their bases.
 
-Pure functions of arrays with a leading axis N of simulations; K devices, numbered from
-the innermost outwards, which leads: a guidewire, and a catheter around it.
+Pure functions of arrays with a leading axis N of simulations. The K devices are
+numbered from the innermost outwards: a guidewire, and a catheter around it.
 
-**Steering.** A pre-shaped end leads to one side of its device, and turning the base
-turns that side. Where the route bends away from how a device lies before its shaped
-end, the device is turned until its side looks there, and advances as that comes about.
-Twist reaches the end late and in leaps, so it is the rotation of the end that counts.
+**Steering.** A pre-shaped end bends to one side of its device, and rotating the base
+rotates that side. Where the route bends away from the axis of the device before its
+shaped end, the device is rotated until its side faces the bend, and advances meanwhile.
+Twist reaches the end late and in jumps, so the rotation of the end is controlled.
 
-**Wire first, catheter after.** The wire goes ahead, the catheter follows at the lead
-of the attempt. Far ahead the wire is limp and follows the vessel; close ahead its bend
-and the catheter's add up to a sharper one.
+**Guidewire first.** The guidewire advances, and the catheter follows at the lead of the
+attempt. With a long lead the guidewire is flexible and follows the vessel; with a short
+lead its bend and the catheter's add up to a sharper one.
 
-**Or the catheter alone.** Into a take-off that turns back on the way there, a wire
-leads badly: its shaft, the stiffer one, comes to lie in the bend. With a negative lead
-the wire stays behind in the catheter, whose soft end takes its shape, hooks the branch
-and goes up; the wire holds the shaft in the aorta straight.
+**Catheter first.** A guidewire hardly enters a take-off that turns back, because its
+stiffer shaft comes to lie in the bend. With a negative lead the guidewire stays inside
+the catheter. The soft end of the catheter bends to its own shape, hooks the branch and
+advances; the guidewire keeps the shaft in the aorta straight.
 
-**Or in turns.** Where a branch leaves another one close to its ostium, the catheter
-goes first, its end turned to the branch, slowly. When it has passed the branch, it
-comes back until its end falls in. It goes up far enough to hold there, and the wire
-goes on from it alone.
+**In turns.** Where a branch leaves another branch close to its ostium, the catheter
+advances first, slowly, its end turned to the branch. Past the branch it is withdrawn
+until its end falls into the branch. It advances until it holds there, and the guidewire
+continues alone.
 
-**Retries** (`tasks.retry`) have another lead, look-ahead and direction, and every other
-time no jumps of the head's place on the route.
+**Retries** (`tasks.retry`) change the lead, the look-ahead and the direction. In every
+other attempt the head's place on the route does not jump.
 """
 
 import dataclasses
@@ -42,22 +42,22 @@ from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.retry import Memory, RetrySettings
 from cathsim_dmc.tasks.route import Place, Route
 
-# What a full action moves (m) and turns (rad) a device by in a control step.
+# Translation (m) and rotation (rad) of a device by a full action in a control step.
 _MOVE = MAX_PUSH_SPEED * CONTROL_TIMESTEP
 _TURN = MAX_ROTATION_SPEED * CONTROL_TIMESTEP
 
 
 @dataclasses.dataclass(frozen=True)
 class CoaxialSettings(AttemptSettings):
-    """Settings of the expert of coaxial devices.
+    """Settings of the expert for coaxial devices.
 
     Attributes:
-        gentle: slowest withdrawal, as a part of `withdrawal`; the forces that slow an
-            advance slow it.
-        lead_gain: share of the error of the lead corrected in a control step.
-        aside: by how much the route must bend away for a device to be turned, rad.
-        turning: share of the error of direction that a base is turned by in a control
-            step.
+        gentle: slowest withdrawal, as a fraction of `withdrawal`; contact and push
+            force slow a withdrawal as they slow an advance.
+        lead_gain: fraction of the lead error that is corrected in a control step.
+        aside: angle between route and device above which the device is rotated, rad.
+        turning: fraction of the direction error by which a base is rotated in a
+            control step.
     """
 
     retry: RetrySettings = retry.COAXIAL
@@ -76,7 +76,7 @@ class CoaxialSettings(AttemptSettings):
     turning: float = 0.2
 
 
-# Of a route whose first two take-offs are close to each other.
+# For a route whose first two take-offs are close to each other.
 CLOSE = CoaxialSettings(aligned=0.9, misaligned=0.3)
 
 
@@ -86,8 +86,8 @@ class CoaxialPlan(Route):
 
     Attributes:
         ends: the pre-shaped ends of the devices.
-        ostium: arc length of the first take-off, or of one that follows close to it;
-            up to there the catheter follows.
+        ostium: arc length up to which the catheter follows, m: that of the first
+            take-off, or of the last one close to it.
         settings: of the expert on this route.
     """
 
@@ -97,9 +97,9 @@ class CoaxialPlan(Route):
 
     @classmethod
     def for_case(cls, case: Case) -> "CoaxialPlan":
-        """Reads off an anatomy of a task."""
+        """Returns the plan of a case; ValueError if its objective has no route."""
         route = Route.of(case.objective)
-        # To a take-off farther on, a limp wire goes better alone.
+        # A flexible guidewire reaches a later take-off better alone.
         ostium, close = take_offs.followed(route)
         return cls(
             **vars(route),
@@ -109,11 +109,11 @@ class CoaxialPlan(Route):
         )
 
     def fresh(self, shape: tuple[int, ...]) -> State:
-        """Memory (N,) at the start of an episode."""
+        """Returns the state (N,) at the start of an episode."""
         return State.fresh(shape)
 
     def told(self, state: State, action: np.ndarray) -> State:
-        """The memory as it is, which no action is part of."""
+        """Returns the state unchanged: it holds no command."""
         return state
 
     def decide(
@@ -125,7 +125,7 @@ class CoaxialPlan(Route):
         wall_force: forces.WallForce,
         devices: CoaxialReadings,
     ) -> tuple[np.ndarray, State]:
-        """One control step of the expert: a pure function.
+        """Computes one control step of the expert; a pure function.
 
         Args:
             state: after the last step, arrays (N,).
@@ -134,7 +134,8 @@ class CoaxialPlan(Route):
             wall_force: arrays (N,); its `mean_max` slows the devices down.
 
         Returns:
-            Action (N, 2 K) in [-1, 1] and the new state.
+            Action (N, 2 K) in [-1, 1], translation before rotation for each device,
+            and the new state.
         """
         place, ahead = attempts.aim(self, settings, state, memory, readings.head)
         error, away = _directions(self, readings, devices, place, ahead)
@@ -167,18 +168,19 @@ def _led(
     speed: np.ndarray,
     deep: np.ndarray,
 ) -> np.ndarray:
-    """Translations (N, K) at the leads; a leading wire deep in a branch goes alone.
+    """Returns the translations (N, K) that keep the leads.
 
-    The fastest device moves at `speed` (N,). The leads come about as others are slower
-    or withdrawn, so that none is pushed against a force that slows the first, nor at
-    all in a withdrawal.
+    The fastest device moves at `speed` (N,). The leads result from slower or withdrawn
+    devices, so no device is pushed against a force that slows the fastest, nor pushed
+    in a withdrawal. A positive lead is at least `deep` (N,), m, so a guidewire enters a
+    branch alone.
     """
     lead = retry.lead(settings.retry, memory)
     lead = np.where(lead > 0.0, np.maximum(lead, deep), lead)[:, None]
     wanted = insertion[:, :1] - lead * np.arange(insertion.shape[1])
     moves = speed[:, None] + settings.lead_gain * (wanted - insertion) / _MOVE
     moves -= moves.max(axis=1, keepdims=True) - speed[:, None]
-    # While one goes on, the other waits for it; a wire that is to be behind comes back.
+    # In an advance the others wait; a guidewire with a negative lead is withdrawn.
     back, retracting = 0.5 * settings.withdrawal, memory.retracting[:, None]
     least = np.where(retracting, speed[:, None] - back, np.zeros(moves.shape))
     least[:, :1] -= np.where(~retracting & (lead < 0.0), back, 0.0)
@@ -192,7 +194,10 @@ def _directions(
     place: Place,
     ahead: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (N, K) of the ends to the route, and its bends (N, K) away, rad."""
+    """Returns rotation and angle (N, K) from each end to the route, rad.
+
+    The rotation is about the axis of the device, the angle is to that axis.
+    """
     behind = coaxial_ends.gaps(devices.insertion)
     targets = plan.at(place.arc_length[:, None] - behind + ahead[:, None])
     ways = plan.ends.directions(readings, devices.insertion, targets)

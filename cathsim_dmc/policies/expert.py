@@ -1,7 +1,8 @@
 """A scripted expert that steers along the centreline to the goal.
 
-Its success shows that a task can be solved, and is compared with that of trained
-agents. `pursuit` has its decisions, `coaxial_pursuit` those for coaxial devices.
+Its success shows that a task can be solved, and is the reference for trained agents.
+`pursuit` computes the actions for a steerable device, `coaxial_pursuit` those for
+coaxial devices.
 """
 
 import dataclasses
@@ -22,14 +23,14 @@ from cathsim_dmc.tasks.route import locate
 
 
 class _Plans:
-    """What is known of the anatomies of N simulations."""
+    """Plans for the anatomies of N simulations, made when first needed."""
 
     def __init__(self, view: View):
         self.view = view
         self._plans: dict[Case, Plan | CoaxialPlan] = {}
 
     def chosen(self) -> Iterator[tuple[Any, np.ndarray, tuple[Any, ...]]]:
-        """Plans, the numbers (K,) of their simulations, and what is read of these."""
+        """Yields each plan, the indices (K,) of its simulations and their readings."""
         rollout = self.view.rollout
         cases = [rollout.case(i) for i in range(self.view.num_simulations)]
         state = rollout.resting, rollout.wall_force, rollout.devices
@@ -50,7 +51,7 @@ class ExpertPolicy(Policy):
     """The expert as a policy; it reads the simulations, not the observation.
 
     Attributes:
-        state: What is remembered of the simulations, arrays (N, ...).
+        state: State of the expert in the simulations, arrays (N, ...).
     """
 
     name = "expert"
@@ -63,7 +64,7 @@ class ExpertPolicy(Policy):
         self._plans: _Plans | None = None
 
     def reset(self, view: View, which: np.ndarray) -> None:
-        """Forget simulations that begin an episode; ValueError if it cannot steer."""
+        """Resets the state of simulations; ValueError if a device cannot be steered."""
         begins = self._plans is None or self._plans.view is not view
         if self._plans is None or begins:
             self._plans = _Plans(view)
@@ -73,7 +74,7 @@ class ExpertPolicy(Policy):
         self.state = merged(old, part(fresh, which), which)
 
     def act(self, observation: Any) -> np.ndarray:
-        """Actions (N, A) for the state of the devices."""
+        """Returns the actions (N, A) in [-1, 1]; the observation is not used."""
         if self._plans is None:
             raise RuntimeError("the expert must be reset before it acts")
         view = self._plans.view
@@ -86,28 +87,28 @@ class ExpertPolicy(Policy):
         return action
 
     def follow(self, action: np.ndarray) -> None:
-        """Replace the last actions by those carried out, (N, A) in [-1, 1]."""
+        """Replaces the last actions by the applied ones, (N, A) in [-1, 1]."""
         self.state = self._plan.told(self.state, action)
 
 
 class Teacher:
     """The expert as a teacher: its action in states that another policy reaches.
 
-    The expert remembers its commands to a steerable tip, to which every correction
-    adds; the teacher takes the action that was carried out for its own. Where the
-    learner observes the memory of the attempts, the teacher decides by it. Otherwise it
-    judges every state by itself: it withdraws outside the tube of the route and
-    advances inside it, and coaxial devices keep one lead and one look-ahead. All
-    follows from the observation if that has the last action.
+    Every correction adds to the last command of a steerable tip, so the teacher takes
+    the applied action as its last command. If the learner observes the memory of the
+    attempts, the teacher decides by that memory. Otherwise it decides by the present
+    state alone: it withdraws outside the tube of the route and advances inside it, and
+    coaxial devices keep one lead and one look-ahead. Its action then depends only on
+    the observation, if that includes the last action.
     """
 
     def __init__(self, view: View, lead: float = 0.02):
-        """Looks at simulations; `reset` comes before the first question.
+        """Takes a view of simulations; call `reset` before the first `act`.
 
         Args:
-            lead: of a guidewire ahead of the catheter around it where the learner does
+            lead: lead of a guidewire over the catheter around it if the learner does
                 not observe the memory, m. With 0.02 it reaches the left common carotid
-                of Type I without retries; the brachiocephalic artery of Type II takes
+                of Type I without retries; the brachiocephalic artery of Type II needs
                 -0.02, the catheter first.
         """
         self._plans = _Plans(view)
@@ -119,21 +120,21 @@ class Teacher:
         self._one_lead = CoaxialSettings(retry=one)
 
     def reset(self, which: np.ndarray) -> None:
-        """Forgets the simulations, (N,) bool, that begin a new episode."""
+        """Resets the simulations `which`, (N,) bool, that begin a new episode."""
         self._last[:, which] = np.nan
 
     def act(self, last_action: np.ndarray) -> np.ndarray:
-        """The expert's action in every state; to be asked once in a control step.
+        """Returns the expert's actions; call it once per control step.
 
         Args:
-            last_action: (N, A) in [-1, 1], carried out in the control step before;
-                zeros at the start of an episode.
+            last_action: (N, A) in [-1, 1], applied in the control step before; zeros at
+                the start of an episode.
 
         Returns:
             (N, A) in [-1, 1].
 
         Raises:
-            ValueError: the task's device can neither be steered nor turned.
+            ValueError: the task's single device has no motors in its tip.
         """
         action = np.empty(last_action.shape)
         remembers = self._plans.view.rollout.progress.shown
@@ -157,7 +158,7 @@ class Teacher:
 def _of_the_moment(
     plan: Plan | CoaxialPlan, settings: AttemptSettings, readings: Readings
 ) -> Memory:
-    """A memory that follows from the present state alone."""
+    """Returns a memory of the attempts derived from the present state alone."""
     place = locate(plan, readings.head)
     memory = Memory.at(place, readings.insertion)
     outside = place.excess > settings.retry.tolerance

@@ -1,4 +1,4 @@
-"""Base class of all policies, and what they may see of the simulations."""
+"""Base class of all policies, and their view of the simulations."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -21,7 +21,7 @@ class View:
     """
 
     def __init__(self, simulations: BatchSimulation | composer.Environment):
-        """Takes simulations; they need no episode yet."""
+        """Takes simulations, which need not have begun an episode."""
         batched = isinstance(simulations, BatchSimulation)
         self.task = simulations.task
         self.num_simulations = simulations.num_simulations if batched else 1
@@ -30,7 +30,7 @@ class View:
 
     @property
     def rollout(self) -> Rollout:
-        """What is measured of them; arrays (N, ...), see `tasks.rollout.Rollout`."""
+        """Measurements of the simulations, arrays (N, ...), see `rollout.Rollout`."""
         return self._stepped.rollout
 
 
@@ -56,15 +56,16 @@ class Policy:
         """Begin new episodes; called after the simulations were reset.
 
         Args:
-            view: The simulations; the same one until all of them begin anew.
+            view: The simulations; the same object until all begin a new episode.
             which: (N,) bool, the simulations that begin a new episode.
         """
 
     def among(self, first: int, count: int) -> "Policy":
-        """The policy for some of the episodes that are evaluated together.
+        """Returns the policy for a part of the episodes of an evaluation.
 
-        It acts as this one does in all of them, bit for bit, so that they may be played
-        apart. This one itself, if the action of a simulation depends on nothing else.
+        Its actions equal those in the whole evaluation bit for bit, so that parts may
+        be played separately. By default it is the policy itself, which holds if the
+        action of a simulation does not depend on the others.
 
         Args:
             first: Number of the first of these episodes.
@@ -89,13 +90,13 @@ class Policy:
 def in_environment(
     policy: Policy, environment: composer.Environment
 ) -> Callable[[dm_env.TimeStep], np.ndarray]:
-    """A policy as a function from a composer environment's timestep to its action."""
+    """Returns a function from a composer environment's time step to an action (A,)."""
     view = View(environment)
 
     def act(timestep: dm_env.TimeStep) -> np.ndarray:
         if timestep.first():
             policy.reset(view, np.ones(1, dtype=bool))
-        # As TorchRL rounds them.
+        # Rounded to single precision, as TorchRL environments do.
         action = np.asarray(policy.act(timestep.observation), dtype=np.float32)[0]
         return action.astype(np.float64)
 

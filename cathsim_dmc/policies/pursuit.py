@@ -1,20 +1,19 @@
 """Pursuit of a route by a steerable tip: the expert's decisions as pure functions.
 
-Everything is a function of arrays with leading batch axes, written `...`: one
-simulation, or many side by side.
+Arrays have leading batch axes, written `...`: one simulation, or many side by side.
 
-**Steering.** The head pursues a point of the route some way ahead of it. The rotation
-that would turn the head towards that point, a vector in the world, has components
-along the two hinges of every joint of the tip: what each hinge would have to bend. A
-positive `bend_x` turns the distal part from +z towards -y of its link, a positive
-`bend_y` from +z towards +x (right-hand rule). Every step adds a fraction of these to
-the motors, most to the distal joints. As the device advances, the command of a joint
-moves to its proximal neighbour, and back as the device is withdrawn (follow the
-leader): the tip keeps the shape of its path.
+**Steering.** The head pursues the point of the route at the look-ahead. The rotation
+vector that turns the head towards this point, in the world frame, has a component along
+each of the two hinges of every tip joint: the bend that this hinge lacks. A positive
+`bend_x` turns the distal part from +z towards -y of its link, a positive `bend_y` from
++z towards +x (right-hand rule). Every control step adds a fraction of these bends to
+the motor commands, most to the distal joints. As the device advances, the command of a
+joint moves to its proximal neighbour, and back as the device is withdrawn (follow the
+leader), so the tip keeps the shape of its path.
 
-**Retries** (`tasks.retry`) have another look-ahead each time, and every other time no
-jumps of the head's place on the route. Before a withdrawal the tip is straightened: a
-bent one is caught at an ostium and snaps out of it.
+**Retries** (`tasks.retry`) change the look-ahead. In every other attempt the head's
+place on the route does not jump. Before a withdrawal the tip is straightened: a bent
+tip is caught at an ostium and snaps out of it.
 """
 
 import dataclasses
@@ -35,17 +34,17 @@ from cathsim_dmc.tasks.route import Route
 
 @dataclasses.dataclass(frozen=True)
 class Settings(AttemptSettings):
-    """Settings of the expert of a steerable device.
+    """Settings of the expert for a steerable device.
 
     None of the values is critical. The published tasks were solved without a retry
     with 0.5 to 1.6 times the gain or the speed, with 0.75 to 1.4 times the look-ahead,
     and with shares from 0.4 to 0.85.
 
     Attributes:
-        gain: share of the error of direction corrected in a control step. The drives
-            and the damping of the tip answer within some 0.25 s, six steps; a gain well
-            above 1/6 overshoots.
-        share: of a joint's part in steering to that of its distal neighbour.
+        gain: fraction of the direction error corrected in a control step. The drives
+            and the damping of the tip respond within about 0.25 s, six steps; a gain
+            well above 1/6 overshoots.
+        share: ratio of a joint's correction to that of its distal neighbour.
         max_bend_rate: largest correction of one hinge in a control step, rad.
     """
 
@@ -61,10 +60,10 @@ class Plan(Route):
     Attributes:
         hinges: column in `Readings.joint_positions` and axis (0, 1, 2 for x, y, z) of
             every hinge of the chain, from proximal to distal.
-        tip: (M, 2) int, numbers among `hinges` of the x and y hinges of the tip motors.
-        steering_angle: by which a motor bends its free joint at most, rad.
-        link_length: of the tip, m.
-        num_actions: A.
+        tip: (M, 2) int, indices in `hinges` of the x and y hinges of the tip motors.
+        steering_angle: largest bend of an unloaded joint by its motor, rad.
+        link_length: length of the most distal link, m.
+        num_actions: number A of entries of an action.
     """
 
     hinges: tuple[tuple[int, int], ...]
@@ -76,7 +75,7 @@ class Plan(Route):
 
     @classmethod
     def for_case(cls, case: Case) -> "Plan":
-        """Reads off an anatomy of a task; ValueError if the tip has no motors."""
+        """Returns the plan of a case; ValueError if the tip has no motors."""
         catheter = case.scene.catheter
         if not catheter.device.steerable:
             steerable = [d.name for d in devices.DEVICES.values() if d.steerable]
@@ -99,11 +98,11 @@ class Plan(Route):
         )
 
     def fresh(self, shape: tuple[int, ...]) -> State:
-        """Memory (...) at the start of an episode."""
+        """Returns the state (...) at the start of an episode."""
         return State.fresh(shape, len(self.tip))
 
     def told(self, state: State, action: np.ndarray) -> State:
-        """State with the last command replaced by (..., A)."""
+        """Returns the state with its command replaced by that of an action (..., A)."""
         bend = action[..., : self.tip.size] * self.steering_angle
         return state._replace(bend=bend.reshape(state.bend.shape))
 
@@ -116,14 +115,14 @@ class Plan(Route):
         wall_force: forces.WallForce,
         devices: CoaxialReadings | None = None,
     ) -> tuple[np.ndarray, State]:
-        """One control step of the expert: a pure function.
+        """Computes one control step of the expert; a pure function.
 
         Args:
             state: after the last step, arrays (...).
             memory: of the attempts, arrays (...).
             readings: of the devices, arrays (...).
             wall_force: arrays (...); its `mean_max` slows the device down.
-            devices: of coaxial devices; not looked at.
+            devices: of coaxial devices; not used.
 
         Returns:
             Action (..., A) in [-1, 1] and the new state.
@@ -149,9 +148,9 @@ class Plan(Route):
 
 
 def tip_frames(plan: Plan, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
-    """Hinge axes of the tip and direction of the head, world frame.
+    """Returns the hinge axes of the tip and the direction of the head, world frame.
 
-    They are found from the head backwards, so they hold for any roll of the device.
+    They are computed from the head backwards, so they hold for any roll of the device.
 
     Returns:
         Axes (..., M, 2, 3) of the x and y hinges of the tip and direction (..., 3).
@@ -167,7 +166,12 @@ def tip_frames(plan: Plan, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rotation_to(direction: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Rotation vector (..., 3), rad, from a direction to a way; cosine (...)."""
+    """Returns the rotation vector (..., 3), rad, from `direction` to `way`; its cosine.
+
+    Args:
+        direction: (..., 3), of length 1.
+        way: (..., 3), of any length.
+    """
     way = way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
     cosine = np.einsum("...i,...i->...", direction, way)
     axis = np.cross(direction, way)
@@ -177,7 +181,7 @@ def _rotation_to(direction: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, ..
 
 
 def _follow_the_leader(plan: Plan, state: State, insertion: np.ndarray) -> np.ndarray:
-    """Bends (..., M, 2) moved along the tip by as much as the device moved."""
+    """Returns the bends (..., M, 2), rad, shifted by the advance of the device."""
     moved = np.where(np.isnan(state.insertion), 0.0, insertion - state.insertion)
     part = np.clip(moved / plan.link_length, -1.0, 1.0)[..., None, None]
     bend = state.bend
@@ -188,7 +192,7 @@ def _follow_the_leader(plan: Plan, state: State, insertion: np.ndarray) -> np.nd
 
 
 def _correction(settings: Settings, axes: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Change (..., M, 2) of the bends that turns the head, rad."""
+    """Returns the change (..., M, 2) of the bends, rad, that turns the head."""
     weight = settings.share ** np.arange(axes.shape[-3])[::-1]
     weight = settings.gain * weight / weight.sum()
     needed = np.einsum("...jai,...i->...ja", axes, turn)

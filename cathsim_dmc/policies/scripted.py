@@ -1,4 +1,4 @@
-"""Policies that ignore the observation: baselines of agents, loads of the simulator."""
+"""Policies that ignore the observation: baselines, stress tests of the simulator."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from cathsim_dmc.policies.policy import Policy, View
 
 
 class _Scripted(Policy):
-    """Repeats an action; what simulation i draws is from a generator of seed + i."""
+    """Repeats an action; simulation i draws from a generator with the seed + i."""
 
     def __init__(self, seed: int = 0):
         self._seed = seed
@@ -16,7 +16,7 @@ class _Scripted(Policy):
         self._action = np.zeros((0, 0))
 
     def reset(self, view: View, which: np.ndarray) -> None:
-        """Make the generators, and the actions (N, A), with the first episodes."""
+        """Make the generators and the actions (N, A) at the first reset."""
         shape = view.num_simulations, view.num_actions
         if self._action.shape != shape:
             seeds = range(self._seed, self._seed + shape[0])
@@ -24,7 +24,7 @@ class _Scripted(Policy):
             self._action = np.zeros(shape)
 
     def among(self, first: int, count: int) -> Policy:
-        """Another one, whose generators are those of its simulations."""
+        """Return a copy whose generators have the seeds of its simulations."""
         return type(self)(self._seed + first)
 
     def act(self, observation: Any) -> np.ndarray:
@@ -43,7 +43,7 @@ class Random(_Scripted):
 
 
 class RandomCurl(_Scripted):
-    """Full push, the tip bent all the way in one direction drawn for each episode.
+    """Full push with a constant bend of the tip, drawn for each episode.
 
     Every x hinge of the tip gets the same command and every y hinge the same: a point
     drawn uniformly by angle and by distance in the unit circle.
@@ -71,7 +71,7 @@ class _Constant(_Scripted):
     push = bend = 0.0
 
     def reset(self, view: View, which: np.ndarray) -> None:
-        """Look up which entries of an action push, and bend the tip about x."""
+        """Set the entries of the action that push and that bend the tip about x."""
         super().reset(view, which)
         catheter = view.task.scene.catheter
         self._action[:, catheter.translations] = self.push

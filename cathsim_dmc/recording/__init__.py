@@ -1,1 +1,1 @@
-"""Episodes: recorded, kept, written as Rerun files, looked at."""
+"""Recording of episodes, and their files: npz, Rerun, Minari, image data sets."""

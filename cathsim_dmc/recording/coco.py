@@ -1,4 +1,4 @@
-"""Labels of a file of fluoroscopy in the format of COCO, masks run-length encoded."""
+"""Labels of fluoroscopy in the COCO format, with run-length encoded masks."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ _SHIFTS = 5 * np.arange(7)  # enough for masks of 2**30 pixels
 
 
 def described(columns: np.ndarray, bit: int = 1) -> dict[str, Any]:
-    """The pixels of a mask that have a bit, as COCO describes an object.
+    """Returns the COCO description of the pixels of a mask in which a bit is set.
 
-    Run lengths begin with that of zeros; from the fourth on they are less the one two
-    before. Each is written in groups of five bits, least first, with a sign.
+    Run lengths begin with a run of zeros. From the fourth on, each is stored as its
+    difference from the run two before. A number is a sequence of five-bit groups, least
+    significant first, with a sign.
 
     Args:
         columns: (columns, rows) uint8, the transposed mask.
 
     Returns:
-        Segmentation in compressed run lengths, which `pycocotools.mask.decode` reads;
-        area; bounding box.
+        "segmentation" in compressed run lengths, which `pycocotools.mask.decode` reads;
+        "area", px; "bbox", (column, row, width, height), px; "iscrowd".
     """
     values = (columns & bit).astype(bool)
     flat = values.ravel()
@@ -59,12 +60,15 @@ def described(columns: np.ndarray, bit: int = 1) -> dict[str, Any]:
 
 
 def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[Any]]:
-    """Images and annotations of one file of sequences.
+    """Returns the images and annotations of one file of sequences.
 
     Args:
-        path: Of the HDF5 file, see `recording.sequences`.
-        number: Of the file in its split; ids are unique with it.
+        path: Path of the HDF5 file, see `recording.sequences`.
+        number: Number of the file in its split; it makes the ids unique.
         pictures: Whether to write the images as PNG, into a folder beside the file.
+
+    Raises:
+        ValueError: the file is damaged.
     """
     extras.require("gym", "h5py")
     import h5py

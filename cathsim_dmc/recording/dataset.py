@@ -21,9 +21,9 @@ from cathsim_dmc.files import (
 from cathsim_dmc.recording.episode import SUFFIX, Episode
 from cathsim_dmc.tasks.config import NavigationConfig
 
-# Options of what is observed, which the record does not hold.
+# Options of the observation, which a recorded episode does not hold.
 _OBSERVED = ("observation", "fluoroscopy", "endoluminal_size", "cameras")
-_SAME_REWARD = 1e-9  # of an episode that is done again: another machine rounds apart
+_SAME_REWARD = 1e-9  # tolerance of a repeated reward: machines round differently
 
 
 def write(
@@ -47,7 +47,7 @@ def write(
         buffers: `minari.data_collector.EpisodeBuffer` of each episode.
         env_spec: Spec of the Gymnasium environment, see
             `simulation.gymnasium.env_spec`.
-        algorithm: What acted, for the metadata.
+        algorithm: Name of the policy, for the metadata.
 
     Returns:
         The directory.
@@ -82,8 +82,8 @@ def write(
 
 
 def _check_space(path: Path, buffers: Sequence[Any]) -> None:
-    """Raises OSError unless the disk, or a quota, holds the arrays of episodes."""
-    # Where HDF5 meets a full disk, it ends the process with a segmentation fault.
+    """Raises OSError unless disk and quota have room for the arrays of episodes."""
+    # On a full disk HDF5 ends the process with a segmentation fault.
     size = 0
     for one in buffers:
         arrays = *one.observations.values(), *one.infos.values(), one.actions
@@ -97,13 +97,13 @@ class DatasetError(ValueError):
 
 
 def chosen(options: Mapping[str, Any], name: str) -> Any:
-    """An option of a task; None where it is left out or is the default."""
+    """Returns an option of a task; None if it is missing or has its default."""
     value = options.get(name)
     return None if value == getattr(NavigationConfig, name, None) else value
 
 
 def metadata_of(path: str | os.PathLike[str]) -> Path:
-    """The file that tells what is in a dataset; DatasetError if there is none."""
+    """Returns the path of a dataset's metadata.json; DatasetError if there is none."""
     data = next(Path(path).glob("data"), Path(path)) / "metadata.json"
     if not data.is_file():
         if Path(path).suffix == SUFFIX:
@@ -119,7 +119,7 @@ def metadata_of(path: str | os.PathLike[str]) -> Path:
 
 
 def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]:
-    """Episodes of a dataset, one after the other, as `minari.EpisodeData`.
+    """Yields the episodes of a dataset as `minari.EpisodeData`.
 
     Args:
         path: Directory of the dataset, or the directory `data` in it.
@@ -134,7 +134,7 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
 
     data = metadata_of(path)
     try:
-        # Without its spaces Minari would make the environment that the file names.
+        # Without the spaces Minari would make the environment that the file names.
         named = json.loads(data.read_text())
         if not {"observation_space", "action_space"} <= set(named):
             raise ValueError("metadata.json lacks the spaces")
@@ -147,7 +147,7 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
         for number, episode in enumerate(minari.MinariDataset(data.parent)):
             _check_episode(episode, number)
             yield episode
-    # What a damaged file leads to.
+    # Errors that a damaged file causes.
     except (AssertionError, AttributeError, LookupError, OSError, RuntimeError,
             TypeError, ValueError) as error:  # fmt: skip
         line = " ".join(str(error).split()) or type(error).__name__
@@ -155,7 +155,7 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
 
 
 def check_stored(path: Path) -> None:
-    """Raises ValueError if an HDF5 file unpacks to far more, or names other files."""
+    """Raises ValueError if an HDF5 file unpacks to too much or names other files."""
     import h5py
 
     links: list[tuple[str, Any]] = []
@@ -174,7 +174,7 @@ def check_stored(path: Path) -> None:
 
 
 def _check_episode(episode: Any, number: int) -> None:
-    """Raises ValueError unless all columns are as long as they must be, and finite."""
+    """Raises ValueError unless all columns are finite and of the right length."""
     steps, seen = len(episode.actions), episode.observations
     columns = {name: (seen[name], steps + 1) for name in seen}
     for name in ("actions", "rewards", "terminations", "truncations"):
@@ -200,13 +200,14 @@ def export(
 ) -> Path:
     """Repeats recorded episodes and writes them as a dataset, see `write`.
 
-    Every step is done again from the episode's seed and compared with the record.
+    Each episode is simulated again from its seed; its rewards must equal the recorded
+    ones.
 
     Args:
-        episodes: Of one task with the same options, seeded and with steps.
+        episodes: Episodes of one task with equal options, with a seed and with steps.
         path: Directory of the dataset, which must not exist.
         observation: Names of observations; None for those of the record.
-        task_kwargs: Further options of what is observed, such as `fluoroscopy`.
+        task_kwargs: Further options of the observation, such as `fluoroscopy`.
 
     Returns:
         The directory.
@@ -244,14 +245,14 @@ def export(
 
 
 def recordings_in(path: str | os.PathLike[str]) -> list[Path]:
-    """Files of episodes in a directory, as `cathsim play --out` writes them."""
+    """Returns the .npz files of a directory, as `cathsim play --out` writes them."""
     return sorted(Path(path).glob(f"*{SUFFIX}"))
 
 
 def repeat_episodes(
     path: str | os.PathLike[str], observation: str | Sequence[str], **options: Any
 ) -> Iterator[Any]:
-    """Repeats the episodes of a directory, as `read_episodes` reads those of a dataset.
+    """Simulates recorded episodes again; yields them as `read_episodes` does.
 
     Args:
         path: Directory of .npz files.
@@ -282,7 +283,11 @@ def repeat_episodes(
 
 
 def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:
-    """Task and options that all episodes share, with what the first one observed."""
+    """Returns the common task and options, with the observation of the first episode.
+
+    Raises:
+        ValueError: the episodes differ in these, or one lacks a seed or steps.
+    """
     given = [dict(one.meta.get("task_kwargs", {}), random=None) for one in episodes]
     kinds = [{k: v for k, v in o.items() if k not in _OBSERVED} for o in given]
     tasks = sorted({episode.task for episode in episodes})
@@ -301,7 +306,7 @@ def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:
 
 
 def _repeated(environment: Any, episode: Episode, kind: np.dtype) -> dict[str, Any]:
-    """Columns of an episode that is done again; ValueError if it differs."""
+    """Simulates an episode again; returns its columns, or ValueError if it differs."""
     name = f"episode with seed {episode.seed}"
     actions = episode.action.astype(kind)
 
@@ -343,7 +348,7 @@ def _repeated(environment: Any, episode: Episode, kind: np.dtype) -> dict[str, A
         "actions": actions,
         "rewards": episode.reward.tolist(),
         "terminations": terminated.tolist(),
-        # Also where the operator has stopped.
+        # An episode that the operator has stopped is truncated too.
         "truncations": (truncated & ~terminated).tolist(),
         "infos": infos,
     }

@@ -63,7 +63,7 @@ class Episode:
         wall_force_sum: (T,) sum of contact force magnitudes over the wall at the end
             of the control step; ``meta`` has means and peaks within it.
         wall_force_max: (T,) largest single contact force magnitude, likewise.
-        push_force: (T,) force at the base of the device, signed as the task says.
+        push_force: (T,) force of the base on the device, positive forward.
         contact_step: (K,) int64, index of the step, non-decreasing.
         contact_position: (K, 3).
         contact_force: (K, 3) force on the wall by the device.

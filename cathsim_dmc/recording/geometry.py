@@ -1,4 +1,4 @@
-"""Forces in drawings: colours, scales and text; places on a line."""
+"""Forces in drawings: colours, scales and text; points of a polyline."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ _FORCE_COLOURS = np.array(
 def force_colours(
     magnitude: np.ndarray, largest: float = FORCE_COLOUR_MAX
 ) -> np.ndarray:
-    """Return RGB colours (..., 3) uint8 of forces (...,), N; up to ``largest``."""
+    """Return RGB colours (..., 3) uint8 of forces (...,), N, from 0 to ``largest``."""
     stops = np.linspace(0.0, largest, len(_FORCE_COLOURS))
     mixed = interpolate(magnitude, stops, _FORCE_COLOURS)
     return np.round(mixed).astype(np.uint8)
@@ -34,7 +34,7 @@ def force_scale(magnitude: np.ndarray) -> float:
 
 
 def along(points: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """Return places (m, 3) on a line (n, 3) at ways (m,) from its first point."""
+    """Return points (m, 3) of a polyline (n, 3) at arc lengths (m,), metres."""
     return interpolate(way, arc_lengths(points), points)
 
 

@@ -5,8 +5,8 @@
     OUT/{train,val,test}/NAME.h5       sequences in one anatomy, see `sequences`
     OUT/annotations/{…}.json           labels in the format of COCO
 
-An anatomy is there whole or not at all; a run that was interrupted goes on with those
-that are missing. The same options give the same files, byte by byte.
+The file of an anatomy is complete or missing; an interrupted run continues with the
+missing ones. The same options give the same files, byte by byte.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from cathsim_dmc import __version__, bounds, cluster, extras, files
 from cathsim_dmc.recording import coco, sequences
 from cathsim_dmc.recording.sequences import KEYPOINTS, KITS, ImageSetOptions
 
-SPLITS = {"train": "train", "val": "train", "test": "test"}  # and their sets of arches
-_TRIES = 8  # arches that are tried in place of those that no device enters
+SPLITS = {"train": "train", "val": "train", "test": "test"}  # split: set of arches
+_TRIES = 8  # candidates that are tried in turn until a device fits
 _FORMAT = "cathsim-image-set"
 Labels = dict[str, list[Any]]  # as `coco.labels` returns them
 
@@ -62,7 +62,7 @@ def write(
     say: Callable[[str], None] = lambda text: None,
     on_cluster: bool = False,
 ) -> dict[str, Any]:
-    """Writes a data set, or what an interrupted run has left out of it.
+    """Writes a data set, or the missing part of an interrupted one.
 
     Args:
         out: folder, which must not exist unless a run with these options has begun it.
@@ -70,21 +70,21 @@ def write(
             script must guard its main part (`if __name__ == "__main__"`).
         say: receives a line for each anatomy.
         on_cluster: whether the machines of a Ray cluster simulate, a processor for each
-            anatomy; the files come here. They are the same, byte by byte, on
+            anatomy; the files are copied to `out`. They are the same, byte by byte, on
             processors of one kind.
 
     Returns:
-        "path" of the data set; images of each split ("frames"), with those of earlier
-        runs; of this run "new" images, wall time ("seconds"), "processor" time of all
-        processes of this machine, s, and the new images in a second of either,
-        "frames_per_second" and "frames_per_processor_second".
+        "path" of the data set; "frames", number of images of each split, with those of
+        earlier runs; of this run "new", number of images, "seconds", wall time, and
+        "processor", time of all processes of this machine, s; "frames_per_second" and
+        "frames_per_processor_second", new images per second of either time.
 
     Raises:
         ValueError: if an option is wrong, or the folder is that of other options.
         OSError: if the directory around `out` does not exist, or `out` is read-only.
         ModuleNotFoundError: if h5py is not installed.
     """
-    extras.require("gym", "h5py")  # now: hours later it would be missed
+    extras.require("gym", "h5py")  # before hours of simulation
 
     out, options = Path(out), options or ImageSetOptions()
     count = os.cpu_count() or 1
@@ -113,8 +113,8 @@ def write(
 
 
 def _others(begun: str, asked: str) -> str:
-    """Values of a dataset.json that another one has otherwise, in brackets."""
-    with contextlib.suppress(ValueError, TypeError, LookupError):  # damaged by hand
+    """Returns the values of a dataset.json that differ from another, in brackets."""
+    with contextlib.suppress(ValueError, TypeError, LookupError):  # edited by hand
         there, here = ({**v, **v["options"]} for v in map(json.loads, (begun, asked)))
         names = [n for n in here if n != "options" and there[n] != here[n]]
         return f" ({', '.join(f'{name} {there[name]}' for name in names)})"
@@ -122,7 +122,7 @@ def _others(begun: str, asked: str) -> str:
 
 
 def _begin(out: Path, options: ImageSetOptions) -> None:
-    """Makes the folders; refuses one with anything else in it."""
+    """Makes the folders; ValueError if `out` has other content or other options."""
     about = {"format": _FORMAT, "version": __version__, "options": vars(options)}
     text = json.dumps(about, indent=2) + "\n"
     files.require_folder(out if out.exists() else out.parent)
@@ -135,7 +135,7 @@ def _begin(out: Path, options: ImageSetOptions) -> None:
             f"version{_others(begun, text)}; give those, or another folder"
         )
     files.require_folder(out, make=True)
-    # First: an interrupted run could not go on in a folder without it.
+    # Written first: an interrupted run can only continue in a folder with this file.
     files.write_text(described, text)
     for name in ("annotations", *SPLITS):
         files.require_folder(out / name, make=True)
@@ -148,7 +148,7 @@ def _shards(out: Path, options: ImageSetOptions) -> list[_Shard]:
     for (split, name), count in zip(SPLITS.items(), options.anatomies, strict=True):
         random, size = np.random.RandomState(options.seed), len(arch.arch_set(name))
         order = random.permutation(size)
-        # A place of its own for each of its candidates, whatever becomes of others.
+        # In a large set, candidates lie far apart, so that anatomies share none.
         ahead = np.arange(_TRIES) * (100 if size >= 100 * _TRIES else 0)
         for number in range(count):
             chosen = tuple(order[(taken[name] + ahead) % size].tolist())
@@ -158,7 +158,7 @@ def _shards(out: Path, options: ImageSetOptions) -> list[_Shard]:
 
 
 def _write_shard(shard: _Shard) -> tuple[int, str, Labels]:
-    """Writes one anatomy unless it is there: new frames, a line about it, labels."""
+    """Writes one anatomy if missing; returns new frames, a line of text, labels."""
     rows, line = (0, "") if shard.path.exists() else _simulate_shard(shard)
     return rows, line, coco.labels(shard.path, shard.number, shard.options.pictures)
 
@@ -201,7 +201,7 @@ def _over(work: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterab
 
 
 def _simulate_on_cluster(shards: list[_Shard], say: Callable[[str], None]) -> int:
-    """Has a cluster simulate the anatomies that are missing; number of new frames."""
+    """Simulates the missing anatomies on a cluster; returns the count of new frames."""
     missing, new = [shard for shard in shards if not shard.path.exists()], 0
     for number, (rows, line, data) in cluster.over(_simulated, missing):
         files.write_bytes(missing[number].path, data)
@@ -211,7 +211,7 @@ def _simulate_on_cluster(shards: list[_Shard], say: Callable[[str], None]) -> in
 
 
 def _simulated(shard: _Shard) -> tuple[int, str, bytes]:
-    """Simulates one anatomy: frames, a line about it, its file."""
+    """Simulates one anatomy; returns frames, a line of text, the bytes of its file."""
     with tempfile.TemporaryDirectory() as folder:
         own = dataclasses.replace(shard, folder=Path(folder))
         own.path.parent.mkdir()
@@ -220,7 +220,7 @@ def _simulated(shard: _Shard) -> tuple[int, str, bytes]:
 
 
 def _label(out: Path, shards: list[_Shard], labels: list[Labels]) -> dict[str, int]:
-    """Writes the labels of each split; the number of its images."""
+    """Writes the labels of each split; returns the numbers of images by split."""
     frames = {}
     for split in SPLITS:
         joined: dict[str, Any] = {

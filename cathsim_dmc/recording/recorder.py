@@ -29,7 +29,7 @@ _TERM = "reward_"  # before the names of reward terms
 
 
 def navigation_of(env: Any) -> Any:
-    """The task of an environment of this package; TypeError for any other."""
+    """Returns the task of an environment of this package; TypeError for any other."""
     task = getattr(env, "task", None)
     if not hasattr(task, "scene") or not hasattr(env, "physics"):
         raise TypeError(
@@ -41,7 +41,7 @@ def navigation_of(env: Any) -> Any:
 
 
 def begun_task_of(env: Any) -> Any:
-    """The task of an environment; RuntimeError if no episode has begun in it."""
+    """Returns the task of an environment; RuntimeError if no episode has begun."""
     task = navigation_of(env)
     if not task.rollout.begun:
         raise RuntimeError(
@@ -59,9 +59,9 @@ class _Rows(collections.defaultdict[str, list]):
 
 
 class EpisodeRecorder:
-    """Runs a policy in an environment and keeps everything that happened.
+    """Runs a policy in a composer environment and records the episode.
 
-    The environment stays usable afterwards; nothing is switched on or changed in it.
+    The recorder changes no setting of the environment, which stays usable afterwards.
     Poses are those the simulator holds after a step: with ``legacy_step=False`` they
     belong to the start of the last physics step, as do the contacts, while ``qpos``
     and ``time`` belong to its end.
@@ -96,8 +96,8 @@ class EpisodeRecorder:
         Args:
             policy: Called with every ``dm_env.TimeStep``, returns the action. It may
                 raise ``StopIteration`` to end the episode as truncated.
-            seed: Seeds the environment's random state before the reset; with None it
-                goes on from where it is and the episode cannot be repeated.
+            seed: Seeds the environment's random state before the reset; with None the
+                random state continues, and the episode cannot be repeated.
             max_steps: Ends the episode as truncated; by default only the environment
                 ends it.
 
@@ -119,8 +119,8 @@ class EpisodeRecorder:
             for action, timestep in itertools.islice(turns, max_steps):
                 termination = self._task.termination
                 end = {"termination": termination, "discount": timestep.discount}
-                # The environment itself ends an episode by diverged physics, discount
-                # 0, or composer's time limit, discount 1; the task never sees that.
+                # The environment itself ends an episode at diverged physics, discount
+                # 0, or composer's time limit, discount 1; the task knows of neither.
                 alone = timestep.last() and termination in (None, "truncated")
                 lost = alone and not timestep.discount
                 if lost or termination == "physics_error":
@@ -135,7 +135,7 @@ class EpisodeRecorder:
         return self._episode(rows, seed, end)
 
     def present(self) -> Episode:
-        """The present state as an episode of one step, whose contacts are present."""
+        """Returns the present state and contacts as an episode of one step."""
         rows = _Rows(list)
         rows.add(**self._state())
         self._add_step(rows, 0, np.zeros(self._env.action_spec().shape), 0.0)
@@ -163,7 +163,7 @@ class EpisodeRecorder:
         }
 
     def _add_step(self, rows: _Rows, step: int, action: Any, reward: float) -> None:
-        """Adds what the step that has just ended has led to."""
+        """Adds state, reward, forces and contacts at the end of a step."""
         task, terms = self._task, self._task.info().items()
         rows.add(**self._state(), action=action, reward=reward)
         rows.add(**{name: float(one) for name, one in task.wall_force.named().items()})
@@ -183,7 +183,7 @@ class EpisodeRecorder:
         shapes = {"action": self._env.action_spec().shape}
         shapes |= {"contact_position": (3,), "contact_force": (3,)}
         for name, shape in shapes.items():
-            arrays[name] = arrays[name].reshape((-1, *shape))  # of no rows, too
+            arrays[name] = arrays[name].reshape((-1, *shape))  # also without rows
         return Episode(self._task_name, seed, meta, **arrays)
 
     def _meta(self, rows: _Rows, end: dict[str, Any]) -> dict[str, Any]:

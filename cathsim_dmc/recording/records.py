@@ -1,4 +1,4 @@
-"""What `meta` of an episode tells of coaxial devices, living vessels and X-rays."""
+"""Coaxial devices, living vessels and X-ray settings in the `meta` of an episode."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -15,7 +15,7 @@ from cathsim_dmc.physics.device_points import device_points
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import along
 
-# Of one device in ``meta['devices']``: series over the states.
+# Series over the states of each device in ``meta['devices']``.
 DEVICE_SERIES = ("insertion", "rotation", "tip_rotation")
 # Figures over the states in ``meta['vessel']``: name, factor and label of a plot.
 VESSEL_SERIES = {
@@ -25,14 +25,14 @@ VESSEL_SERIES = {
     "indentation": (1e3, "indentation, mm"),
     "wall_work": (1e6, "work on the wall, µJ"),
 }
-MESH_EVERY = 4  # states, of which a recording keeps the moved surface
+MESH_EVERY = 4  # states between the surfaces of a moving vessel in a recording
 
 
 @dataclass(frozen=True, eq=False)
 class CoaxialRecord:
     """K devices from the innermost outwards, over T+1 states."""
 
-    names: tuple[str, ...]  # what each device is to an operator
+    names: tuple[str, ...]  # kind of each device, such as "guidewire"
     radii: np.ndarray  # (K,), outer radius, metres
     insertion: np.ndarray  # (T+1, K), of the devices' ends, metres
     rotation: np.ndarray  # (T+1, K), of the rotary units, radians
@@ -52,16 +52,16 @@ class CoaxialRecord:
 
     @property
     def gaps(self) -> np.ndarray:
-        """Way (T+1, K) from the end of each device to that of the chain, metres."""
+        """Distance (T+1, K) from each device's end to the chain's end, metres."""
         return self.insertion.max(axis=1, keepdims=True) - self.insertion
 
     def ends(self, line: np.ndarray) -> np.ndarray:
-        """Ends (T+1, K, 3) of the devices on a chain (T+1, L+1, 3), ``catheter``."""
+        """Returns the devices' ends (T+1, K, 3) on a chain (T+1, L+1, 3), metres."""
         pairs = zip(line, self.gaps, strict=True)
         return np.array([along(points[::-1], gaps) for points, gaps in pairs])
 
     def outermost(self, line: np.ndarray) -> np.ndarray:
-        """Number (T+1, L) of the outermost device in each link's middle; see `ends`."""
+        """Returns the number (T+1, L) of the outermost device at each link's middle."""
         lengths = np.linalg.norm(np.diff(line, axis=1), axis=-1)
         middle = np.cumsum(lengths[:, ::-1], axis=1)[:, ::-1] - lengths / 2
         number = np.broadcast_to(self.gaps.argmin(axis=1)[:, None], middle.shape).copy()
@@ -71,7 +71,7 @@ class CoaxialRecord:
 
 
 def device_meta(chain: Any, rows: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """What ``meta['devices']`` holds, from ``DEVICE_SERIES`` (T+1, K) by name."""
+    """Returns ``meta['devices']`` from the arrays (T+1, K) of ``DEVICE_SERIES``."""
     return [
         {
             "name": name,
@@ -92,7 +92,7 @@ class VesselRecord:
     # (T+1,) by names of `VESSEL_SERIES`; (T+1, 3), world frame, "goal" (m) and
     # "blood_velocity" at the head (m/s); "time" (T+1,) and "parameters" of the motion.
     series: dict[str, np.ndarray]
-    motion: Motion | None  # how it moves; None where it rests
+    motion: Motion | None  # None for a vessel at rest
 
     @classmethod
     def of(cls, episode: Episode) -> "VesselRecord | None":
@@ -104,7 +104,7 @@ class VesselRecord:
         return cls(given, Motion(given["lattice"]) if meta["lattice"] else None)
 
     def surface(self, rest: Surface, state: int) -> Surface:
-        """The surface of the lumen in a state."""
+        """Returns the surface of the lumen in a state, from its surface at rest."""
         if self.motion is None:
             return rest
         time = float(self.series["time"][state])
@@ -112,7 +112,7 @@ class VesselRecord:
 
 
 def vessel_state(task: Any) -> dict[str, Any]:
-    """What a record keeps of the vessel in a state; nothing of one that rests."""
+    """Returns the recorded quantities of a vessel; empty if it and its blood rest."""
     vessel, moving = task.rollout.vessel, task.rollout.moving
     if vessel is None:
         return {}
@@ -126,7 +126,7 @@ def vessel_state(task: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class XRayRecord:
-    """How X-rays show an episode."""
+    """Fluoroscopy of an episode: its options, the machine, the devices."""
 
     options: FluoroscopyOptions  # of the task
     deviation: Deviation  # of the machine in this episode
@@ -134,7 +134,7 @@ class XRayRecord:
 
     @classmethod
     def of(cls, episode: Episode) -> "XRayRecord":
-        """Reads it from an episode; what is not kept is as usual."""
+        """Reads the record of an episode, with defaults for missing values."""
         kept, coaxial = episode.meta.get("x_ray", {}), CoaxialRecord.of(episode)
         radii = episode.radii[:1] if coaxial is None else coaxial.radii
         return cls(
@@ -144,7 +144,7 @@ class XRayRecord:
         )
 
     def shadows(self, episode: Episode, states: slice) -> list[Shadow]:
-        """The devices in some states (T,), from the innermost outwards."""
+        """Returns the shadows of the devices in some states, innermost first."""
         line, coaxial = np.array(episode.catheter[states]), CoaxialRecord.of(episode)
         gaps = np.zeros((len(line), 1)) if coaxial is None else coaxial.gaps[states]
         nodes = arc_lengths(line[0, ::-1])[::-1].copy()
@@ -153,7 +153,7 @@ class XRayRecord:
 
 
 def x_ray_meta(task: Any) -> dict[str, Any]:
-    """What ``meta['x_ray']`` holds, see `XRayRecord`."""
+    """Returns ``meta['x_ray']``, see `XRayRecord`."""
     shadows = [vars(shadow).items() for shadow in task.rollout.shadows]
     return {
         "options": asdict(task.config.fluoroscopy),

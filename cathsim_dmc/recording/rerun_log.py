@@ -31,10 +31,10 @@ _PLANE_NAMES = ("Fluoroscopy, frontal", "Fluoroscopy, second plane")
 # Distance of the eye in extents of the scene: the viewer's vertical field of view
 # is near 45 degrees, which shows 0.83 of the distance.
 _EYE_DISTANCE = 1.35
-# Of the eye from the tip that it follows, and from the robot, m.
+# Offset of the eye from the tip that it follows, and from the robot, m.
 _TIP_OFFSET, _ROBOT_OFFSET = (0.0, -0.075, 0.0), (-0.16, -0.42, 0.2)
 _BACKGROUND = (30, 32, 38)
-# Plots from top to bottom: name, entity, whether there are several lines.
+# Plots from top to bottom: name, entity, whether the legend is shown.
 _PLOTS = (
     ("Reward and its terms", "reward", True),
     ("Distance to goal, mm", "distance_mm", False),
@@ -81,8 +81,8 @@ def write_rrd(
             stream.set_log_time_enabled(False)
             # Not `save`, which hangs on a full disk.
             encoded, log = stream.binary_stream(), Log(stream, episode)
-            # Active at once: a viewer that reads over a network has made itself a
-            # layout by the time that this one arrives.
+            # Active at once: a viewer that reads over a network makes a layout of its
+            # own before this one arrives.
             layout = _layout(log, surface, robot_geoms, planes)
             stream.send_blueprint(layout, make_active=True, make_default=True)
             seed = "unseeded" if episode.seed is None else f"seed {episode.seed}"
@@ -105,7 +105,7 @@ def write_rrd(
 def _layout(
     log: Log, surface: Surface, geoms: Sequence[BodyGeom], planes: int
 ) -> rrb.Blueprint:
-    """The layout: scene left, X-ray and text in the middle, series right."""
+    """Return the layout: scene left, X-ray and text in the middle, series right."""
     episode = log.episode
     low, high = surface.vertices.min(0), surface.vertices.max(0)
     # From the front, as in an antero-posterior projection; y points backwards.
@@ -163,7 +163,7 @@ def _world(
     tracked: str | None = None,
     so_far: Sequence[str] = ("world/heat",),
 ) -> rrb.Spatial3DView:
-    """A view of the world; of the entities `so_far`, where they have been is shown."""
+    """Return a view of the world; the entities `so_far` show their past as well."""
     start = rrb.TimeRangeBoundary.infinite()
     end = rrb.TimeRangeBoundary.cursor_relative()
     ranges = [rrb.VisibleTimeRange(each, start=start, end=end) for each in TIMELINES]
@@ -218,7 +218,7 @@ def _log_series(log: Log) -> None:
     if log.vessel is not None:
         for name, (factor, label) in VESSEL_SERIES.items():
             log.series(f"vessel/{name}", factor * log.vessel.series[name], label)
-    # Of several devices, whose names come first; otherwise of joints of the device.
+    # The prefix, a device or an entity, is dropped where names stay unique without it.
     names = [str(name) for name in meta.get("action_names", ())]
     short = [name.rsplit("/", 1)[-1] for name in names]
     names = short if len(set(short)) == len(names) else names

@@ -15,20 +15,20 @@ from cathsim_dmc.recording.records import MESH_EVERY, CoaxialRecord, VesselRecor
 
 TIMELINES = ("sim_time", "step")
 SHAFT_COLOUR = (215, 228, 255)
-# Of coaxial devices from the innermost outwards, over and over: a wire is teal, the
-# catheter around it looks as a single device does.
+# Coaxial devices from the innermost outwards, repeated: a guidewire is teal, the
+# catheter around it has the colour of a single device.
 DEVICE_COLOURS = np.array([(90, 220, 190), SHAFT_COLOUR, (200, 170, 255)], np.uint8)
-# Rows of a series: one for each state, and of what is measured.
+# Rows of a series: all states; the states after a step, at which forces are measured.
 EVERY, MEASURED = slice(None), slice(1, None)
 VESSEL_COLOUR = (225, 140, 130, 60)
 GOAL_COLOUR = (60, 190, 90, 110)
 BLOOD_COLOUR, BLOOD_SCALE = (200, 30, 40), 0.02  # s; an arrow of 20 mm is 1 m/s
 HEAD_COLOUR, TRAIL_COLOUR = (255, 200, 0), (255, 200, 0, 160)
-SHEATH_OPACITY = 0.3  # of what would hide the device inside it
-LONGEST_ARROW = 25e-3  # m, about, in an episode
+SHEATH_OPACITY = 0.3  # shows the device inside
+LONGEST_ARROW = 25e-3  # m, approximately
 ARROW_RADIUS, HEAT_RADIUS, TRAIL_RADIUS = 0.7e-3, 0.9e-3, 0.25e-3
 HEAD_SCALE = 1.8
-# Of the text at the largest force of a step: it can be read on light and dark.
+# Text of the largest force of a step: legible on light and dark backgrounds.
 LABEL_COLOUR = (186, 58, 0)
 # Geoms that bodies collide with are not drawn, as in MuJoCo's own viewers.
 _VISIBLE_GROUPS = 3
@@ -48,11 +48,11 @@ class Log:
         self._times = np.round(episode.time * 1e9).astype("timedelta64[ns]")
 
     def static(self, entity: str, archetype: Any) -> None:
-        """Logs what never changes."""
+        """Logs an entity that never changes."""
         self._stream.log(entity, archetype, static=True, strict=True)
 
     def flush(self) -> None:
-        """Puts all that has been logged before what follows; Rerun keeps no order."""
+        """Writes all entities so far before later ones; Rerun keeps no order itself."""
         self._stream.flush()
 
     def columns(self, entity: str, columns: Any, rows: Any = EVERY) -> None:
@@ -67,7 +67,7 @@ class Log:
     def series(
         self, entity: str, values: Any, names: Any, colour: Any = None, rows: Any = None
     ) -> None:
-        """Plots (n,) or (n, C) values as C lines; T of them are of `MEASURED` rows."""
+        """Plots values (n,) or (n, C) as C lines; by default, T rows are `MEASURED`."""
         values = np.asarray(values)
         rows = rows or (EVERY if len(values) > self.episode.steps else MEASURED)
         self.static(f"series/{entity}", rr.SeriesLines(names=names, colors=colour))
@@ -84,7 +84,7 @@ def log_vessel(log: Log, surface: Surface) -> None:
     # Patient frame LPS: x to the patient's left, y to the back, z up.
     log.static("world", rr.ViewCoordinates.LBU)
     mesh = rr.Mesh3D.from_fields(
-        # What is static hides what moves.
+        # A static component would hide the moving one.
         vertex_positions=None if moves else surface.vertices.astype(np.float32),
         vertex_normals=surface.normals.astype(np.float32),
         triangle_indices=surface.faces.astype(np.uint32),
@@ -118,7 +118,7 @@ def log_vessel(log: Log, surface: Surface) -> None:
 
 
 def log_catheter(log: Log) -> None:
-    """Log the device as capsules coloured by what they press, its head and its path."""
+    """Log the device as capsules coloured by contact force, its head and its path."""
     entity, coaxial, joints = "world/catheter", log.coaxial, log.episode.catheter
     radii = log.episode.radii
     states, links = joints.shape[0], joints.shape[1] - 1
@@ -135,7 +135,7 @@ def log_catheter(log: Log) -> None:
         ):
             _log_point(log, f"{entity}/{name}", end, colour, radius)
     log.static(entity, rr.Capsules3D.from_fields(fill_mode="solid"))
-    # Azimuth and inclination of what lies along +z.
+    # Azimuth and inclination that turn +z onto the links.
     x, y, z = along.reshape(-1, 3).T
     angles = np.stack([np.arctan2(y, x), np.arctan2(np.hypot(x, y), z)], axis=-1)
     turns = Rotation.from_euler("ZY", angles)
@@ -162,7 +162,7 @@ def _log_point(log: Log, entity: str, places, colour, radius: float) -> None:
 
 
 def link_colours(episode: Episode, colours: np.ndarray) -> np.ndarray:
-    """Colours (T+1, L, 3) uint8 of links: of the largest force, or their own."""
+    """Return link colours (T+1, L, 3) uint8 by largest force; `colours` without one."""
     pressed = np.zeros(colours.shape[:2])
     magnitude = np.linalg.norm(episode.contact_force, axis=-1)
     row = episode.contact_step + 1
@@ -174,12 +174,12 @@ def link_colours(episode: Episode, colours: np.ndarray) -> np.ndarray:
 
 
 def arrow_scale(episode: Episode) -> float:
-    """Length of an arrow for each newton, metres."""
+    """Return the length of an arrow per newton, m/N."""
     return LONGEST_ARROW / force_scale(np.linalg.norm(episode.contact_force, axis=-1))
 
 
 def log_contacts(log: Log) -> None:
-    """Log the forces of each step as arrows, the largest also as text, and places."""
+    """Log contact forces as arrows, the largest of a step as text, and the places."""
     episode = log.episode
     magnitude = np.linalg.norm(episode.contact_force, axis=-1)
     colours = force_colours(magnitude, force_scale(magnitude))
@@ -187,7 +187,7 @@ def log_contacts(log: Log) -> None:
     log.static("world/contacts", rr.Arrows3D.from_fields(radii=[ARROW_RADIUS]))
     vectors = arrow_scale(episode) * episode.contact_force
     arrows = rr.Arrows3D.columns(vectors=vectors, origins=places, colors=colours)
-    # A step without contact is an empty row, which takes the old arrows away.
+    # A step without contact is an empty row, which removes the old arrows.
     log.columns("world/contacts", arrows.partition(counts), MEASURED)
     if len(magnitude):
         log.static("world/heat", rr.Points3D.from_fields(radii=[HEAT_RADIUS]))
@@ -217,7 +217,7 @@ class BodyGeom(NamedTuple):
 
 
 def body_geoms(physics: Any) -> Iterator[BodyGeom]:
-    """The visible primitives of robot and sheath of a dm_control ``Physics``."""
+    """Yield the visible primitives of robot and sheath of a dm_control ``Physics``."""
     import mujoco
 
     model = physics.model
@@ -234,9 +234,9 @@ def body_geoms(physics: Any) -> Iterator[BodyGeom]:
 
 
 def log_bodies(log: Log, geoms: Iterable[BodyGeom]) -> None:
-    """Log how the bodies move, and then their shapes.
+    """Log the poses of the bodies, then their shapes.
 
-    A shape that a viewer reads before its pose stands at the origin, in the arch.
+    A viewer draws a shape that it reads before its pose at the origin, in the arch.
     """
     by_body = sorted(geoms, key=lambda geom: (geom.body, geom.kind))
     for body, parts in itertools.groupby(by_body, lambda geom: geom.body):

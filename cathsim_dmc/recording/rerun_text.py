@@ -1,4 +1,4 @@
-"""An episode in words, as Rerun entities: what happens when, and a page about it."""
+"""Text of an episode as Rerun entities: a log of events and a page about it."""
 
 import json
 
@@ -12,7 +12,7 @@ from cathsim_dmc.recording.rerun_scene import Log
 EVENTS, PAGE = "events", "info"  # entities
 # Steps without contact after which the next contact is an event again.
 _QUIET = 10
-_LEVELS = {"success": "INFO", "physics_error": "ERROR"}  # of an end; others: WARN
+_LEVELS = {"success": "INFO", "physics_error": "ERROR"}  # of terminations; else WARN
 _LONG = 200  # characters of a value: longer ones are series, which belong in plots
 
 
@@ -26,10 +26,10 @@ def log_text(log: Log) -> None:
 
 
 def events(episode: Episode) -> list[tuple[int, str, str]]:
-    """Number of the state, text and level of every event, in the order of time.
+    """Return (number of the state, text, level) of every event, sorted by state.
 
-    The start, contacts that begin, the largest force, the head half way and nearest to
-    the goal, the end.
+    Events are the start, new contacts, the largest force, half of the distance to the
+    goal, the smallest distance, and the end.
     """
     found = [(0, f"start of {episode.task}", "INFO")]
     touched = np.unique(episode.contact_step)
@@ -54,7 +54,7 @@ def events(episode: Episode) -> list[tuple[int, str, str]]:
 
 
 def markdown(episode: Episode) -> str:
-    """A page in Markdown: outcome, forces, versions and options."""
+    """Return a page in Markdown: outcome, forces, versions and options."""
     force = np.linalg.norm(episode.contact_force, axis=-1)
     path = np.linalg.norm(np.diff(episode.head, axis=0), axis=-1).sum()
     mean, largest = (

@@ -1,7 +1,7 @@
-"""Sequences of fluoroscopy in one anatomy, with all that is known of each frame.
+"""Sequences of labelled fluoroscopy in one anatomy.
 
-One HDF5 file holds the frames of an anatomy, those of a sequence after each other; a
-row of every array belongs to one frame.
+One HDF5 file holds the frames of an anatomy, sequence after sequence; a row of every
+array belongs to one frame.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from cathsim_dmc.tasks.anatomies import BRANCHES
 
 # Bits of a mask.
 DEVICE, VESSEL = 1, 2
-# The innermost device, or the only one, and the one around it: its distal end and where
-# its radiopaque marker begins. Then the ostia, where a branch leaves its parent.
+# Distal end and proximal end of the radiopaque marker of the innermost or only device,
+# then of the one around it. Then the ostia, where a branch leaves its parent.
 DEVICE_KEYPOINTS = ("tip", "marker", "outer_tip", "outer_marker")
 OSTIA = tuple(f"ostium_{name}" for name in BRANCHES)
 KEYPOINTS = DEVICE_KEYPOINTS + OSTIA
-# Of a keypoint, as in COCO.
+# State of a keypoint, as in COCO.
 ABSENT, UNSEEN, SEEN = 0, 1, 2
 
-# Devices that are pushed and turned: options of the task, by name.
+# Options of the task for each kit of devices, by name.
 KITS: dict[str, dict[str, Any]] = {
     "steerable_5f": {"device": "steerable_5f", "rotation": True},
     "steerable_4f": {"device": "steerable_4f", "rotation": True},
@@ -46,13 +46,14 @@ KITS: dict[str, dict[str, Any]] = {
     "glide_in_vertebral": {"devices": ["wire_035_glide", "vertebral_5f"]},
     "micro": {"devices": ["wire_014_micro", "microcatheter_021"]},
 }
-# What is drawn for each sequence: angles, degrees, within those used for the arch;
-# electronic zoom; air kerma, Gy; gain; iodine in the lumen, kg/m³, in every other one.
+# Ranges drawn for each sequence: angles, degrees, within those used for the arch;
+# electronic zoom; air kerma, Gy; gain; iodine in the lumen of half of them, kg/m³.
 PRIMARY, SECONDARY = (-45.0, 75.0), (-25.0, 25.0)
 ZOOM, KERMA, GAIN, IODINE = (1.0, 1.8), (8e-9, 60e-9), (0.6, 0.85), (3.0, 20.0)
-_STARTS = (0.0, 0.9)  # shares of the way to the branch
+_STARTS = (0.0, 0.9)  # start, as a fraction of the route to the branch
 _RANDOMISED = {"friction": (0.02, 0.15), "stiffness": (0.8, 1.25), "roll": (-3.1, 3.1)}
-# Mean push of a sequence; deviation and memory, a control step, of what is added.
+# Range of the mean push of a motion; standard deviation and correlation between control
+# steps of the noise added to the actions.
 _PUSH, _JITTER, _MEMORY = (-0.3, 1.0), 0.3, 0.8
 
 
@@ -103,16 +104,20 @@ class ImageSetOptions:
 class States(NamedTuple):
     """The motions in one anatomy, arrays with leading axes (T frames, N motions)."""
 
-    shadows: Sequence[Shadow]  # devices as X-rays meet them, points (T, N, n, 3)
-    columns: dict[str, np.ndarray]  # what is written of each state, by name
+    shadows: Sequence[Shadow]  # one per device, points (T, N, n, 3)
+    columns: dict[str, np.ndarray]  # measurements (T, N, ...) by name
     warps: list[list[Warp]]  # T times N motions of the vessel; empty at rest
-    kept: np.ndarray  # numbers of the motions that are sound
+    kept: np.ndarray  # indices of the motions without a physics error
 
 
 def simulate(
     anatomy: Anatomy, goal: str, kit: str, options: ImageSetOptions, seed: Sequence[int]
 ) -> States:
-    """Pushes and turns devices at random; ValueError if they do not fit, or fail."""
+    """Simulates devices with random actions.
+
+    Raises:
+        ValueError: the devices do not fit, or the physics fails in all motions.
+    """
     from cathsim_dmc import suite
     from cathsim_dmc.simulation.batch import BatchSimulation
 
@@ -160,7 +165,7 @@ def simulate(
 
 
 def ostia(anatomy: Anatomy) -> np.ndarray:
-    """Places (len(OSTIA), 3) where branches leave their parents, m; NaN for none."""
+    """Returns the places (len(OSTIA), 3) of the ostia, m; NaN for missing branches."""
     vessels, none = anatomy.tree.vessels, np.full(3, np.nan)
     return np.array([
         vessels[name].mouth.position if name in vessels else none for name in BRANCHES
@@ -168,7 +173,7 @@ def ostia(anatomy: Anatomy) -> np.ndarray:
 
 
 def ends(shadow: Shadow) -> np.ndarray:
-    """Distal end of a device and where its marker begins (..., 2, 3), m."""
+    """Returns a device's distal end and its marker's proximal end (..., 2, 3), m."""
     back = shadow.points[..., ::-1, :]
     found = np.empty((*back.shape[:-2], 2, 3))
     for row in np.ndindex(back.shape[:-2]):
@@ -181,10 +186,14 @@ def _within(random: Any, ends: Sequence[float] | np.ndarray) -> float:
 
 
 class Camera:
-    """C-arm, contrast and dose of one sequence, as drawn."""
+    """C-arm, contrast and dose of one sequence, randomly drawn."""
 
     def __init__(self, anatomy: Anatomy, size: int, aim: np.ndarray, random: Any):
-        """Draws them; the isocentre lies from the lumen's middle towards `aim`, m."""
+        """Draws the settings.
+
+        The isocentre lies on the segment from the middle of the lumen's bounding box to
+        `aim` (3,), m.
+        """
         self.angles = _within(random, PRIMARY), _within(random, SECONDARY)
         middle = np.mean(anatomy.lumen.box, axis=0)
         isocentre = middle + random.uniform() * (aim - middle)
@@ -200,7 +209,7 @@ class Camera:
         self.gain = _within(random, GAIN)
 
     def seen(self, places: np.ndarray) -> np.ndarray:
-        """Column, row and state (T, K, 3) of places (T, K, 3) m, NaN for none."""
+        """Returns column, row and state (T, K, 3) of places (T, K, 3), m or NaN."""
         pixels, _ = self.arm.project(np.nan_to_num(places, nan=1e3))
         size = self.arm.resolution[0]
         inside = ((pixels >= -0.5) & (pixels < size - 0.5)).all(axis=-1)
@@ -212,7 +221,7 @@ class Camera:
         return np.concatenate([pixels, state[..., None]], axis=-1)
 
     def before(self, anatomy: Anatomy, warp: Warp | None = None) -> Fluoroscope:
-        """The fluoroscope before the vessel, as it has moved at one time."""
+        """Returns the fluoroscope with the vessel, moved by `warp` if given."""
         surface = anatomy.surface
         if warp is not None:
             parameters, time = warp
@@ -226,11 +235,11 @@ class Camera:
 def frames_of(
     anatomy: Anatomy, states: States, options: ImageSetOptions, seed: Sequence[int]
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Sequences (T rows of every array) before C-arms drawn for each."""
+    """Yields sequences, arrays of T rows by name, each with a C-arm drawn for it."""
     random = np.random.RandomState(seed)
     rest, found = ostia(anatomy), 0
     here = np.isfinite(rest[:, 0])
-    # Frames before one state of the vessel, and how it has moved.
+    # Rows of the frames with one state of the vessel, and its motion.
     parts = [(slice(row, row + 1), each) for row, each in enumerate(states.warps)]
     device = np.concatenate([ends(shadow) for shadow in states.shadows], axis=-2)
     count = options.frames
@@ -279,7 +288,7 @@ def write(
     path: Path, anatomy: Anatomy, states: States, options: ImageSetOptions,
     seed: Sequence[int], **about: Any,
 ) -> int:  # fmt: skip
-    """Writes the file of an anatomy, whole or not at all; returns its frames.
+    """Writes the file of an anatomy, whole or not at all; returns its frame count.
 
     Args:
         about: attributes of the file.
@@ -296,7 +305,7 @@ def write(
     every = frames_of(anatomy, states, options, seed)
     first = next(every)
     with files.atomic_path(path, ".h5") as temporary:
-        # Where HDF5 meets a full disk, it ends the process with a segmentation fault.
+        # On a full disk HDF5 ends the process with a segmentation fault.
         files.fill(temporary, _most_bytes(first, rows))
         with h5py.File(temporary, "w") as file:
             file.attrs.update(about)
@@ -310,7 +319,7 @@ def write(
 
 
 def _column(file: Any, name: str, values: np.ndarray, rows: int) -> Any:
-    """A new array of a file for rows such as `values`."""
+    """Creates an array of a file for `rows` rows of the kind of `values`."""
     pixels, shape = values.dtype == np.uint8, (rows, *values.shape[1:])
     kind = _TYPES.get(name, "u1" if pixels else "f4")
     packed = {"compression": "gzip", "compression_opts": 1} if name == "mask" else {}
@@ -319,7 +328,7 @@ def _column(file: Any, name: str, values: np.ndarray, rows: int) -> Any:
 
 
 def _most_bytes(clip: dict[str, np.ndarray], rows: int) -> int:
-    """Bytes of a file of so many rows, of which a clip shows some, at most."""
+    """Returns an upper bound on the bytes of a file of `rows` rows such as a clip's."""
     held = sum(values.nbytes for name, values in clip.items() if name != "mask")
-    # A quarter more for masks, which shrink, and chunks; 2 KB for what lists a row.
+    # A quarter more for compressed masks and chunks; 2 KB per row for its index.
     return 2**20 + (held // len(clip["image"]) * 5 // 4 + 2**11) * rows

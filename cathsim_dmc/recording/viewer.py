@@ -8,7 +8,7 @@ from pathlib import Path
 
 # First bytes of every recording of the current format.
 _MAGIC = b"RRF2"
-# Near the end of every whole one, before four bytes of a checksum.
+# Near the end of every complete recording, before a checksum of four bytes.
 _FOOTER, _END = b"RRF2FOOT", -4
 LOOPBACK, WEB_PORT = "127.0.0.1", 9090
 
@@ -18,7 +18,12 @@ class ViewerError(RuntimeError):
 
 
 def check_recording(path: str | os.PathLike[str]) -> Path:
-    """Absolute path of a whole recording; FileNotFoundError or ValueError if none."""
+    """Return the absolute path of a complete recording.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no complete recording of this version of Rerun.
+    """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no recording at {path}")
@@ -41,15 +46,15 @@ def open_viewer(
     port: int = WEB_PORT,
     data_port: int | None = None,
 ) -> None:
-    """Become the Rerun viewer of a recording; this process does not return.
+    """Replace this process by the Rerun viewer of a recording; does not return.
 
     Args:
-        path: of the .rrd file.
-        web: serve it to a browser, whose address the viewer prints.
-        port: of the web page.
-        data_port: that the page reads the data from; a browser on another machine needs
-            both, see docs/how-to.md. None takes 9876, or another one if it is taken;
-            the address that is printed names it.
+        path: path of the .rrd file.
+        web: whether to serve it to a browser; the viewer prints the address.
+        port: port of the web page.
+        data_port: port from which the page reads the data; a browser on another machine
+            needs both, see docs/how-to.md. None takes 9876, or another one if it is
+            taken; the printed address names it.
 
     Raises:
         FileNotFoundError, ValueError: see `check_recording`.
@@ -65,7 +70,7 @@ def open_viewer(
         )
     found = importlib.util.find_spec("rerun_cli")
     folder = Path(found.origin).parent if found and found.origin else Path()
-    # The viewer of this interpreter's package: of the version of the recordings.
+    # The viewer of the installed package has the version of the recordings.
     names = ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun")
     viewer = next((folder / one for one in names if (folder / one).is_file()), None)
     if not found or viewer is None:
