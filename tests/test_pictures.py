@@ -11,6 +11,7 @@ from recording_samples import make_tube, same
 
 import cathsim_dmc
 from cathsim_dmc import suite
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.forces import PEAK_NOTE
@@ -316,6 +317,27 @@ def test_glass_covers_what_the_surface_covers_and_darkens_at_the_rim():
     assert picture.glaze[rows // 2, columns // 2, 3] < middle[columns // 2]
     assert middle[inside[2]] > 2 * middle[columns // 2]
     assert alpha[0].max() == 0 == alpha[:, 0].max()
+
+
+def test_glass_draws_the_nearest_of_many_walls():
+    tube = make_tube(radius=0.02, length=0.08, sides=48, rings=9)
+    projection = ParallelProjection.of(tube.vertices, margin=0.01, size=60)
+    wall = tube.vertices * (1.0, 1e-3, 1.0)  # two flat walls, one behind the other
+    away = -projection.towards * 1e-3 * np.arange(16)[:, None]
+    walls = [wall + step for step in away]
+    tilted = tube.vertices + 0.1 * projection.towards  # in front of them, rounder
+    drawn = [
+        glass(Surface(np.vstack(vertices), np.vstack(faces)), projection)
+        for vertices, faces in (
+            _stacked([*walls, tilted], tube.faces),
+            _stacked([*walls[:7], tilted], tube.faces),
+        )
+    ]
+    np.testing.assert_array_equal(drawn[0].behind, drawn[1].behind)
+
+
+def _stacked(vertices, faces):
+    return vertices, [faces + len(vertices[0]) * i for i in range(len(vertices))]
 
 
 @pytest.mark.parametrize("right", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.8, 0.0)])

@@ -85,28 +85,6 @@ class CoaxialReadings(NamedTuple):
     push: np.ndarray
 
 
-class Bodies(NamedTuple):
-    """The bodies in a physics step: MuJoCo's arrays, world frame, SI units.
-
-    Attributes:
-        xipos: (nbody, 3), centres of mass.
-        ximat: (nbody, 9), orientations of the principal axes, row by row.
-        xmat: (nbody, 9), orientations of the bodies, row by row.
-        cvel: (nbody, 6), rotational and translational velocity about the centre of mass
-            of the kinematic tree.
-        subtree_com: (nbody, 3), that centre is the row of the tree's first body.
-        xfrc_applied: (nbody, 6), force and torque on the centres of mass, N and N·m.
-            Effects add to it; it is 0 before those of a physics step.
-    """
-
-    xipos: np.ndarray
-    ximat: np.ndarray
-    xmat: np.ndarray
-    cvel: np.ndarray
-    subtree_com: np.ndarray
-    xfrc_applied: np.ndarray
-
-
 class ModelIndex:
     """Indices of a task's quantities in the arrays of a compiled model."""
 

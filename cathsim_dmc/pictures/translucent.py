@@ -21,7 +21,7 @@ FACING, GRAZING = 0.08, 0.70
 # Opacity of the nearest wall over a device inside, as a share of the wall's opacity.
 GLAZE = 0.45
 _SAMPLES = 2  # samples along each side of a pixel
-_LAYERS = 16  # largest number of walls that are drawn in a pixel
+_LAYERS = 16  # largest number of walls that are drawn in a pixel, the nearest
 
 
 @dataclass(frozen=True)
@@ -110,9 +110,11 @@ def glass(surface: Surface, projection: ParallelProjection) -> Glass:
     first = np.flatnonzero(np.diff(pixel, prepend=-1))
     count = np.diff(np.append(first, len(pixel)))
     behind, glaze = np.zeros((2, rows * columns, 4))
-    for layer in range(min(int(count.max(initial=0)), _LAYERS)):
-        deep = count > layer
-        where, over = pixel[first[deep]], hits[first[deep] + layer]
+    drawn = np.minimum(count, _LAYERS)
+    farthest = first + count - drawn
+    for layer in range(int(drawn.max(initial=0))):
+        deep = drawn > layer
+        where, over = pixel[first[deep]], hits[farthest[deep] + layer]
         behind[where] = over + (1.0 - over[:, 3:]) * behind[where]
     glaze[pixel[first]] = GLAZE * hits[first + count - 1]
     shape = projection.shape
