@@ -18,6 +18,7 @@ NON_MANIFOLD = 0.01  # of the triangles: more at non-manifold edges are not mend
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
 FOLD = 2.5e-3  # m, most that a vertex of a self-intersection is moved
+LITTLE = 0.5e-3  # m, and before a patch is cut out
 WIDE_HOLE = 14e-3  # m, and of a lumen that is enlarged to 24 mm
 CUT = 16e-3  # m, widest hole that is filled where it was cut out
 END_AREA = 0.5e-6  # m^2, least area of an open end
@@ -314,7 +315,11 @@ class _Work:
             self.notes.append("surface turned inside out: normals pointed inwards")
 
     def untangle(self) -> None:
-        """Cut out small patches that pierce the surface, smooth or refuse others."""
+        """Smooths folds that pierce the surface, or cuts out small patches.
+
+        A patch that is cut out leaves a hole as wide as the triangles around it, so
+        folds are smoothed first if that moves them little.
+        """
         first = None
         for turn in range(ROUNDS + 1):
             pierced, where, tangled = self._crossings(self.vertices)
@@ -322,11 +327,13 @@ class _Work:
                 break
             first = first or (pierced, where)
             few = tangled.mean() <= NON_MANIFOLD and turn < ROUNDS
+            if few and turn == 0 and self._smooth_folds(LITTLE):
+                return
             patches = self.faces[tangled]
             label = topology.parts(patches)
             wide = topology.widths(self.vertices, patches, label).max() > SPIKE
             if not few or wide:
-                if few and self._smooth_folds():
+                if few and self._smooth_folds(FOLD):
                     return
                 raise ValueError(
                     f"{self.name} intersects itself: {first[0]} triangles, one at "
@@ -349,8 +356,11 @@ class _Work:
         where = shown(vertices[edges[0, 0]]) if len(edges) else ""
         return len(np.unique(faces)), where, tangled
 
-    def _smooth_folds(self) -> bool:
-        """Move vertices of folds to their neighbours; False if that does not help."""
+    def _smooth_folds(self, limit: float) -> bool:
+        """Move vertices of folds to their neighbours; False if that is not enough.
+
+        `limit` is the most that a vertex is moved, m.
+        """
         import igl
 
         vertices, count = self.vertices, 0
@@ -367,13 +377,13 @@ class _Work:
         else:
             return False
         far = float(np.linalg.norm(vertices - self.vertices, axis=1).max())
-        if far <= FOLD:
+        if far <= limit:
             self.vertices = vertices
             self.notes.append(
                 f"{count} self-intersecting triangles smoothed, by {mm(far):.1f} mm "
                 "at most"
             )
-        return far <= FOLD
+        return far <= limit
 
     def _cut_out(self, chosen: np.ndarray) -> None:
         self._cut.update(map(tuple, self.vertices[np.unique(self.faces[chosen])]))
