@@ -1,10 +1,11 @@
-"""Episodes of a policy in the batch, each played again as a composer environment.
+"""Episodes of a policy in the batch, each repeated as a composer environment.
 
     python benchmarks/both_paths.py --task femoral_type1_lcca_pair
     python benchmarks/both_paths.py --task type1_lcca --policy random --steps 200
 
-The conditions of an episode are those of the varied protocol. Observation, reward, end,
-positions, velocities and wall force must be equal bit for bit in every control step.
+The conditions of an episode are those of the varied protocol. Observation, reward,
+termination, positions, velocities and wall force must be bitwise equal in every control
+step.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-# torchrl goes before dm_control.
+# torchrl must be imported before dm_control.
 from cathsim_dmc.agents import protocols  # isort: skip
 
 import numpy as np
@@ -33,10 +34,10 @@ class Play:
     """First episodes of a batch.
 
     Attributes:
-        actions: (T, A) of each episode.
-        states: what `state_of_batch` gives after every step, by episode.
-        success: whether each reached its goal.
-        force: largest sum of the force on the wall in each, N.
+        actions: actions (T, A) of each episode.
+        states: by episode, the arrays of every step that are compared.
+        success: whether each episode reached its goal.
+        force: largest sum of the wall force in each episode, N.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class Play:
 
 
 def outcome_of_batch(step: Any, index: int) -> list[np.ndarray]:
-    """Reward, end and wall force of one simulation."""
+    """Reward, termination, end and wall force of one simulation."""
     ended = step.terminated[index], step.terminated[index] or step.truncated[index]
     force = step.wall_force
     return [
@@ -89,7 +90,7 @@ def outcome_of_batch(step: Any, index: int) -> list[np.ndarray]:
 def first_difference(
     name: str, seed: int, options: dict[str, Any], actions: list, states: list
 ) -> int | None:
-    """First control step that differs in a composer environment, or None."""
+    """First control step that differs in a composer environment; None if none does."""
     task = suite.make_task(name, observation=OBSERVED, random=seed, **options)
     environment = suite.environment(task)
     seen = environment.reset()

@@ -1,10 +1,10 @@
-"""What a Ray cluster costs and gives, on two nodes of this machine.
+"""Costs and gains of a Ray cluster, on two nodes of this machine.
 
     python benchmarks/cluster_costs.py           (with nothing else running)
 
 Prints one JSON object, which `docs/scripts/cluster.py` keeps in docs/data and which
-`benchmarks/cluster_plan.py` plans larger clusters with. What is compared takes turns;
-control steps and learning are measured in processor time.
+`benchmarks/cluster_plan.py` uses to plan larger clusters. Runs that are compared
+alternate; control steps and learning are measured in processor time.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ from cathsim_dmc.cli.options import say
 from cathsim_dmc.simulation import environments
 
 TASK = "type1_lcca"
-# Simulations, and control steps of each in a batch.
+# Number of simulations, and control steps of each in a batch.
 ENVS, STEPS = 16, 64
 SIZES = (1, 2, 4, 8)  # numbers of processes that costs are fitted to
 SETTINGS = {"task": TASK, "num_envs": ENVS, "steps_per_update": ENVS * STEPS}
@@ -44,13 +44,13 @@ def main(rounds: int = 8) -> None:
     Args:
         rounds: Number of times that each figure is measured; medians are reported.
     """
-    with contextlib.redirect_stdout(sys.stderr):  # Ray tells of losses there
+    with contextlib.redirect_stdout(sys.stderr):  # Ray reports losses on stdout
         found = measured(rounds)
     print(json.dumps({"checks": [], "findings": found}, indent=1))
 
 
 def measured(rounds):
-    """All figures by name."""
+    """All measured values by name."""
     began = time.monotonic()
     nodes = Cluster(
         initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False}
@@ -71,7 +71,7 @@ def measured(rounds):
 
 
 def source(folder, collector, processes, make_env=environments.make_env):
-    """A source of batches and the learner that it collects for."""
+    """A collector of batches, and its learner."""
     config = make_config(
         "ppo", "tuned", **SETTINGS, num_threads=1, collector=collector,
         collectors=processes,
@@ -84,7 +84,7 @@ def source(folder, collector, processes, make_env=environments.make_env):
 
 
 def speeds(rounds, kept):
-    """Control steps per second of one process, and of one and two collectors."""
+    """Control steps per second of one process, one collector and two collectors."""
     kinds = {
         "one process": ("local", 1),
         "one node": ("ray", 1),
@@ -119,7 +119,7 @@ def speeds(rounds, kept):
 
 
 def learning(rounds, kept):
-    """Processor time of an update by the frame, on one thread."""
+    """Processor time of an update per frame, on one thread."""
     torch.set_num_threads(1)
     taken = []
     for _ in range(max(rounds // 2, 2)):
@@ -130,7 +130,7 @@ def learning(rounds, kept):
 
 
 class Process:
-    """Takes weights and gives its part of a batch."""
+    """Actor that receives weights and returns its part of a batch."""
 
     def take(self, weights):
         self.weights = weights
@@ -143,12 +143,12 @@ class Process:
 
 
 def weights(rounds, kept):
-    """Milliseconds to give weights to so many processes, all together."""
+    """Milliseconds to send weights to a number of processes in parallel."""
     kept["actors"] = [
         ray.remote(num_cpus=0)(Process).remote() for _ in range(max(SIZES))
     ]
     small = TensorDict.from_module(kept["learner"].policy).data
-    # As many numbers as the networks for images have.
+    # As many parameters as the networks for images have.
     large = TensorDict({"convolutions": torch.zeros(4_900_000)})
     tables = {}
     for name, values in (("numbers", small), ("images", large)):
@@ -166,7 +166,7 @@ def weights(rounds, kept):
 
 
 def parts(rounds, kept):
-    """Milliseconds until so many parts of a batch are here and joined."""
+    """Milliseconds to receive and concatenate a number of parts of a batch."""
     share, table = kept["batch"][: ENVS // 2].clone(), {}
     ray.get([one.keep.remote(share) for one in kept["actors"]])
     for count in SIZES:
@@ -188,7 +188,7 @@ def nothing(job):
 
 
 def jobs(rounds, kept):
-    """Milliseconds of an empty job, among many; seconds of the first in a process."""
+    """Milliseconds of an empty job among many; seconds of the first in a process."""
     began = time.monotonic()
     dict(cluster.over(nothing, range(1)))
     first, taken = time.monotonic() - began, []

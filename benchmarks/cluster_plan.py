@@ -1,11 +1,11 @@
-"""A plan for clusters of 10, 100 and 1,000 nodes, simulated by measured costs.
+"""A plan for clusters of 10, 100 and 1,000 nodes, simulated from measured costs.
 
     python benchmarks/cluster_plan.py
     python benchmarks/cluster_plan.py --nodes 50 --learner-speed 1 --network 1e8
 
-What one node costs is read from docs/data/cluster.json, which
-`benchmarks/cluster_costs.py` measures; Ray is not needed. The options are what cannot
-be measured on one machine. The same options give the same table.
+The costs of one node are read from docs/data/cluster.json, which
+`benchmarks/cluster_costs.py` measures; Ray is not needed. The options are quantities
+that cannot be measured on one machine. The same options give the same table.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ import tyro
 
 DATA = Path(__file__).parents[1] / "docs" / "data" / "cluster.json"
 DAY = 86_400.0
-BATCHES = 400  # that are simulated of a training
+BATCHES = 400  # simulated batches of a training
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,14 +51,14 @@ class Assumptions:
 
 
 def line(table):
-    """Constant and slope, s, of milliseconds by the number of processes."""
+    """Constant and slope, s, of a fit of milliseconds by the number of processes."""
     counts = {int(key): value for key, value in table.items() if key.isdigit()}
     slope, constant = np.polyfit(list(counts), list(counts.values()), 1)
     return max(constant, 0.0) / 1e3, max(slope, 0.0) / 1e3
 
 
 def factors(costs, random, count):
-    """Times as multiples of their mean, as widely spread as that of a batch."""
+    """Random times (count,) relative to their mean, with the spread of a batch."""
     sigma = np.sqrt(np.log1p(costs["spread of a batch's time"] ** 2))
     return random.lognormal(-(sigma**2) / 2, sigma, count)
 
@@ -84,7 +84,7 @@ def training(costs, given, nodes):
     learning = 1e-6 * costs["learning, us a frame"] * frames / given.learner_speed
     batch = collecting + weights + gathering + learning
     losses = random.poisson(nodes * DAY / (3600 * given.hours_between_losses))
-    # All wait for the process that begins again, and for its part.
+    # All processes wait for the restarted one and for its part.
     lost = losses * (max(costs["loss, s"].values()) + own)
     rate = frames / batch * (1.0 - min(lost / DAY, 1.0))
     parts = np.array([weights, collecting, gathering, learning]) / batch
@@ -102,12 +102,12 @@ def independent(costs, given, nodes):
     places = nodes * given.processors
     count = places * given.jobs
     lengths = given.job_seconds * factors(costs, random, count)
-    # A node is lost in the middle of its jobs, on average; they begin again.
+    # A node is lost half-way through its jobs, on average; they are restarted.
     chance = given.job_seconds / (3600 * given.hours_between_losses)
     lost = random.uniform(size=count) < chance
     free, submitted, end = [costs["first job, s"]] * places, 0.0, 0.0
     for length, again in zip(lengths, lost, strict=True):
-        # The first machine submits one job after the other.
+        # The first machine submits jobs one after the other.
         submitted += costs["job, ms"] / 1e3
         begin = max(heapq.heappop(free), submitted)
         done = begin + length * (1.5 if again else 1.0)

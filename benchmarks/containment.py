@@ -1,4 +1,4 @@
-"""Whether a device is where it must be: in the lumen or in the introducer sheath."""
+"""Containment of a device in the lumen or the introducer sheath."""
 
 import dataclasses
 
@@ -6,8 +6,8 @@ import numpy as np
 
 from cathsim_dmc.anatomy import Anatomy
 
-# Spacing of the points along the device at which it is measured, m: about a device
-# radius, so that nothing the size of the device is missed between two of them.
+# Spacing of the sample points along the device, m: about a device radius, so that no
+# excursion of the size of the device is missed between two of them.
 SPACING = 1e-3
 
 
@@ -32,7 +32,7 @@ def points_along(centreline: np.ndarray, spacing: float = SPACING) -> np.ndarray
     if not spacing > 0:
         raise ValueError(f"spacing is {spacing} m; it must be > 0")
     lengths = np.linalg.norm(np.diff(centreline, axis=-2), axis=-1)
-    # Links are rigid, so the first of a batch tells how all are divided.
+    # Links are rigid, so the first of a batch gives the division of all.
     counts = np.ceil(lengths.reshape(-1, lengths.shape[-1])[0] / spacing)
     counts = np.maximum(counts.astype(int), 1)
     link = np.repeat(np.arange(len(counts)), counts)
@@ -48,9 +48,9 @@ class Containment:
     """Lumen and sheath that hold a device.
 
     Attributes:
-      anatomy: lumen and inlet.
-      device_radius: m.
-      bore_radius: of the sheath, m.
+      anatomy: anatomy with lumen and inlet.
+      device_radius: outer radius of the device, m.
+      bore_radius: bore radius of the sheath, m.
       axis: (3,), unit direction of the sheath, world frame.
     """
 
@@ -70,12 +70,11 @@ class Containment:
         )
 
     def excess(self, points: np.ndarray) -> np.ndarray:
-        """How far the device stands out of the lumen and of the sheath, m.
+        """Protrusion of the device from the lumen and the sheath, m.
 
-        In the lumen it is the device's radius less the depth of the point in the true
-        lumen (not in the wall pieces, which approximate it). Before the inlet it is
-        the distance by which the device's side lies beyond the bore. The
-        smaller of the two counts: a device that is in neither is always detected.
+        For the lumen it is the device's radius minus the depth of the point. For the
+        sheath it is the protrusion of the device's side beyond the bore. Before the
+        inlet the smaller one counts, so a device that is in neither is detected.
 
         Args:
           points: (..., 3) on the axis of the device, m, world frame.

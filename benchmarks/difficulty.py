@@ -38,20 +38,20 @@ SUCCESS, TIME, CUT = "success", "out of time", "cut"
 STUCK, ERROR = "stuck", "physics error"
 ENDS = (SUCCESS, TIME, CUT, STUCK, ERROR)
 
-# Success that the expert must reach, and a straight push must not exceed where the
-# task asks for steering, %.
+# Least success of the expert, and largest success of a straight push on tasks that
+# require steering, %.
 LEAST_EXPERT = 95.0
 MOST_PUSH = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Limit:
-    """When an episode that leads nowhere is cut off; None for never.
+    """Limits at which an episode without progress is cut off; None for no limit.
 
     Attributes:
         steps: Control steps after which the episode ends.
-        stuck_steps: Control steps in which the insertion did not grow by `growth`.
-        growth: m; what a device that still slides gains in that time.
+        stuck_steps: Control steps without growth of the insertion after which it ends.
+        growth: Least growth of the insertion, m, of a device that still slides.
     """
 
     steps: int | None = None
@@ -59,8 +59,8 @@ class Limit:
     growth: float = 0.5e-3
 
 
-# A constant command that has not moved the device for 2 s has brought it to rest.
-# Random actions leave the device within a few centimetres of its start.
+# A device that a constant command has not moved for 2 s is at rest. Random actions keep
+# the device within a few centimetres of its start.
 _BLIND = Limit(steps=500, stuck_steps=50)
 LIMITS: Mapping[str, Limit] = {
     "push": _BLIND,
@@ -75,9 +75,9 @@ class Trial:
     """Episodes of one policy on one task, in the order of their seeds.
 
     Attributes:
-        ends: How each episode ended, one of `ENDS`.
-        steps: Control steps of each.
-        forces: Forces on the wall in each.
+        ends: End of each episode, one of `ENDS`.
+        steps: Number of control steps of each episode.
+        forces: Wall forces of each episode.
     """
 
     ends: tuple[str, ...]
@@ -90,7 +90,7 @@ class Trial:
         return self.ends.count(SUCCESS)
 
     def summary(self) -> dict[str, Any]:
-        """JSON-able figures over the episodes.
+        """Statistics over the episodes, as JSON values.
 
         Forces in N, see `EpisodeForces`: "mean_force", "max_force" and "peak_force" are
         averaged over the episodes, "largest_force" is the largest "max_force" of all.
@@ -112,7 +112,7 @@ class Trial:
 
 
 class _Slides:
-    """How long the devices of N simulations have not advanced."""
+    """Control steps since the devices of N simulations last advanced."""
 
     def __init__(self, insertion: np.ndarray, growth: float):
         self._best = insertion.copy()
@@ -135,9 +135,9 @@ def play(
 
     Args:
         simulation: Simulations, which are seeded and reset.
-        policy: Policy without memory of other simulations.
+        policy: Policy that plays all simulations.
         seed: Seed of the first simulation; the others count up.
-        limit: When episodes are cut off; None for when the task ends them.
+        limit: Limits of the episodes; None if only the task ends them.
     """
     limit = limit or Limit()
     count = simulation.num_simulations
@@ -168,7 +168,7 @@ def play(
 
 
 def _ends(step: Step, number: int, resting: np.ndarray, limit: Limit) -> dict[int, str]:
-    """How the episodes end that end with this control step, by simulation."""
+    """Ends of the episodes that end with this control step, by simulation."""
     found = {}
     for index in range(len(step.terminated)):
         if step.outcome.success[index]:
@@ -200,9 +200,9 @@ def tasks() -> tuple[str, ...]:
     )
 
 
-# Tasks on the femoral route whose goal a straight device slides into: the LSA of the
-# measured phantoms leaves the outer curve of the arch, along which it comes. It does so
-# wherever the sheath stands in the descending aorta and up to 20 degrees askew
+# Femoral tasks whose goal a straight device enters: the LSA of the measured phantoms
+# leaves the outer curve of the arch, along which the device slides. This holds for all
+# positions of the sheath in the descending aorta and tilts up to 20 degrees
 # (docs/difficulty.md).
 FIRST_ON_THE_WAY = ("femoral_type1_lsa", "femoral_type2_lsa")
 
@@ -210,9 +210,9 @@ FIRST_ON_THE_WAY = ("femoral_type1_lsa", "femoral_type2_lsa")
 def asks_for_steering(task: str) -> bool:
     """Whether a straight push must not solve a registered task.
 
-    It may where the goal is the first branch on the way of a straight device: the BCA
-    from the ascending aorta, whose continuation it is, and `FIRST_ON_THE_WAY`. There,
-    force tells a good cannulation from a bad one.
+    It may if the goal is the first branch on the path of a straight device: the BCA,
+    which continues the ascending aorta, and `FIRST_ON_THE_WAY`. In these tasks the
+    force distinguishes a good cannulation from a bad one.
     """
     definition = suite.TASKS[task]
     if task in FIRST_ON_THE_WAY:
@@ -238,11 +238,11 @@ def difficulty(
         first_seed: Seed of the first episode; the others count up.
         players: Names of policies in `LIMITS`; None for all.
         num_threads: Number of threads of the simulation, 0 for one per core.
-        say: Function that is told of the progress.
-        keep: Function that is given the report so far after every task.
+        say: Called with lines on the progress.
+        keep: Called with the report so far after every task.
 
     Raises:
-        ValueError: there is no such task or policy, it is named twice, or seeds < 1.
+        ValueError: if a task or policy is unknown or named twice, or seeds < 1.
     """
     names = tasks() if names is None else tuple(names)
     players = tuple(LIMITS) if players is None else tuple(players)
@@ -274,7 +274,7 @@ def difficulty(
 
 
 def _refuse(what: str, given: Sequence[str], known: Sequence[str]) -> None:
-    """Refuses names that would fail after hours of work."""
+    """Raises ValueError for names that would fail after hours of work."""
     if not given or set(given) - set(known) or len(set(given)) < len(given):
         raise ValueError(
             f"{what} are {list(given)}; give each once, out of {', '.join(known)}"
@@ -290,7 +290,7 @@ def _trials(
     say: Callable[[str], None],
 ) -> dict[str, Trial]:
     """Trials of the policies on one task; the expert needs a device that it steers."""
-    # Cheapest to observe; none of the policies looks at it.
+    # The cheapest observation; none of the policies uses it.
     task = suite.make_task(name, observation="tracking")
     simulation = BatchSimulation(task, seeds, num_threads=num_threads)
     trials = {}

@@ -1,4 +1,4 @@
-"""Makes a policy that ships from a run: evaluates it, writes weights and a card.
+"""Exports the policy of a run for the package: evaluation, weights and a card.
 
 python benchmarks/export.py RUN NAME [--out DIRECTORY]
 """
@@ -75,7 +75,7 @@ def export(
     if definition.random_arch:
         trained = {**definition.options, **config.task_kwargs}.get("arches")
         options["arches"] = "test_neck" if trained == "neck" else "test"
-        if not isinstance(options.get("goal", ""), str):  # one for each arch
+        if not isinstance(options.get("goal", ""), str):  # a goal for each arch
             options["goal"] = "any"
     label = f"{pretrained.PREFIX}{name}"
     card = {
@@ -114,7 +114,7 @@ def write_list(directory):
         forces, observation = summary["forces"], card["config"]["observation"]
         if not isinstance(observation, str):
             observation = ", ".join(observation)
-        # Cards of before 0.3 tell the forces at the end of a control step.
+        # Cards from before 0.3 have the forces at the end of a control step.
         total = forces.get("mean_sum", forces["sum"])
         largest = forces.get("mean_max", forces["max"])
         shown = total["mean"], largest["mean_in_contact"], largest["maximum"]

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 # isort: off
-# torchrl goes before dm_control.
+# torchrl must be imported before dm_control.
 import torch
 from cathsim_dmc import agents
 from cathsim_dmc.simulation.torchrl import BatchedEnv
@@ -47,7 +47,7 @@ PARITY_TASKS: dict[str, dict[str, Any]] = {
     "type1_lcca_pair": {},
     "type1_lcca living": {"vessel": "living"},
 }
-# Task and options of what stands behind the observation in `SPEED`.
+# Task and options by the word after the observation in `SPEED`.
 SCENES: dict[str, tuple[str, dict[str, Any]]] = {
     "": ("type1_lcca", {}),
     "pair": ("type1_lcca_pair", {}),
@@ -63,8 +63,8 @@ SPEED = (
     ("internal", 16384, "push"), ("image", 4096, "push"), ("route", 4096, "push"),
     ("internal, pair", 4096, "random"), ("internal, living", 4096, "random"),
 )  # fmt: skip
-ON_THE_CPU = 1024  # simulations on all cores
-# Hundreds of worlds, a few steps of each: an update needs no more frames.
+ON_THE_CPU = 1024  # simulations of the CPU case, on all cores
+# Hundreds of worlds with a few steps each give enough frames for an update.
 _UPDATES = {"minibatch_size": 512, "epochs": 10, "checkpoint_frames": 40_960}
 _SMALL = {"num_envs": 512, "steps_per_update": 4096, "learning_rate": 2.5e-4}
 _LARGE = {"num_envs": 1024, "steps_per_update": 8192, "learning_rate": 3e-4}
@@ -81,14 +81,14 @@ EPISODES, LONGEST, ENOUGH = 40, 200, 0.95
 
 
 class Report:
-    """What has been found, on disk as soon as it is known."""
+    """Results, which are written to a file after each measurement."""
 
     def __init__(self, path: Path | None, budget: float):
         self.found: dict[str, Any] = {}
         self._path, self._budget, self._began = path, budget, time.perf_counter()
 
     def add(self, part: str, value: Any) -> None:
-        """Adds a row to a part, or sets it."""
+        """Appends a row (dict) to a part, or sets the part to another value."""
         if isinstance(value, dict):
             self.found.setdefault(part, []).append(value)
         else:
@@ -101,18 +101,18 @@ class Report:
     def attempt(
         self, part: str, measure: Callable, *given: Any, seconds: float
     ) -> None:
-        """Adds a row that is measured, if so many seconds are left for it."""
+        """Measures and adds a row, if `seconds` of the budget are left."""
         if not self.has(seconds):
             return
         try:
             self.add(part, measure(*given))
-        except Exception as error:  # the others may still be measured
+        except Exception as error:  # other measurements may still succeed
             traceback.print_exc()
             words = [str(each) for each in given[:4]]
             self.add("failed", {"part": part, "given": words, "error": repr(error)})
 
     def has(self, seconds: float) -> bool:
-        """Whether so many seconds are left."""
+        """Whether so many seconds of the budget are left."""
         return time.perf_counter() - self._began + seconds <= self._budget
 
 
@@ -128,7 +128,7 @@ def actions(policy: str, steps: int, simulation: BatchSimulation) -> np.ndarray:
 
 
 def parity(device: str, name: str, steps: int) -> dict[str, Any]:
-    """Differences of four worlds of a task from `BatchSimulation`."""
+    """Differences between four worlds of a task and `BatchSimulation`."""
     task, options = name.split()[0], PARITY_TASKS[name]
     one = BatchSimulation(suite.make_task(task, **options), 4, num_threads=4)
     two = WarpSimulation(suite.make_task(task, **options), 4, device=device)
@@ -155,7 +155,7 @@ def parity(device: str, name: str, steps: int) -> dict[str, Any]:
 
 
 def pace(step: Callable[[int], Any], steps: int) -> float:
-    """Calls per second, after three that do not count."""
+    """Calls per second, after three warm-up calls."""
     for k in range(3):
         step(k)
     began = time.perf_counter()
@@ -204,7 +204,7 @@ def speed(
         row["lost"] = int(stepper.lost.sum())
         row["seconds"] = {k: round(v, 4) for k, v in stepper.profile().items()}
         row["again"] = round(worlds * pace(lambda _: stepper.step_device(), 10))
-        # Warp waits for nothing on the CPU.
+        # On the CPU, Warp does not wait for the step to end.
         waited = float(np.median(spent))
         row["physics"] = round(worlds / waited) if waited > 1e-3 else row["again"]
         if env.device.type == "cuda":
@@ -215,7 +215,7 @@ def speed(
 
 
 def training(name: str, device: str, folder: Path, out: Path | None) -> dict[str, Any]:
-    """Frames and seconds until a policy succeeds; its files go beside `out`."""
+    """Trains a policy; frames and seconds until it succeeds. Files go beside `out`."""
     settings = {"task": "type1_lcca", "simulation_device": device, **TRAINING[name]}
     place = "cuda" if device.startswith("cuda") else "cpu"
     cores = os.cpu_count() or 1
@@ -260,7 +260,7 @@ def training(name: str, device: str, folder: Path, out: Path | None) -> dict[str
 
 
 def measure(given: argparse.Namespace, report: Report) -> None:
-    """All parts, the most important ones first."""
+    """Measures all parts, the most important ones first."""
     device, only = given.device, given.only
     report.add("command", " ".join(["benchmarks/gpu.py", *sys.argv[1:]]))
     report.add("date", time.strftime("%Y-%m-%d"))
@@ -290,7 +290,7 @@ def measure(given: argparse.Namespace, report: Report) -> None:
     speeds(rows[:2], 0)
     trained("PPO-Internal", 60)
     compared(names[:2], 20)
-    # Compiled for other models.
+    # Other models, which are compiled first.
     speeds(rows[2:4], 60)
     compared(names[2:], 60)
     speeds(rows[4:6], 30)

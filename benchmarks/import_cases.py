@@ -1,4 +1,4 @@
-"""Scans with known truth for the import: arches of tubes, remeshed, cut and turned."""
+"""Scans with ground truth for the import: arches, remeshed, cut and rotated."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from cathsim_dmc.anatomy.surface import lumen_surface
 TRIANGLES = (2_000, 4_000, 12_000, 30_000, 100_000)
 TYPES = ("I", "II", "III")
 VARIANTS = ("normal", "bovine_trunk", "bovine_branch", "aberrant")
-SEED = 9_100_000  # of the cases with which the import was made
-ASK = "ask"  # what an import should do where the truth cannot be seen
+SEED = 9_100_000  # of the cases with which the import was developed
+ASK = "ask"  # what an import should do if the surface does not show the truth
 NAME = "name"
-_MARCHED = 1.3e-3  # m, coarsest step at which surfaces are marched before decimation
+_MARCHED = 1.3e-3  # m, coarsest grid of marching cubes before decimation
 _PER_AREA = 2.4  # triangles per squared step
 
 
@@ -35,15 +35,15 @@ class Case:
     """One scan.
 
     Attributes:
-        kind: what was done to the arch, a group of the report.
-        source: arch type of a random arch, or the name of a phantom.
-        seed: of the arch and of what is random in the change.
-        variant: of a random arch.
-        triangles: of the surface.
-        answer: "name" or "ask".
-        change: vessel and length (m) that is left of it past its ostium, 0 for none.
-        noise: m, standard deviation of the surface.
-        turn: None, "any" rotation or "x" or "y", the axis that is mirrored.
+        kind: change of the arch, a group of the report.
+        source: type of a random arch, or name of a phantom.
+        seed: seed of the arch and of random changes.
+        variant: variant of a random arch.
+        triangles: number of triangles of the surface.
+        answer: expected answer of the import, "name" or "ask".
+        change: vessel and its remaining length (m) past its ostium, 0 for none.
+        noise: standard deviation of the surface, m.
+        turn: None, "any" for a random rotation, or "x" or "y", a mirrored axis.
     """
 
     kind: str
@@ -58,7 +58,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Unique, for a line of the results."""
+        """Unique name of the case, for a line of the results."""
         words = [self.kind, self.source, self.variant, self.seed, self.triangles]
         words += [f"{name}{1e3 * length:g}" for name, length in self.change]
         words += [self.turn] if self.turn else []
@@ -67,7 +67,7 @@ class Case:
 
 
 def cases(seed: int = SEED) -> list[Case]:
-    """All cases from a seed on, in an order in which the first are of every kind."""
+    """All cases from a seed on, ordered so that the first ones are of every kind."""
     groups: list[list[Case]] = []
     seeds = iter(range(seed, seed + 100_000))
 
@@ -111,13 +111,13 @@ def cases(seed: int = SEED) -> list[Case]:
         for count in (4_000, 100_000):
             groups.append([Case("phantom", name, 0, triangles=count)])
         groups.append([Case("phantom, turned", name, abs(seed - SEED) + 1, turn="any")])
-    # In turns, so that a run that is cut off has seen every kind.
+    # Kinds alternate, so that an interrupted run has cases of every kind.
     longest = max(map(len, groups))
     return [g[k] for k in range(longest) for g in groups if k < len(g)]
 
 
 def truth(case: Case) -> VesselTree:
-    """The tree of a case, as its surface shows it, upright; m, LPS."""
+    """The tree of a case, changed but not rotated; m, LPS."""
     if case.kind.startswith("phantom"):
         return phantoms.load(case.source).tree
     seed = ArchSeed(case.seed, case.source, case.variant)
@@ -138,7 +138,7 @@ def truth(case: Case) -> VesselTree:
 
 
 def surface(case: Case, tree: VesselTree) -> Surface:
-    """The surface of a case, turned and with noise."""
+    """The surface of a case, rotated and with noise."""
     area = sum(
         2.0 * np.pi * float(np.median(v.centreline.radii)) * v.centreline.length
         for v in tree.vessels.values()
@@ -160,7 +160,7 @@ def surface(case: Case, tree: VesselTree) -> Surface:
 
 
 def turn(case: Case) -> np.ndarray:
-    """Matrix (3, 3) by which the points of a case are turned or mirrored."""
+    """Matrix (3, 3) that rotates or mirrors the points of a case."""
     if case.turn == "any":
         rng = np.random.default_rng(case.seed + 1)
         matrix = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -169,7 +169,7 @@ def turn(case: Case) -> np.ndarray:
 
 
 def shortened(tree: VesselTree, name: str, length: float) -> VesselTree:
-    """The tree with so much of a vessel past its ostium, without its branches."""
+    """The tree with a vessel cut `length` (m) past its ostium, without its branches."""
     vessels = {}
     for key, vessel in tree.vessels.items():
         if key == name:
@@ -187,7 +187,7 @@ def shortened(tree: VesselTree, name: str, length: float) -> VesselTree:
 
 
 def limb_cut(tree: VesselTree, limb: str, length: float) -> VesselTree:
-    """The tree with so much of the aorta before its first or after its last branch."""
+    """The tree with `length` (m) of aorta before its first or after its last branch."""
     root = tree.root
     places = [tree.origin(k) for k, v in tree.vessels.items() if v.parent == root.name]
     line = root.centreline
@@ -199,18 +199,18 @@ def limb_cut(tree: VesselTree, limb: str, length: float) -> VesselTree:
 
 
 def with_neck(tree: VesselTree, rng, narrow: float | None = None) -> VesselTree:
-    """The tree with its branches up to the neck and the arms.
+    """The tree with its branches extended to the neck and the arms.
 
     Args:
-        tree: with a brachiocephalic artery, upright.
+        tree: upright tree with a brachiocephalic artery.
         rng: source of randomness.
-        narrow: m, radius of a stenosis of the right subclavian artery, or None.
+        narrow: radius of a stenosis of the right subclavian artery, m, or None.
     """
     right, up = np.array([-1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
     back = np.array([0.0, 1.0, 0.0])
 
     def course(name, ways, radii, parent=None, place=0.0):
-        """An artery whose headings are moved a little at random."""
+        """An artery with slightly randomised headings."""
         first = None if parent is None else tuple(ways[0][0])
         moved = ((way + rng.normal(0.0, 0.12, 3), length) for way, length in ways)
         drawn = tuple((tuple(way), length) for way, length in moved)
@@ -272,7 +272,7 @@ def with_vertebral(tree: VesselTree, rng) -> VesselTree:
 def resumed(
     out: Path, cases: Sequence[Any], run: Callable[[Any], dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Rows of a file of JSON lines, after running the cases that are not in it."""
+    """Runs the cases that are not in a file of JSON lines; returns all of its rows."""
     rows = []
     if out.exists():
         rows = [json.loads(line) for line in out.read_text().splitlines()]

@@ -3,9 +3,9 @@
     python benchmarks/import_times.py lumen.obj
 
 Both measured phantoms are written as surfaces in millimetres, Type I also as a label
-map with voxels of 1 mm. Each import is a process of its own, with the field of its
-lumen and the picture, as a user starts it; no field is taken from a cache. The time is
-the median of three, to be measured with nothing else running.
+map with voxels of 1 mm. Each import is a separate process that also builds the field of
+the lumen and the picture; no field comes from a cache. The time is the median of three,
+to be measured with nothing else running.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def surface(name: str, folder: Path) -> Path:
 
 
 def label_map(name: str, folder: Path) -> Path:
-    """NIfTI file of a phantom: label 1 in the lumen, voxels of 1 mm."""
+    """NIfTI file of a phantom, with label 1 in the lumen and voxels of 1 mm."""
     anatomy = phantoms.load(name)
     corners = anatomy.surface.vertices * _MM
     first = np.floor(corners.min(axis=0)) - _BORDER

@@ -31,9 +31,9 @@ SEED = 4_800
 SCALES = (0.7, 1.0, 1.4)  # of the usual size
 TRIANGLES = (3_000, 14_000)
 STEP = 0.5  # mm, between points of a centreline
-GRID = (2.5e-3, 0.3)  # m and of the least radius, at which a surface is marched
-COVERED = 0.6  # of a vessel's own centreline, that is in the tree if it is found
-NAMES = {"aorta", "rva", *BRANCHES}  # of an arch
+GRID = (2.5e-3, 0.3)  # m, and in least radii: step of marching cubes
+COVERED = 0.6  # of a found vessel's own centreline, least share in the tree
+NAMES = {"aorta", "rva", *BRANCHES}  # of vessels of an arch
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Unique, for a line of the results."""
+        """Unique name of the case, for a line of the results."""
         return f"{self.kind}-{self.seed}-{self.scale:g}-{self.triangles}-{self.units}"
 
 
 def cases(seed: int = SEED) -> list[Case]:
-    """Every kind at three scales and two meshings, in turns."""
+    """Cases of every kind at three scales and two meshings, with alternating kinds."""
     order = product(TRIANGLES, SCALES, KINDS)
     return [
         Case(kind, seed + k, scale, triangles, ("mm", "cm", "mm", "m")[k % 4])
@@ -62,7 +62,7 @@ def cases(seed: int = SEED) -> list[Case]:
 
 
 class _Grower:
-    """Adds vessels along corners in mm; every corner is moved a little at random."""
+    """Adds vessels along corners in mm, each of which is slightly randomised."""
 
     def __init__(self, rng: np.random.Generator, shake: float):
         self._rng, self._shake = rng, shake
@@ -81,7 +81,7 @@ class _Grower:
         *,
         joins: str | None = None,
     ) -> None:
-        """A vessel from a share of its parent on; it may end in another one."""
+        """Adds a vessel at a share of its parent's length; it may end in another."""
         trunk = self.vessels[parent].centreline
         start = trunk.at(share * trunk.length).position * 1e3
         ends = [start, *(start + np.array(corners))]
@@ -219,7 +219,7 @@ def truth(case: Case) -> VesselTree:
 
 
 def surface(case: Case, tree: VesselTree) -> Surface:
-    """The closed surface of a tree with about as many triangles as the case asks."""
+    """The closed surface of a tree, with about the triangles of the case."""
     least = min(float(v.centreline.radii.min()) for v in tree.vessels.values())
     fine = lumen_surface(tree, min(GRID[0], max(GRID[1] * least, 0.25e-3)))
     return Surface(*decimated(fine.vertices, np.asarray(fine.faces), case.triangles))
@@ -256,7 +256,7 @@ def run(case: Case) -> dict:
 def compared(
     anatomy: Anatomy, tree: VesselTree, notes: Sequence[str], unit: float
 ) -> dict:
-    """Units, names and vessels of an import against its truth; `unit` is in m."""
+    """Comparison of units, names and vessels with the truth; `unit` in m."""
     size = [
         float(np.linalg.norm(np.ptp(points, axis=0)))
         for points in (anatomy.surface.vertices, lumen_surface(tree, 2e-3).vertices)
@@ -294,7 +294,7 @@ def compared(
 
 
 def passing(anatomy: Anatomy) -> float:
-    """Radius (m) of a device that every route to a goal lets pass."""
+    """Radius (m) of a device that passes every route to a goal, at most 5 Fr."""
     radii = [float(anatomy.route(goal).radii.min()) for goal in anatomy.goals]
     return min([0.84e-3, *radii])
 
@@ -307,7 +307,7 @@ def places(note: str) -> Iterator[np.ndarray]:
 
 
 def report(rows: list[dict]) -> Report:
-    """What was found of all trees, and a table with a line for each kind."""
+    """Checks and counts over all trees, and a table with a line for each kind."""
     kinds = dict.fromkeys(row["kind"] for row in rows)
     groups = {kind: [row for row in rows if row["kind"] == kind] for kind in kinds}
     groups["**all**"] = rows
@@ -323,7 +323,7 @@ def report(rows: list[dict]) -> Report:
 
 
 def counted(rows: list[dict]) -> dict[str, int]:
-    """Trees and vessels by what an import made of them."""
+    """Numbers of trees and vessels by the result of the import."""
     fine = [row for row in rows if "found" in row]
     return {
         "number": len(rows),
@@ -340,7 +340,7 @@ def counted(rows: list[dict]) -> dict[str, int]:
 
 
 def main() -> int:
-    """Run what is not in the file yet, and print the table."""
+    """Run the cases that are not in the file yet, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="JSON lines, one per case; resumed")
     parser.add_argument("--only", default="", help="part of a case's name")

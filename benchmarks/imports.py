@@ -23,9 +23,9 @@ from cathsim_dmc.cli.options import show
 from cathsim_dmc.validation.checks import Check, Report
 
 ENTRY = 20e-3  # m, distance of the inlet from the end of the descending aorta
-LONG = 22e-3  # m past its ostium: shorter branches need no name
-CLEAR = 6e-3  # m past an ostium, from which on a vessel is told from its parent
-MARGIN = 15e-3  # m at the ends of the aorta at which its radius is not compared
+LONG = 22e-3  # m past its ostium; shorter branches need no name
+CLEAR = 6e-3  # m past an ostium, beyond which a vessel differs from its parent
+MARGIN = 15e-3  # m at the ends of the aorta, where its radius is not compared
 WORDS = ("right", "asked", "wrong", "refused")
 
 
@@ -54,7 +54,7 @@ def run(case: Case) -> dict:
 
 
 def compared(anatomy: Anatomy, tree: VesselTree, back: np.ndarray) -> dict:
-    """Names, entry and radii of an import against its truth."""
+    """Comparison of names, entry and radii of an import with the truth."""
     wrong, missing = [], []
     found = {}
     for name, vessel in anatomy.tree.vessels.items():
@@ -67,7 +67,7 @@ def compared(anatomy: Anatomy, tree: VesselTree, back: np.ndarray) -> dict:
         if name in (*BRANCHES, "rva") and name not in (first, last):
             wrong.append(f"{name} is {first}")
     for name, vessel in tree.vessels.items():
-        if "_" in name:  # a second branch of a phantom's vessel, without a name
+        if "_" in name:  # an unnamed second branch of a phantom's vessel
             continue
         visible = vessel.centreline.length - vessel.ostium > LONG
         if vessel.parent is not None and visible and name not in found:
@@ -95,7 +95,7 @@ def compared(anatomy: Anatomy, tree: VesselTree, back: np.ndarray) -> dict:
 
 
 def whose(tree: VesselTree, points: np.ndarray) -> tuple[str, str]:
-    """Vessels in which the first and the last third of some points lie."""
+    """Names of the vessels that hold the first and the last third of points (n, 3)."""
     names = [name.split("_")[0] for name in tree.vessels]
     depth = np.stack(list(tree.depths(points).values()))
     owner = depth.argmax(axis=0)
@@ -107,7 +107,7 @@ def whose(tree: VesselTree, points: np.ndarray) -> tuple[str, str]:
 
 
 def report(rows: list[dict]) -> Report:
-    """Counts of all cases and of those that show their names, and their table."""
+    """Counts of all cases and of those with visible names, and their table."""
     groups = defaultdict(list)
     for row in rows:
         groups[row["kind"]].append(row)
@@ -130,7 +130,7 @@ def report(rows: list[dict]) -> Report:
 
 
 def counted(rows: list[dict]) -> dict[str, int]:
-    """How many cases ended in each of `WORDS`."""
+    """Number of cases with each result of `WORDS`."""
     return {word: sum(row["names"] == word for row in rows) for word in WORDS}
 
 
@@ -144,7 +144,7 @@ def _line(kind: str, rows: list[dict]) -> str:
 
 
 def main() -> int:
-    """Run what is not in the file yet, and print the table."""
+    """Run the cases that are not in the file yet, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="JSON lines, one per case; resumed")
     parser.add_argument("--only", default="", help="part of a case's name")

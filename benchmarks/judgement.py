@@ -3,7 +3,7 @@
 import dataclasses
 from importlib.metadata import version
 
-# torchrl goes before dm_control.
+# torchrl must be imported before dm_control.
 from cathsim_dmc.agents import evaluation  # isort: skip
 
 import numpy as np
@@ -16,10 +16,10 @@ from cathsim_dmc.tasks.config import MAX_STEPS
 from cathsim_dmc.tasks.placement import sheath_direction
 
 EPISODES = 30  # published
-_DIGITS = 6  # significant ones of a number in a list
-# Options that say what the device, its surroundings and the observations are. All
-# others (reward, goal radius, length of an episode, randomisation, starts) may differ
-# in training and are the published ones in the evaluation.
+_DIGITS = 6  # significant digits of a number in a list
+# Options of the device, its surroundings and the observations. All others (reward, goal
+# radius, length of an episode, randomisation, starts) may differ in training; the
+# evaluation uses the published ones.
 _KEPT = frozenset(
     {
         *("anatomy", "access", "goal", "device", "rotation", "friction"),
@@ -32,9 +32,10 @@ _PACKAGES = ("mujoco", "dm-control", "torch", "torchrl", "tensordict", "numpy", 
 
 
 def published_options(task_kwargs):
-    """Options of a task for the evaluation of what was trained with others.
+    """Options of a task for the published evaluation, from those of a training.
 
-    Reward and rule of success are the task's own, the number of steps the published.
+    Reward and criterion of success are the task's, the number of steps is the published
+    one.
     """
     kept = {name: value for name, value in task_kwargs.items() if name in _KEPT}
     return {**kept, "max_steps": MAX_STEPS}
@@ -43,7 +44,7 @@ def published_options(task_kwargs):
 def judge(policy, task, task_kwargs, episodes=EPISODES, name=None, num_threads=None):
     """Evaluate a policy; return the result and the map of its contact forces.
 
-    The map is None where every episode has an anatomy of its own.
+    The map is None if each episode has another anatomy.
     """
     log = evaluation.ContactLog()
     found = evaluation.evaluate(
@@ -61,15 +62,15 @@ def judge(policy, task, task_kwargs, episodes=EPISODES, name=None, num_threads=N
 def judge_each_arch(policy, task, task_kwargs, arches, name=None, numbers=None):
     """Evaluate a policy in every arch of a set, one episode each.
 
-    Arches before whose inlet no sheath fits are passed over.
+    Arches without room for a sheath at the inlet are left out.
 
     Args:
-        policy: As for `evaluation.evaluate`.
+        policy: Policy, as in `evaluation.evaluate`.
         task: Name of a task with random arches.
         task_kwargs: Options of the task.
         arches: Name of the set, such as "test".
         name: Name of the policy for the reports.
-        numbers: Numbers of the arches in the set; None for all.
+        numbers: Indices of the arches in the set; None for all.
 
     Returns:
         The result, and the kind of arch of each episode.
@@ -103,7 +104,7 @@ def judge_each_arch(policy, task, task_kwargs, arches, name=None, numbers=None):
 
 
 def episode_figures(found):
-    """Figures of every episode of an `EvaluationResult`, in the order of the seeds."""
+    """Measures of every episode of an `EvaluationResult`, in the order of the seeds."""
     names = {name: name for name in _EPISODE} | {f: f"forces.{f}" for f in FIGURES}
     return {
         name: numbers(
@@ -114,7 +115,7 @@ def episode_figures(found):
 
 
 def map_values(contacts):
-    """A force map as JSON: only cells with contacts, row after row from below."""
+    """A force map as JSON values: cells with contacts only, row by row from below."""
     index = np.flatnonzero(contacts.count)
     return {
         "x": [float(contacts.x_edges[0]), float(contacts.x_edges[-1])],
@@ -143,7 +144,7 @@ def map_from_values(values):
 
 
 def numbers(values):
-    """Numbers short enough for a file; whole ones as integers."""
+    """Numbers rounded for a file; whole ones as integers."""
     return [
         v if v is None else int(v) if v == int(v) else float(f"{v:.{_DIGITS}g}")
         for v in values
@@ -151,5 +152,5 @@ def numbers(values):
 
 
 def versions():
-    """Versions of this package and those that results depend on."""
+    """Versions of this package and of packages that results depend on."""
     return {name: version(name) for name in ("cathsim-dmc", *_PACKAGES)}

@@ -2,8 +2,8 @@
 
     python benchmarks/long_load.py --steps 1000000 --out runs/long-load.json
 
-A control step is one of one simulation: 16 simulations make 16 of them at once. At the
-end the same steps are timed here and in a fresh process, in alternation.
+Control steps are counted for each simulation: a step of 16 simulations counts 16. At
+the end the same steps are timed here and in a fresh process, in alternation.
 Exit code 1: a bound was broken.
 
 Bounds: memory grows by less than 20 MB after the warm-up; the speed at the end is at
@@ -26,7 +26,7 @@ from cathsim_dmc.simulation.batch import BatchSimulation
 GROWTH = 20e6  # bytes
 SPEED = 0.95
 WARM_UP = 0.1  # of all steps
-RESET = 0.002  # chance that a simulation starts anew, each control step
+RESET = 0.002  # probability of a reset of a simulation in each control step
 HOLD = 10  # control steps between two draws of the actions
 
 
@@ -47,7 +47,7 @@ class Load:
         self.resets = self.errors = self.not_finite = self.count = 0
 
     def run(self, calls: int) -> float:
-        """Steps so often; returns control steps per second."""
+        """Makes `calls` steps of the batch; returns control steps per second."""
         start, size = time.perf_counter(), len(self.action)
         for _ in range(calls):
             if self.count % HOLD == 0:
@@ -66,7 +66,7 @@ class Load:
         return calls * size / (time.perf_counter() - start)
 
     def time(self, number: int, calls: int) -> float:
-        """Control steps per second in a stretch that is the same in every process."""
+        """Control steps per second of a run that is the same in every process."""
         self.batch.seed(number)
         self.batch.reset()
         self.random, self.count = np.random.default_rng(number), 0
@@ -74,12 +74,12 @@ class Load:
 
     @property
     def warnings(self) -> int:
-        """MuJoCo's own counters."""
+        """Number of MuJoCo warnings, by its own counters."""
         return int(np.sum(self.batch.batch.warning))
 
 
 def memory() -> int:
-    """Resident bytes of this process."""
+    """Resident memory of this process, bytes."""
     gc.collect()
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
@@ -88,7 +88,7 @@ def memory() -> int:
 
 
 def serve(load: Load, calls: int) -> None:
-    """Times stretches when told to by a line on standard input."""
+    """Times a run for each line on standard input."""
     load.run(calls)
     print("ready", flush=True)
     for line in sys.stdin:
@@ -98,7 +98,7 @@ def serve(load: Load, calls: int) -> None:
 def in_turns(
     load: Load, arguments: argparse.Namespace, calls: int
 ) -> list[list[float]]:
-    """Speeds here and in a fresh process, in turns."""
+    """Speeds in this and in a fresh process, measured in alternation."""
     command = [sys.executable, __file__, "--serve", str(calls)]
     for name in ("task", "simulations", "threads", "seed"):
         command += [f"--{name}", str(getattr(arguments, name))]

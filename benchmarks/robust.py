@@ -4,10 +4,9 @@ python benchmarks/robust.py pretrained:navigator --out runs/navigator.jsonl
 python benchmarks/robust.py expert --out runs/expert.jsonl --only anatomies
 python benchmarks/robust.py pretrained:navigator_pair --pair --out runs/pair.jsonl
 
-Every cell is a line of the file as soon as it has been played; the same command goes on
-with those that are missing. With --ray the machines of a Ray cluster play them, see
-docs/cluster.md. docs/scripts/robust.py makes the tables of
-docs/robustness.md.
+Every cell becomes a line of the file when it has been played; the same command
+continues with the missing cells. With --ray the machines of a Ray cluster play them,
+see docs/cluster.md. docs/scripts/robust.py makes the tables of docs/robustness.md.
 """
 
 import dataclasses
@@ -22,7 +21,7 @@ import numpy as np
 import torch
 import tyro
 
-# torchrl goes before dm_control.
+# torchrl must be imported before dm_control.
 from cathsim_dmc.agents import evaluation, protocols  # isort: skip
 
 from cathsim_dmc import cluster, files, suite
@@ -39,8 +38,8 @@ from cathsim_dmc.tasks.anatomies import load_anatomy
 GOALS = ("bca", "lcca", "lsa")
 ACCESSES = ("ascending", "descending")
 PHANTOMS = ("type1", "type2", "type3", "bovine")
-PAIR = suite.COAXIAL["pair"][0]  # driven from the groin
-# What the device and the surroundings of one episode may differ in, one at a time.
+PAIR = suite.COAXIAL["pair"][0]  # with femoral access
+# Randomised properties of device and surroundings, one at a time.
 CHANGES = {
     "none": {},
     **{
@@ -52,15 +51,15 @@ CHANGES = {
     },
     "goal": {"goal_shift": (-5e-3, 5e-3)},
 }
-# Radii of a branch that is too narrow for one device or all, m, from so far behind its
-# ostium on; between them the lumen tapers.
+# Radii, m, to which a branch narrows, too narrow for some devices or all; and length,
+# m, past its ostium over which it tapers.
 NARROW, TAPER = (0.6e-3, 0.8e-3, 1.0e-3, 1.2e-3), 10e-3
 Part = Literal["arches", "neck", "variants", "anatomies", "changes", "narrow"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """Episodes that are counted together."""
+    """Episodes that are evaluated together."""
 
     part: str
     labels: Mapping[str, str | None]
@@ -79,7 +78,7 @@ def _arch(pair):
 
 
 def arches(pool=None, pair=False):
-    """Every held-out arch once, or so many, for each branch and access."""
+    """The first `pool` held-out arches, or all, once for each branch and access."""
     pool = pool or len(arch.arch_set("test"))
     for goal in GOALS:
         for access in _accesses(pair):
@@ -89,7 +88,7 @@ def arches(pool=None, pair=False):
 
 
 def neck(pool=None, pair=False):
-    """Every held-out arch with the arteries of neck and arms once, for each goal."""
+    """The first `pool` held-out arches with a neck, or all, once for each goal."""
     pool = pool or len(arch.arch_set("test_neck"))
     for goal in WITH_NECK:
         where = {"arches": "test_neck", "goal": goal}
@@ -98,10 +97,10 @@ def neck(pool=None, pair=False):
 
 
 def variants(pair=False, episodes=4):
-    """Held-out arches of type III, bovine ones and aberrant ones, each by itself.
+    """Held-out arches of type III, bovine and aberrant ones, with a cell for each.
 
-    The branch and the access of an arch follow from its number. Arches with another
-    number of goals have no place in one pool.
+    The branch and the access of an arch follow from its number. A pool cannot hold
+    arches with different numbers of goals.
     """
     access = ACCESSES[1] if pair else "any"
     where = {"goal": "any", "access": access, "arches": "test_variants", "pool": 1}
@@ -124,7 +123,7 @@ def anatomies(names, pair=False, wanted=GOALS, episodes=20):
 
 
 def narrowed(seed: arch.ArchSeed, branch: str, radius: float) -> Anatomy:
-    """An arch entered from the groin, one of whose branches narrows to a radius, m."""
+    """An arch with femoral access, one branch of which narrows to a radius, m."""
     tree = arch_tree(seed.parameters())
     vessel, line = tree.vessel(branch), tree.vessel(branch).centreline
     ways = np.linalg.norm(np.diff(line.points, axis=0), axis=1)
@@ -141,7 +140,7 @@ def narrowed(seed: arch.ArchSeed, branch: str, radius: float) -> Anatomy:
 
 
 def narrow(pair=False, episodes=2, branch="lcca"):
-    """Held-out arches with a branch that is too narrow; with each device."""
+    """Held-out arches with a branch that is too narrow, for each of `NARROW`."""
     for radius in NARROW:
         for seed in arch.arch_set("test")[:3]:
             where = {"arch": seed.name, "radius": f"{1e3 * radius:g}"}
@@ -169,7 +168,7 @@ def changes(pair=False, episodes=20):
 
 
 def play(policy: str, cell: Cell, player=None, threads: int | None = None) -> dict:
-    """The line of a cell, of a policy that is loaded already or that has a name."""
+    """Plays a cell and returns its line; `player` is the policy if it is loaded."""
     began, player = time.monotonic(), player or load_policy(policy)
     # A policy that reads images needs the planes that it was trained with.
     planes = (player.task_kwargs or {}).get("fluoroscopy")
@@ -209,21 +208,21 @@ def play(policy: str, cell: Cell, player=None, threads: int | None = None) -> di
 
 
 def _play_apart(job):
-    """The line of a cell, in a process of a cluster."""
+    """The line of a cell, played in a process of a cluster."""
     policy, cell, player, threads, of_torch = job
     torch.set_num_threads(of_torch)  # rounding depends on it
     return play(policy, cell, player, threads)
 
 
 def _device(cell, drawn):
-    """Name of the device of an episode; of coaxial ones the names of all."""
+    """Name of the device of an episode; the names of all coaxial devices."""
     own = suite.TASKS[cell.task].options.get("devices", ())
     devices = cell.options.get("devices", own)
     return " in ".join(devices) or drawn.get("device")
 
 
 def _kind(cell, drawn):
-    """Kind of the arch that an episode plays, such as "II bovine_trunk"."""
+    """Kind of the arch of an episode, such as "II bovine_trunk"."""
     if "arches" not in cell.options:
         return None
     number = drawn.get("arch", cell.options.get("first"))
@@ -232,7 +231,7 @@ def _kind(cell, drawn):
 
 
 def _shares(groups, reached):
-    """[successes, episodes] of each group."""
+    """Lists [successes, episodes] by group."""
     counts = {}
     for group, good in zip(groups, reached, strict=True):
         count = counts.setdefault(group or "default", [0, 0])
@@ -266,7 +265,7 @@ class Selection:
     episodes: int = 20
 
     def cells(self):
-        """The cells in turn."""
+        """Yields the cells in order."""
         makers = {
             "arches": lambda: arches(self.pool, self.pair),
             "neck": lambda: neck(self.pool, self.pair),
@@ -320,7 +319,7 @@ def main(
         with out.open("a") as file:
             file.write(found[number] + "\n")
         print(cell.part, cell.labels, line["success"], "of", cell.episodes)
-    if ray:  # which finishes them in another order
+    if ray:  # the cluster finishes cells in another order
         lines += [found[number] for number in sorted(found)]
         files.write_text(out, "".join(f"{line}\n" for line in lines))
 

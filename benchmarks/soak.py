@@ -3,24 +3,23 @@
     python benchmarks/soak.py --out runs/soak          # 100 episodes of 2,000 steps
     python benchmarks/soak.py --out runs/soak --quick  # 16 episodes of 200 steps
 
-Every finished episode is one line of OUT/episodes.jsonl, written as soon as its batch
-ends; the same command goes on with the episodes that are missing. The report is
-printed and left in OUT/soak.json and OUT/soak.md. Exit code 1: a bound was broken.
+Every finished episode is one line of OUT/episodes.jsonl, written when its batch ends;
+the same command continues with the missing episodes. The report is printed and written
+to OUT/soak.json and OUT/soak.md. Exit code 1: a bound was broken.
 
-What is measured
-- penetration: depth of the device in the wall pieces, of every contact in every
-  physics substep (MuJoCo's `dist`). Percentiles are those of the deepest contact of
-  a substep, over the substeps that have a contact.
+Measured quantities
+- penetration: penetration depth of every contact with the wall in every physics substep
+  (MuJoCo's `dist`). Percentiles are those of the deepest contact of a substep, over the
+  substeps that have a contact.
 - wall force: magnitude of every single contact in every substep, and their sum.
-- excess: every control step, by how much the device stands out of the true lumen (or
-  of the sheath), at points 1 mm apart along its axis: `containment.py`. It adds
-  what the wall pieces stay behind the lumen to the penetration.
+- excess: protrusion of the device from the lumen (or the sheath) in every control step,
+  at points 1 mm apart along its axis, with and without contacts: `containment.py`.
 - escape: the excess exceeds the device's diameter, so that a part of the device is
-  wholly outside.
-- tip step: largest change of the place of the device's end in a control step.
+  entirely outside.
+- tip step: largest displacement of the device's end in a control step.
 - warnings: MuJoCo's own counters.
 
-A goal does not end an episode here: its radius is tiny.
+Goals do not end episodes: their radius is tiny.
 """
 
 import argparse
@@ -40,7 +39,7 @@ from cathsim_dmc import files, suite
 from cathsim_dmc.physics import forces
 from cathsim_dmc.simulation.batch import BatchSimulation
 
-# Both arches from both sides: a goal does not change what these policies do.
+# Both arches from both accesses; the goal does not affect these policies.
 TASKS = ("type1_lcca", "type2_lcca", "femoral_type1_lcca", "femoral_type2_lcca")
 EPISODES, STEPS = 100, 2000
 QUICK_EPISODES, QUICK_STEPS = 16, 200
@@ -51,24 +50,24 @@ PENETRATION_P99 = 0.3e-3  # m
 PENETRATION_MAX = 1e-3  # m
 FORCE_MAX = 10.0  # N
 
-# Penetrations are counted in bins, so that percentiles of all episodes together come
-# from their lines alone.
-BIN, BINS = 1e-6, 10_000  # m; the last bin holds all above
+# Penetrations are counted in bins, so that percentiles over all episodes follow from
+# their lines.
+BIN, BINS = 1e-6, 10_000  # m; the last bin holds all larger ones
 
-# Control steps between two changes of the action, where a policy changes it.
+# Most control steps between two changes of the action.
 LONGEST_HOLD = 100
 
 
-# Policies: (control steps, seed) -> actions (T, 21) in [-1, 1].
+# Policies: (control steps, size of an action, seed) -> actions (T, A) in [-1, 1].
 
 
 def halton_noise(steps: int, size: int, seed: int) -> np.ndarray:
-    """Low-discrepancy noise, new at every control step."""
+    """Low-discrepancy noise, with a new value at every control step."""
     return 2 * qmc.Halton(size, seed=seed).random(steps) - 1
 
 
 def full_push(steps: int, size: int, seed: int) -> np.ndarray:
-    """Forward at full speed to the end, the tip held: straight, or curled anyhow."""
+    """Forward at full speed with a constant command of the tip, straight or curled."""
     random = np.random.RandomState(seed)
     tip = random.choice([-1.0, 1.0], size=size) * random.choice([0.0, 0.5, 1.0])
     tip[-1] = 1.0
@@ -76,7 +75,7 @@ def full_push(steps: int, size: int, seed: int) -> np.ndarray:
 
 
 def bang_bang(steps: int, size: int, seed: int) -> np.ndarray:
-    """All motors of the tip from one stop to the other, forward all the time.
+    """All motors of the tip alternate between their limits, with a constant push.
 
     The period differs between seeds; the shortest is one control step.
     """
@@ -89,7 +88,7 @@ def bang_bang(steps: int, size: int, seed: int) -> np.ndarray:
 
 
 def reversals(steps: int, size: int, seed: int) -> np.ndarray:
-    """Push and pull at full speed in turn, with a new stop of the tip each time."""
+    """Push and pull at full speed alternate, each with a new extreme tip command."""
     random = np.random.RandomState(seed)
     action = np.empty((steps, size))
     start, direction = 0, 1.0
@@ -111,7 +110,7 @@ POLICIES: dict[str, Callable[[int, int, int], np.ndarray]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Episode:
-    """One episode to run; `seed` is that of its start and of its policy."""
+    """One episode to run; `seed` is that of the environment and of the policy."""
 
     number: int
     task: str
@@ -137,7 +136,7 @@ def plan(
 
 @dataclasses.dataclass
 class Peak:
-    """A largest value of each simulation, and the control step it fell into."""
+    """Largest value in each simulation, and the control step of it."""
 
     value: np.ndarray
     step: np.ndarray
@@ -153,12 +152,12 @@ class Peak:
 
 
 def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> list[dict]:
-    """Runs the episodes, all of one task, side by side.
+    """Runs episodes of one task in a batch.
 
     Args:
-      simulation: of the task, with as many simulations as there are episodes.
-      episodes: what to run.
-      steps: control steps.
+      simulation: batch of the task with a simulation for each episode.
+      episodes: episodes to run.
+      steps: number of control steps.
 
     Returns:
       One row for each episode.
@@ -238,12 +237,12 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
 
 
 def read_rows(path: Path, steps: int) -> list[dict]:
-    """Rows of a file that this program wrote; a torn last line is dropped.
+    """Rows of a file that this program wrote, without an incomplete last line.
 
-    So are rows that lack a figure of today, to be run again.
+    Rows without `tip_step_max` are dropped too, so that they run again.
 
     Raises:
-      ValueError: if they are of another number of steps.
+      ValueError: if they have another number of steps.
     """
     if not path.is_file():
         return []
@@ -263,12 +262,12 @@ def read_rows(path: Path, steps: int) -> list[dict]:
 
 
 def write_rows(path: Path, rows: list[dict]) -> None:
-    """Replaces the file in one step: a reader finds all rows or the old ones."""
+    """Replaces the file atomically."""
     files.write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
 
 
 def percentile(rows: list[dict], percent: float) -> float:
-    """Percentile of the penetration of all rows together, m (0 without contact)."""
+    """Percentile of the penetration over all rows, m (0 without contact)."""
     counts: dict[int, int] = {}
     for row in rows:
         for key, count in row["penetration_histogram"].items():
@@ -283,7 +282,7 @@ def percentile(rows: list[dict], percent: float) -> float:
 
 
 def summarise(rows: list[dict]) -> dict:
-    """Figures of a set of episodes; lengths in mm, forces in N."""
+    """Statistics of a set of episodes; lengths in mm, forces in N."""
     return {
         "episodes": len(rows),
         "warnings": sum(row["warnings"] for row in rows),
@@ -300,7 +299,7 @@ def summarise(rows: list[dict]) -> dict:
 
 
 def report(rows: list[dict]) -> dict:
-    """Checks and figures, as every measuring command reports them."""
+    """Checks and statistics in the format of all measuring commands."""
     total = summarise(rows)
 
     def check(name, value, unit, bound):
@@ -354,7 +353,7 @@ def report(rows: list[dict]) -> dict:
 
 
 def markdown(result: dict) -> str:
-    """The report as tables."""
+    """The report as Markdown tables."""
     lines = [
         "| check | measured | bound | |",
         "|---|---|---|---|",

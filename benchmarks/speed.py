@@ -3,7 +3,7 @@
     python benchmarks/speed.py --json   (with nothing else running)
     python benchmarks/speed.py --short  (real-time factors and overhead alone)
 
-The two sides of a ratio take turns, so that a machine whose speed drifts bends neither.
+The two sides of a ratio alternate, so that a drift of the machine's speed cancels.
 """
 
 import argparse
@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 
 # isort: off
-# torchrl goes before dm_control.
+# torchrl must be imported before dm_control.
 import torch
 from cathsim_dmc.simulation.torchrl import BatchedEnv
 
@@ -42,14 +42,14 @@ from cathsim_dmc.validation.pace import (
 )
 
 DEPTHS = (0.0, 0.1, 0.2, 0.3, np.inf)  # m of insertion, edges of the bins
-# Long enough that the deepest bin is reached, m, in so many steps.
+# Working length, m, and control steps with which the deepest bin is reached.
 _LONG, _LONG_STEPS = 0.42, 215
 NUM_SIMULATIONS = 16
 _RUNS = 12
 
 
 def everything(say: Callable[[str], None]) -> Report:
-    """The checks of `speed`, further ones, and tables."""
+    """Report with the checks of `speed`, further checks, and tables."""
     base = speed(say)
     say("by insertion depth")
     long = load(working_length=_LONG)
@@ -106,11 +106,11 @@ _HOOKS = {
 
 
 def account(policy: str, steps: int = 150, runs: int = 7) -> dict[str, float]:
-    """Where a control step goes.
+    """CPU time of a control step by stage.
 
     The stages of `mj_step` come from MuJoCo's own timers, whose shares are applied to
-    the time it takes without them. What is left of a step beside `mj_step` and the
-    hooks of the task is composer's: its schedule, its buffers, and the observation.
+    the time of `mj_step` without timers. The rest of a step, beside `mj_step` and the
+    hooks of the task, belongs to composer: schedule, buffers, and observation.
 
     Returns:
       CPU time of each stage in a control step, µs; they add up to the whole.
@@ -144,7 +144,7 @@ def account(policy: str, steps: int = 150, runs: int = 7) -> dict[str, float]:
 
 @contextlib.contextmanager
 def _timed_hooks(task) -> Iterator[dict[str, float]]:
-    """CPU seconds in the hooks of a task, while the context is open."""
+    """Context that measures CPU seconds in the hooks of a task."""
     seconds = dict.fromkeys(_HOOKS, 0.0)
 
     def timed(name: str) -> Callable:
@@ -168,7 +168,7 @@ def _timed_hooks(task) -> Iterator[dict[str, float]]:
 
 @contextlib.contextmanager
 def _mujoco_timers(data: mujoco.MjData) -> Iterator[Callable[[str], float]]:
-    """MuJoCo's timers, read by name, running while the context is open."""
+    """Context with MuJoCo's timers running; yields a function that reads them."""
 
     def read(stage: str) -> float:
         return data.timer[int(getattr(mujoco.mjtTimer, f"mjTIMER_{stage}"))].duration
@@ -190,11 +190,11 @@ def _batch(threads: int, seed: int = 0, **options):
 
 
 def thread_scaling(steps: int = 30) -> tuple[list[float], float, dict[str, float]]:
-    """Throughput of bare batches on two threads over one.
+    """Throughput of bare batches on two threads relative to one.
 
     Returns:
-      the ratios; their median if the same work took the same CPU time on two cores as
-      on one, as it does where nobody else uses them; control steps a second.
+      the ratios; their median, corrected to equal CPU time on one and two cores, as on
+      an idle machine; control steps per second.
     """
     batches = {threads: _batch(threads) for threads in (1, 2)}
     shape = (steps, NUM_SIMULATIONS, batches[1].num_actions)
@@ -225,7 +225,7 @@ def thread_scaling(steps: int = 30) -> tuple[list[float], float, dict[str, float
 
 
 def torchrl_overhead(steps: int = 30, threads: int = 1) -> tuple[list[float], float]:
-    """Time of TorchRL batched steps over bare `Batch.step`, and steps a second."""
+    """Time of TorchRL batched steps divided by `Batch.step`, and steps per second."""
     torch.set_num_threads(1)
     env = BatchedEnv(
         "type1_bca",
@@ -288,7 +288,7 @@ _OBSERVED = ("internal", "image")
 
 
 def image_ratio(steps: int = 20) -> list[float]:
-    """Rate of a batch that observes images over one of `internal`, same actions."""
+    """Rate of a batch with image observations relative to `internal`, same actions."""
     simulations = [_batch(1, observation=o) for o in _OBSERVED]
     ratios = []
     for run in range(_RUNS + 1):
@@ -307,7 +307,7 @@ def image_ratio(steps: int = 20) -> list[float]:
 
 
 def _overheads() -> tuple[list[Check], dict[str, float]]:
-    """Ratios, and control steps per second of batches."""
+    """Checks of the ratios, and control steps per second of batches."""
     torchrl, rate = torchrl_overhead()
     threads, undisturbed, rates = thread_scaling()
     cores = f"; {undisturbed:.2f} x at equal speed of the cores"
@@ -367,7 +367,7 @@ def _processes() -> list[Check]:
 
 
 def _in_fresh_process(code: str, runs: int = RUNS, **environment: str) -> float:
-    """Median of the number that a fresh interpreter prints."""
+    """Median of the last number that fresh interpreters print."""
     command, own = [sys.executable, "-c", code], {**os.environ, **environment}
     return statistics.median(
         float(subprocess.check_output(command, text=True, env=own).split()[-1])
@@ -384,8 +384,8 @@ def _import_seconds(statement: str) -> float:
 
 def peak_memory() -> float:
     """Peak memory of a process that loads a task and steps it, without OpenGL, MB."""
-    # The kernel's high-water mark of the address space: ru_maxrss would hold what the
-    # parent had when it forked.
+    # VmHWM is that of the process itself: ru_maxrss would include the memory of the
+    # parent at the fork.
     return _in_fresh_process(
         "from cathsim_dmc import suite; "
         "env = suite.load('cathsim', 'type1_bca'); env.reset(); "

@@ -1,12 +1,12 @@
-"""Trains and evaluates the agents of docs/results.md, as far as they are missing.
+"""Trains and evaluates the missing agents of docs/results.md.
 
     python benchmarks/trainings.py
     python benchmarks/trainings.py --only lcca-sac --list
 
-Stopped at any moment, it continues where it was. Each cell of grid.toml (task,
-algorithm, preset, observation, seed) is trained in a folder of its own; when it is
-finished, its evaluation by the published rule appears as a JSON file. With --ray the
-machines of a Ray cluster train the cells, see docs/cluster.md.
+An interrupted run continues from its last checkpoint. Each cell of grid.toml (task,
+algorithm, preset, observation, seed) is trained in its own folder; its evaluation by
+the published rule is written to a JSON file at the end. With --ray the machines of a
+Ray cluster train the cells, see docs/cluster.md.
 """
 
 import dataclasses
@@ -38,18 +38,18 @@ from cathsim_dmc.cli.options import BAD_INPUT, CHECK_FAILED, INTERRUPTED
 HERE = Path(__file__).parent
 FORMAT = 2
 POINTS = 200  # of the learning curve
-SOLVED = 0.9  # success rate that "solved" stands for
+SOLVED = 0.9  # success rate of a solved task
 GUIDED = (
     0.05  # share of an expert's control steps above which an episode is not counted
 )
-# Columns of metrics.csv that make the learning curve, as far as they are there.
+# Columns of metrics.csv in the learning curve, if present.
 _CURVE = ("frames", "seconds", "episodes", "episode_reward", "episode_length")
 _CURVE += ("success", "distance", "mean_force", "max_force")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Cell:
-    """One training with its evaluation; grid.toml tells what the fields mean."""
+    """One training with its evaluation; grid.toml describes the fields."""
 
     label: str
     task: str
@@ -64,7 +64,7 @@ class Cell:
 
     @property
     def name(self):
-        """Name of its folder and its JSON file."""
+        """Name of the folder and of the JSON file of the cell."""
         observation = self.observation
         if not isinstance(observation, str):
             observation = "+".join(observation)
@@ -72,11 +72,11 @@ class Cell:
         return "-".join(part for part in (*parts, f"seed{self.seed}") if part)
 
     def to_dict(self):
-        """JSON-able values, with the name."""
+        """The fields and the name as JSON values."""
         return {"name": self.name, **dataclasses.asdict(self)}
 
     def config(self):
-        """Settings of the training; ConfigError names what is not allowed."""
+        """Configuration of the training; ConfigError names an invalid setting."""
         settings = {
             name: value.replace("{task}", self.task)
             if isinstance(value, str)
@@ -108,12 +108,12 @@ class Cell:
 
 
 def read_grid(path=HERE / "grid.toml"):
-    """The cells of a grid file, in the order in which they are to be run.
+    """The cells of a grid file in the order of their runs.
 
     Within a row the first seed of every task comes before the second seed of any.
 
     Raises:
-        ValueError: it cannot be read, or a row says something that cannot be.
+        ValueError: if the file cannot be read, or a row is invalid.
     """
     cells, where = {}, ""
     try:
@@ -139,7 +139,7 @@ def read_grid(path=HERE / "grid.toml"):
 
 
 class Result(NamedTuple):
-    """A finished cell, as its file tells it."""
+    """Content of the file of a finished cell."""
 
     path: Path
     values: dict[str, Any]
@@ -151,7 +151,7 @@ class Result(NamedTuple):
 
 
 def read_result(path):
-    """The result in the file of a cell; ValueError names one that is damaged."""
+    """The result in the file of a cell; ValueError if the file is damaged."""
     try:
         values = json.loads(Path(path).read_text())
         if values["format"] != FORMAT or values["cell"]["name"] != Path(path).stem:
@@ -168,8 +168,8 @@ def read_result(path):
 def standing(cell, runs, results):
     """State of a cell, and a remark.
 
-    The state is "finished", "other settings" (finished with others than the grid's),
-    "begun" (there is a training) or "waiting".
+    The state is "finished", "other settings" (finished with settings that differ from
+    the grid's), "begun" (a training exists) or "waiting".
     """
     path, remark = results / f"{cell.name}.json", ""
     if path.exists():
@@ -192,18 +192,18 @@ def work(cell, runs, results, num_threads=None):
     """Train or continue a cell, evaluate it and write its file.
 
     Args:
-        cell: What to train.
+        cell: Cell to train.
         runs: Directory with a folder for each training.
         results: Directory with a JSON file for each finished cell.
         num_threads: Number of threads of the simulation; None for that of the cell.
 
     Returns:
-        Whether it came to the end; a signal ends the training with a checkpoint.
+        Whether the cell is finished; a signal ends the training with a checkpoint.
     """
     config, folder = cell.config(), runs / cell.name
-    files.require_folder(results, make=True)  # now: a result would be lost
+    files.require_folder(results, make=True)  # checked first, as a result would be lost
     task, options, arches, episodes = cell.evaluated(config)
-    suite.make_task(task, **options)  # refuses options before the training
+    suite.make_task(task, **options)  # refuses invalid options before the training
     resume = (folder / training.CONFIG_FILE).exists()
     threads = config.num_threads if num_threads is None else num_threads
     own = config.replace(num_threads=threads)
@@ -251,7 +251,7 @@ def work(cell, runs, results, num_threads=None):
 
 
 def _work_apart(job):
-    """`work` in a process of a cluster; error of a folder that is not shared."""
+    """`work` in a process of a cluster; FileNotFoundError if `runs` is not shared."""
     cell, runs, results, mark, processors, of_torch = job
     if not mark.exists():
         raise FileNotFoundError(
@@ -263,12 +263,12 @@ def _work_apart(job):
 
 
 def work_on_cluster(cells, runs, results, processors):
-    """`work` on the machines of a cluster, so many processors for each cell.
+    """`work` on the machines of a cluster, with `processors` for each cell.
 
-    A cell begins when that is trained whose policy it starts from.
+    A cell begins after the cell whose policy it starts from.
 
     Yields:
-        Number of a cell that ended, and what `work` returned or the exception.
+        Index of a cell that ended, and the result of `work` or the exception.
     """
     runs, results = runs.resolve(), results.resolve()
     runs.mkdir(parents=True, exist_ok=True)
@@ -286,7 +286,7 @@ def work_on_cluster(cells, runs, results, processors):
 
 
 def write_result(path, values):
-    """Write the file of a cell, one line for each of its parts; return its path."""
+    """Write the file of a cell, with a line for each part; return its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = [
         f"{json.dumps(name)}: {json.dumps(value, allow_nan=False)}"
@@ -304,7 +304,7 @@ def commit():
 
 
 def learning_curve(rows):
-    """At most `POINTS` rows of metrics.csv as columns, the last row among them."""
+    """At most `POINTS` rows of metrics.csv as columns, including the last row."""
     if not rows:
         return {}
     count = min(len(rows), POINTS)
@@ -316,10 +316,10 @@ def learning_curve(rows):
 def solved(rows):
     """Frames and seconds at which the success of training episodes reached `SOLVED`.
 
-    It is the mean over the last 100 finished episodes, so the first 100 are passed
-    over: those that end early are the successful ones. Where an expert acts in more
-    than `GUIDED` of the control steps (DAgger), episodes count afterwards only. None if
-    it never did.
+    Success is the mean over the last 100 finished episodes. The first 100 episodes do
+    not count, because those that end early are the successful ones; nor do episodes in
+    which an expert acts in more than `GUIDED` of the control steps (DAgger). None if
+    success never reached `SOLVED`.
     """
     guided = 0.0
     for row in rows:
@@ -385,7 +385,7 @@ def main(
 
 
 def attempt(cell, runs, results):
-    """What `work` returns, or the exception that ended it."""
+    """Result of `work`, or the exception that ended it."""
     print(f"{cell.name}: begins", flush=True)
     try:
         return work(cell, runs, results)

@@ -23,7 +23,7 @@ _CORE = Section.isotropic(190e-6, METAL_POISSON_RATIO)  # N·m²
 
 
 def variants() -> dict[str, dict[str, Any]]:
-    """Changes of the setting whose effect is reported, by name."""
+    """Changes of the setting by name, for the sensitivities."""
 
     def changed(**change: Callable[[Device], Any]) -> dict[str, Any]:
         devices = {
@@ -49,7 +49,7 @@ def variants() -> dict[str, dict[str, Any]]:
     found["tip bent by 15° more"] = changed(
         tip_shape=lambda d: (Arc(0.03, math.radians(15)), *d.tip_shape)
     )
-    # That of the data sheet; its stiffness is that of a core of nitinol of 0.5 mm.
+    # The taper is that of the data sheet, the stiffness that of a 0.5 mm nitinol core.
     tapered = replace(bench.DEVICES["straight"], shaft=_CORE)
     found["straight tip tapers over 150 mm"] = {
         "device": bench.DEVICES | {"straight": tapered},
@@ -64,12 +64,12 @@ def variants() -> dict[str, dict[str, Any]]:
 
 
 class Experiment(bench.Experiment):
-    """A bench on which the core of a wire may taper."""
+    """A bench with wires whose core may taper."""
 
     def held(
         self, wire: bench_data.Wire, wall: Any, turn: float = 0.0, **changes: Any
     ) -> bench.Held:
-        """A wire on the bench; "taper" by kind of the wire, see `grind`."""
+        """A wire on the bench; the change "taper" is by kind of wire, see `grind`."""
         taper = changes.pop("taper", {}).get(wire.kind)
         held = super().held(wire, wall, turn, **changes)
         if taper is not None:
@@ -78,11 +78,12 @@ class Experiment(bench.Experiment):
 
 
 def grind(rig: Rig, length: float, thinnest: float) -> None:
-    """Lets the core taper: EI goes with the fourth power of its diameter.
+    """Tapers the core of a wire: EI goes with the fourth power of its diameter.
 
     Args:
-        length: from the tip to where the core has its diameter, m.
-        thinnest: of the diameter, at the tip.
+        rig: Rig of the wire, whose hinge stiffness is changed.
+        length: Length of the taper from the tip, m.
+        thinnest: Diameter at the tip relative to the full diameter.
     """
     lengths, stiffness = rig.lengths, rig.device.shaft.bending_stiffness
     share = np.minimum(lengths[::-1].cumsum()[::-1] / length, 1.0)

@@ -3,8 +3,8 @@
     cathsim serve type1_lcca --observation tracking   # in one terminal
     python examples/drive_by_socket.py                # in another
 
-Pushes until the force at the wall exceeds a limit, then withdraws a little and goes on:
-a program in any language does the same with sockets and JSON.
+Pushes until the wall force exceeds a limit, then withdraws a little and continues. A
+program in any language can do the same with sockets and JSON.
 """
 
 import argparse
@@ -23,7 +23,7 @@ def send(sock: socket.socket, kind: str, **fields) -> None:
 
 
 def receive(stream) -> dict:
-    """The next message; ends the program where the device says what is wrong."""
+    """The next message; ends the program on an error or a closed connection."""
     head = stream.read(4)
     if len(head) < 4:
         raise SystemExit("the device is gone")

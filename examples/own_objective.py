@@ -31,7 +31,7 @@ def gentle(
 ):
     """The objective of the task; keyword arguments become options of the task.
 
-    But for `farthest_shift`, how far past its place the task may shift the goal, m.
+    `farthest_shift` is no option: the task passes how far it may shift the goal, m.
     """
     reward = {"distance": -1.0, "success": 10.0, "hard_contact": -tolerance_weight}
     return GentleCannulation.to(
@@ -51,7 +51,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("runs/own_objective"))
     parser.add_argument("--frames", type=int, default=20_000)
     options = parser.parse_args()
-    # The run keeps the name of this module, for whoever evaluates it.
+    # The run keeps the name of this module, which evaluations import.
     config = agents.make_config(
         "ppo", "demo", task=TASK, total_frames=options.frames, modules=["own_objective"]
     )

@@ -17,17 +17,17 @@ from cathsim_dmc.simulation.batch import BatchSimulation
 def best_actions(
     planner: BatchSimulation, snapshot, horizon: int, random: np.random.Generator
 ) -> np.ndarray:
-    """Actions (horizon, A) with the largest sum of rewards of those tried.
+    """Actions (horizon, A) with the largest sum of rewards among random sequences.
 
     Args:
-        planner: As many simulations as sequences are tried.
-        snapshot: State of one simulation, where they begin.
-        horizon: Control steps of a sequence.
-        random: Source of the sequences.
+        planner: Batch with a simulation for each sequence.
+        snapshot: State of one simulation, from which the sequences begin.
+        horizon: Number of control steps of a sequence.
+        random: Source of randomness of the sequences.
     """
     count = planner.num_simulations
     planner.restore(snapshot.repeat(count))
-    # Actions that stay for some steps reach farther than those that change in each.
+    # Actions that are held for some steps reach farther than white noise.
     held = random.uniform(-1.0, 1.0, (horizon // 5 + 1, count, planner.num_actions))
     held[..., -1] = np.abs(held[..., -1])  # forward
     sequences = np.repeat(held, 5, axis=0)[:horizon]
@@ -40,7 +40,7 @@ def best_actions(
 
 
 def main() -> None:
-    """Plays one episode and prints how near the goal it comes."""
+    """Plays one episode and prints the final distance to the goal."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="simple1_bca")
     parser.add_argument("--sequences", type=int, default=32)

@@ -1,19 +1,19 @@
-"""PPO of Stable-Baselines3 on the batch, evaluated and recorded as the package's own.
+"""PPO of Stable-Baselines3 on the batch, evaluated and recorded by the package.
 
     pip install -c constraints.txt -e '.[gym]' stable-baselines3
     python examples/sb3_ppo.py --frames 150000 --out runs/sb3
     python examples/sb3_ppo.py --policy examples/sb3_ppo.safetensors --out runs/shipped
 
-The last command evaluates the policy beside this file, which the one before it trained.
-`PPO_SETTINGS` and `TRAINING` are the settings. The motors of the tip that bend it about
-one axis get one command, so the policy has three outputs: two bends and the
-translation. The evaluation is that of the task: its reward, its start, its time limit.
+The last command evaluates the policy beside this file, which the second one trained.
+`PPO_SETTINGS` and `TRAINING` are the settings. All motors that bend the tip about one
+axis get the same command, so the policy has three outputs: two bends and the
+translation. The evaluation uses the reward, the start and the time limit of the task.
 """
 
 import json
 from pathlib import Path
 
-# torchrl goes before dm_control.
+# torchrl must be imported before dm_control.
 from cathsim_dmc import agents  # isort: skip
 
 import gymnasium
@@ -32,7 +32,7 @@ from cathsim_dmc import files, suite
 from cathsim_dmc.simulation.environments import VECTOR
 
 OBSERVATION = "internal"  # numbers, without images
-# Short episodes from anywhere along the way; the reward is the path that is left.
+# Short episodes start anywhere along the route; the reward is the remaining path.
 TRAINING = {
     "observation": OBSERVATION,
     "max_steps": 120,
@@ -54,20 +54,20 @@ PPO_SETTINGS = {
 
 
 def flat(observation: dict, axes: int = 0) -> np.ndarray:
-    """Entries behind some leading axes as one vector, in the order of their names."""
+    """Entries in the order of their names as one vector (..., n), after `axes` axes."""
     entries = [observation[name] for name in sorted(observation)]
     return np.concatenate([x.reshape(*x.shape[:axes], -1) for x in entries], axis=-1)
 
 
 class Batch(VecEnv):
-    """Gymnasium's vector environment of a task as Stable-Baselines3 takes it.
+    """Adapts Gymnasium's vector environment of a task to Stable-Baselines3.
 
-    One vector to observe, one action for each group of motors.
+    The observation is one vector, the action has one entry for each group of motors.
     """
 
     def __init__(self, task: str, envs: int, **options):
         name = f"cathsim/{task}-v{cathsim_dmc.gym.VERSION}"
-        # The next episode begins in the step that ends one.
+        # The step that ends an episode also begins the next one.
         mode = {"autoreset_mode": "SameStep"}
         self.env = gymnasium.make_vec(name, envs, **mode, **options)
         catheter = self.env.unwrapped.simulation.task.scene.catheter
@@ -109,7 +109,7 @@ class Batch(VecEnv):
 
 
 def policy_of(model: PPO, normalise: VecNormalize, groups: np.ndarray):
-    """A function from observations (N, …) to actions (N, A), as `evaluate` takes it."""
+    """Policy for `evaluate`: a function from observations (N, …) to actions (N, A)."""
 
     def sb3_ppo(observation):
         seen = normalise.normalize_obs(observation[VECTOR].numpy())
@@ -127,7 +127,7 @@ def untrained(task: str, envs: int, seed: int) -> tuple[PPO, VecNormalize]:
 
 
 def save(path: Path, model: PPO, normalise: VecNormalize, **metadata) -> None:
-    """Networks and normalisation as safetensors: unlike pickle, it holds no code."""
+    """Saves networks and normalisation as safetensors, which hold no code."""
     statistics = normalise.obs_rms
     tensors = {f"policy.{name}": x for name, x in model.policy.state_dict().items()}
     for name in ("mean", "var", "count"):
@@ -136,7 +136,7 @@ def save(path: Path, model: PPO, normalise: VecNormalize, **metadata) -> None:
 
 
 def load(path: Path, task: str | None = None) -> tuple[PPO, VecNormalize, dict]:
-    """What `save` wrote; `model.learn` trains it on."""
+    """Loads model, normalisation and metadata of `save`; `model.learn` trains on."""
     with safe_open(path, framework="pt") as file:
         metadata = {name: json.loads(x) for name, x in file.metadata().items()}
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

@@ -2,8 +2,8 @@
 
     python examples/side_wind.py --wind 0 0 0.3
 
-The effect is one class; nothing in the package changes. It acts in every physics step,
-compiled, in the composer environment and in batches alike.
+The effect is one class; nothing in the package changes. Its compiled law acts in every
+physics step, in the composer environment and in batches.
 """
 
 import argparse
@@ -17,19 +17,19 @@ from cathsim_dmc.physics.effects import Effect
 
 
 class Wind(NamedTuple):
-    """What the law reads, of one simulation."""
+    """Parameters of the law, for one simulation."""
 
     force_per_length: Any = Array(3)  # N/m, world frame
     lengths: Any = Array("links")  # m
 
 
 class SideWind(Effect):
-    """The same force per length on every link."""
+    """Effect with the same force per length on every link."""
 
     parameters = Wind
 
     def __init__(self, force_per_length):
-        """Takes (3,), N/m, world frame."""
+        """Takes the force per length (3,), N/m, world frame."""
         self._wind = np.asarray(force_per_length, dtype=float)
 
     def restart(self, index, episode, random_state):

@@ -2,9 +2,9 @@
 
     python examples/train_ppo.py --task type1_lcca --total-frames 300000
 
-It reads from top to bottom: settings, environment, networks, noise, loop, evaluation.
-The settings are those of `cathsim train type1_lcca --preset tuned`, which adds what a
-long run needs: checkpoints that survive kill -9, metrics, images.
+From top to bottom: settings, environment, networks, noise, loop, evaluation. The
+settings are those of `cathsim train type1_lcca --preset tuned`, which adds features for
+long runs: checkpoints that survive kill -9, metrics, images.
 """
 
 import dataclasses
@@ -72,7 +72,7 @@ def network(inputs: int, outputs: int, hidden: int, gain: float) -> MLP:
 
 
 def make_actor(inputs: int, actions: int, settings: Settings) -> ProbabilisticActor:
-    """A Gaussian before a tanh; its learnt deviation is the same in all states."""
+    """A tanh-squashed Gaussian; its learnt deviation is the same in all states."""
     mean = network(inputs, actions, settings.hidden, gain=0.01)
     scale = LearntScale(actions, init_value=math.log(settings.deviation))
     return ProbabilisticActor(
@@ -87,8 +87,8 @@ class Exploration(TensorDictModuleBase):
     """The policy with noise correlated in time and over the motors of an axis.
 
     White noise on twenty motors averages out along the tip and over time. Each action
-    is still normal about the mean, and PPO takes its log-probability as if the noise
-    were white (Hollenstein et al., Colored Noise in PPO, AAAI 2024).
+    is still normal about the mean, and PPO computes its log-probability as for white
+    noise (Hollenstein et al., Colored Noise in PPO, AAAI 2024).
     """
 
     def __init__(self, policy: TensorDictSequential, groups, settings: Settings):
@@ -138,7 +138,7 @@ def update(batch, loss, advantage, optimiser, settings: Settings) -> float:
 
 @torch.no_grad()
 def evaluate(policy, settings: Settings) -> None:
-    """Play episodes of the task to their ends with the most likely actions."""
+    """Play episodes of the task to their ends with deterministic actions."""
     episodes = settings.evaluation_episodes
     env = environment(settings, episodes, 1_000_000, settings.evaluation_steps)
     alive = torch.ones(episodes, dtype=torch.bool)

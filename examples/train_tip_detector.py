@@ -4,8 +4,9 @@ r"""A detector of device tips, trained on `cathsim dataset` and tested on other 
         --size 128
     python examples/train_tip_detector.py arches
 
-A small convolutional network draws a map of where the tip is; the tip is its mean. The
-error is compared with that of the mean position of the training set.
+A small convolutional network outputs a probability map of the tip; the detection is the
+mean of this map. Its error is compared with that of the mean position of the training
+set.
 """
 
 import dataclasses
@@ -35,7 +36,7 @@ class Settings:
 
 
 def load(data: Path, split: str):
-    """Images (n, 1, H, W), tips (n, 2) in pixels, and mm of patient in a pixel (n,)."""
+    """Images (n, 1, H, W), tips (n, 2) in pixels, and size of a pixel (n,) in mm."""
     images, tips, scales = [], [], []
     for path in sorted((data / split).glob("*.h5")):
         with h5py.File(path) as file:
@@ -45,7 +46,7 @@ def load(data: Path, split: str):
             camera = file["camera_matrix"][:][seen]
             place = file["keypoints_3d"][:][seen, 0]
             depth = np.einsum("ni,ni->n", camera[:, 2, :3], place) + camera[:, 2, 3]
-            # (x, y, z) to pixels: the focal length is that of the first row, centred.
+            # The norm of the centred first row of the matrix is the focal length.
             across = (
                 camera[:, 0, :3] - 0.5 * (images[-1].shape[2] - 1) * camera[:, 2, :3]
             )
@@ -55,7 +56,7 @@ def load(data: Path, split: str):
 
 
 class Detector(nn.Module):
-    """A U of three levels; from an image to the logarithm of a map of the tip."""
+    """U-Net of three levels from images to log-probability maps of the tip."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -81,7 +82,7 @@ class Detector(nn.Module):
         )
 
     def forward(self, images):
-        """Logarithms (n, H / CELL, W / CELL) of the probability of each cell."""
+        """Log-probabilities (n, H / CELL, W / CELL) of the cells."""
         signal = images.float() / 127.5 - 1.0
         signal = signal - signal.mean(dim=(2, 3), keepdim=True)
         signal = 4.0 * nn.functional.avg_pool2d(signal, 2)
@@ -100,16 +101,16 @@ class Detector(nn.Module):
 
 
 def targets(tips, shape):
-    """Maps (n, h, w) that are a Gaussian about the tip and sum to 1."""
+    """Target maps (n, h, w): a Gaussian about each tip, normalised to 1."""
     rows, columns = (torch.arange(size, dtype=torch.float32) for size in shape)
-    x, y = ((tips - (CELL - 1) / 2) / CELL).T  # whole numbers are centres of cells
+    x, y = ((tips - (CELL - 1) / 2) / CELL).T  # integers are centres of cells
     square = (columns - x[:, None, None]) ** 2 + (rows[:, None] - y[:, None, None]) ** 2
     return (-square).flatten(1).softmax(1).view(len(tips), *shape)
 
 
 @torch.no_grad()
 def detect(model, images, batch: int):
-    """Tips (n, 2) in pixels: the mean of the map about its largest value."""
+    """Tips (n, 2) in pixels: the mean of each map around its maximum."""
     model.eval()
     found = []
     for part in images.split(batch):
@@ -129,7 +130,7 @@ def detect(model, images, batch: int):
 
 
 def report(name: str, found, tips, scale) -> None:
-    """Prints median and 90 % quantile of the distance."""
+    """Prints median and 90 % quantile of the error in pixels and mm."""
     error = (found - tips).norm(dim=1).numpy()
     pixels, lengths = (np.percentile(e, [50, 90]) for e in (error, error * scale))
     print(
@@ -139,7 +140,7 @@ def report(name: str, found, tips, scale) -> None:
 
 
 def picture(path: Path, images, tips, found) -> None:
-    """Draws eight images with the true tip (ring) and the one found (cross)."""
+    """Draws eight images with the true (ring) and the detected tip (cross)."""
     from matplotlib.figure import Figure
 
     figure = Figure((10, 5.2), layout="constrained")

@@ -5,8 +5,8 @@
 
 Every Python of `PYTHONS` that is on the path is tried with three sets of versions: the
 pinned ones (constraints.txt), the newest allowed and the lowest allowed ones of the
-main dependencies. What cannot be installed is said, and is no failure where the
-versions do not exist for that Python. Exit code 1: something was installed and failed.
+main dependencies. A set that cannot be installed is reported, but is no failure. Exit
+code 1: a set was installed and failed.
 """
 
 import argparse
@@ -21,10 +21,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PYTHONS = ("python3.11", "python3.12", "python3.13", "python3.14")
-# dm-control asks for labmaze, which has no wheel for these Pythons.
+# dm-control requires labmaze, which has no wheel for these Pythons.
 LABMAZE = f"{ROOT / 'tools' / 'labmaze'} ; python_version >= '3.13'"
 SETS = ("pinned", "newest", "lowest")
-# Of which the lowest allowed version is asked for; the others follow from them.
+# Dependencies whose lowest allowed version is installed; the others follow from them.
 MAIN = ("numpy", "scipy", "mujoco", "dm-control", "torch", "torchrl", "trimesh", "tyro")
 # One task, stepped; one image; one network.
 SMOKE = ROOT / "tools" / "smoke.py"
@@ -47,7 +47,7 @@ def lowest() -> list[str]:
 
 
 def environment(python: str, versions: str, folder: Path, tests: bool) -> tuple:
-    """A fresh environment: its Python, and what went wrong or None."""
+    """Makes a fresh environment; returns its Python, and an error text or None."""
     subprocess.run([python, "-m", "venv", str(folder)], check=True)
     inside = folder / "bin" / "python"
     wanted = [f"{ROOT}[test]" if tests else str(ROOT), LABMAZE]
@@ -65,14 +65,14 @@ def environment(python: str, versions: str, folder: Path, tests: bool) -> tuple:
 
 
 def is_there(python: str) -> bool:
-    """Whether an interpreter runs: a name on the path may be an empty promise."""
+    """Whether an interpreter is on the path and runs."""
     if shutil.which(python) is None:
         return False
     return subprocess.run([python, "-c", ""], capture_output=True).returncode == 0
 
 
 def attempt(python: str, versions: str, tests: bool) -> dict:
-    """Installs and tries one cell of the matrix."""
+    """Installs and tests one cell of the matrix; returns its result."""
     cell = {"python": python, "versions": versions}
     if not is_there(python):
         return {**cell, "result": "no such interpreter"}

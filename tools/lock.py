@@ -2,9 +2,9 @@
 
     python tools/lock.py [UV]
 
-Asks uv for versions that suit all Pythons and systems within constraints.txt. Two kinds
-of packages are left out, so `pip install --no-deps` installs the file: labmaze, which
-dm-control asks for and nothing here imports, and what is for CUDA.
+uv finds versions that suit all Pythons and systems within constraints.txt. Two kinds of
+packages are left out, so `pip install --no-deps` installs the file: labmaze, which
+dm-control requires but nothing here imports, and packages for CUDA.
 """
 
 import re

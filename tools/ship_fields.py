@@ -1,7 +1,7 @@
-"""Writes the fields that come with the package, those of all phantoms and accesses.
+"""Writes the fields that ship with the package, for all phantoms and accesses.
 
-Run it after a change of their centrelines, or of the code that builds fields:
-tests/test_anatomy_field_cache.py says when.
+Run it after a change of their centrelines, or of the code that builds fields;
+tests/test_anatomy_field_cache.py fails when it is needed.
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ DATA = Path(cathsim_dmc.anatomy.__file__).parent / "data"
 
 
 def main() -> None:
-    """Builds them anew and takes the place of those that are there."""
+    """Builds all fields, and replaces the files that are there."""
     paths = []
     for name in phantoms.PHANTOMS:
         fields = {}

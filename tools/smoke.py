@@ -14,7 +14,7 @@ from cathsim_dmc.simulation.environments import VECTOR, make_env
 
 
 def command_line(*words: str) -> str:
-    """What `cathsim` prints, as a command of this environment."""
+    """Output of the `cathsim` command of this environment."""
     program = Path(sys.executable).with_name("cathsim")
     done = subprocess.run([program, *words], stdout=subprocess.PIPE, text=True)
     assert done.returncode == 0, f"cathsim {words}: {done.returncode}"
@@ -25,7 +25,7 @@ def main() -> None:
     home = Path(cathsim_dmc.__file__).resolve()
     checkout = Path(__file__).resolve().parents[1] / "cathsim_dmc"
     if len(sys.argv) > 1 and sys.argv[1] == "--installed":
-        # The environment itself may lie in the checkout, as that of `make dist` does.
+        # The environment itself may be in the checkout, as with `make dist`.
         assert home.parent != checkout, f"{home} is the checkout, not the package"
     environment = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 0})
     first = environment.reset()

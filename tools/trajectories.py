@@ -47,7 +47,7 @@ CASES = {
 
 
 def actions(policy: str, count: int) -> np.ndarray:
-    """Actions (STEPS, count): a push into the wall, or random ones that hold on."""
+    """Actions (STEPS, count): a push into the wall, or random ones held 10 steps."""
     random = np.random.RandomState(5).uniform(-1, 1, (STEPS // 10, count))
     held = np.repeat(random, 10, axis=0)
     if policy == "push":
@@ -58,7 +58,7 @@ def actions(policy: str, count: int) -> np.ndarray:
 
 
 def digest(values) -> str:
-    """Of the bytes of arrays."""
+    """Digest of the types, shapes and bytes of arrays."""
     total = hashlib.sha256()
     for value in values:
         value = np.ascontiguousarray(value)

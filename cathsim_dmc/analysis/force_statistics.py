@@ -1,4 +1,4 @@
-"""Definitions of the forces of an episode, explained in docs/forces.md."""
+"""Force statistics of an episode; docs/forces.md defines them."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from cathsim_dmc.recording.episode import Episode
 
 @dataclass(frozen=True)
 class Statistics:
-    """One force of the control steps of an episode in three numbers, N.
+    """Statistics of one force over the control steps of an episode, N.
 
     Attributes:
         mean: Mean over all control steps; steps without contact count as 0.
@@ -30,20 +30,19 @@ class Statistics:
 class EpisodeForces:
     """Force of the device on the wall over an episode, N.
 
-    None where the environment or the recording does not tell.
+    A quantity is None if the environment or the recording does not have it.
 
     Attributes:
-        sum: Of the sum of the magnitudes over all contacts at the end of a control
-            step.
-        max: Of the largest single contact at the end of a control step; one place of
-            the wall may be two contacts.
-        peak_sum: Of the largest sum in any physics step of a control step; it depends
-            on the physics step (`physics.forces.PEAK_NOTE`).
-        peak_max: Of the largest single contact in any physics step of a control step;
-            likewise.
-        mean_sum: Of the sum over all contacts, mean over a control step: what a load
-            cell that is read at 25 Hz shows.
-        mean_max: Of the largest single contact, mean over a control step.
+        sum: Sum of the magnitudes over all contacts at the end of a control step.
+        max: Largest single contact at the end of a control step; one place of the wall
+            may be two contacts.
+        peak_sum: Largest sum in any physics step of a control step; it depends on the
+            physics step (`physics.forces.PEAK_NOTE`).
+        peak_max: Largest single contact in any physics step of a control step; it
+            depends on the physics step too.
+        mean_sum: Sum over all contacts, mean over a control step: the reading of a load
+            cell at 25 Hz.
+        mean_max: Largest single contact, mean over a control step.
     """
 
     sum: Statistics | None = None
@@ -53,8 +52,8 @@ class EpisodeForces:
     mean_sum: Statistics | None = None
     mean_max: Statistics | None = None
 
-    # Files of before 0.3 do not tell the means over a control step: what they tell of
-    # its end stands for them in the first three.
+    # Files from before 0.3 lack the means over a control step; the first three
+    # properties then use the values at its end.
 
     @property
     def mean_force(self) -> float | None:
@@ -78,8 +77,8 @@ class EpisodeForces:
     def largest_sum(self) -> float | None:
         """`mean_sum` of the control step where it is largest, N.
 
-        *Safe success* is decided on it. `peak_sum`, which is never less, stands for it
-        in files of before 0.3.
+        It decides *safe success*. Files from before 0.3 have `peak_sum` instead, which
+        is never less.
         """
         force = self.mean_sum or self.peak_sum
         return force and force.maximum
@@ -104,13 +103,13 @@ class ForceTracker:
         self._steps: list[list[np.ndarray]] = [[] for _ in range(num_simulations)]
 
     def add(self, forces: Sequence[np.ndarray]) -> None:
-        """Add a control step: forces (N,) in N, in the order of `QUANTITIES`."""
+        """Add a control step: one array (N,), N, for each of `QUANTITIES`, in order."""
         rows = np.array(forces, dtype=np.float64).T
         for steps, row in zip(self._steps, rows, strict=True):
             steps.append(row)
 
     def finish(self, simulation: int) -> EpisodeForces:
-        """Statistics of a simulation's episode, which ends; the next one begins."""
+        """Ends the episode of a simulation and returns its statistics."""
         steps, self._steps[simulation] = self._steps[simulation], []
         columns = zip(QUANTITIES, np.transpose(steps), strict=False)
         return EpisodeForces(**{name: _statistics(column) for name, column in columns})
@@ -126,7 +125,7 @@ def _statistics(row: Sequence[float] | np.ndarray) -> Statistics | None:
 
 
 def recorded_forces(episode: Episode) -> EpisodeForces:
-    """Statistics of a recorded episode; empty without a single step."""
+    """Statistics of a recorded episode; all None without a step."""
     if not episode.steps:
         return EpisodeForces()
     columns = episode.wall_force_sum, episode.wall_force_max
@@ -139,7 +138,7 @@ def recorded_forces(episode: Episode) -> EpisodeForces:
 
 
 def millinewtons(mean: float | None, deviation: float | None = None) -> str:
-    """Text of a force given in N, in mN with three digits and its deviation alike."""
+    """Text, in mN with three digits, of a force and its deviation given in N."""
     if mean is None:
         return "–"
     size = 1e3 * max(abs(mean), abs(deviation or 0.0))

@@ -1,4 +1,4 @@
-"""Where the device presses on the wall, along y (phantoms: from the front)."""
+"""Heatmaps of contact forces, projected along y (phantoms: from the front)."""
 
 import os
 from dataclasses import dataclass
@@ -8,10 +8,10 @@ import numpy as np
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.files import atomic_path, require_file
 
-# Cells of 2 mm: about the diameter of the device, below which neighbouring contacts
-# of one place would be told apart.
+# m; about the diameter of the device. Smaller cells would separate the contacts of one
+# place.
 CELL = 2e-3
-# Margin around the vessel in the picture.
+# Margin around the vessel in the picture, m.
 MARGIN = 5e-3
 # Columns of the antero-posterior projection: x (lateral, patient left on the right
 # of the picture, as the reader faces the patient) and z (up).
@@ -50,8 +50,8 @@ def force_map(
 ) -> ForceMap:
     """Average contact forces over the cells of the AP projection.
 
-    The mean is over contacts, not over time: a place that is touched once counts as
-    one that is touched always, as in the published heatmaps.
+    The mean is over contacts, not over time, as in the published heatmaps: a single
+    contact gives a cell as much weight as permanent contact.
 
     Args:
         position: (K, 3) places of contact, world frame, metres.
@@ -64,7 +64,7 @@ def force_map(
     force = np.asarray(force, dtype=np.float64)
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     shape = np.maximum(np.ceil((high - low) / cell - 1e-9).astype(int), 1)
-    # Half a cell more keeps what lies on the far edges out of the map.
+    # One more half cell, dropped afterwards, excludes points on the far edges.
     edges = [
         low[k] + cell * np.append(np.arange(n + 1), n + 0.5)
         for k, n in enumerate(shape)
@@ -91,7 +91,8 @@ def heatmap(
         position: (K, 3) places of contact, world frame, m.
         force: (K,) magnitudes, N.
         surface: The vessel.
-        path: Target, ``*.png``; appears whole or not at all.
+        path: Target, ``*.png``; written atomically.
+        title: Title of the picture.
         upright: Whether +x is the patient's left and +z the head.
     """
     from matplotlib.collections import PolyCollection
@@ -106,8 +107,8 @@ def heatmap(
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
     triangles = list(1e3 * outline[surface.faces])
-    # All triangles twice: dark and wide, then light on top, which leaves a dark rim
-    # around the silhouette without computing it.
+    # All triangles are drawn twice, dark and wide, then light on top: the silhouette
+    # keeps a dark rim.
     for colour, rim in (("0.45", 2.2), ("0.9", 0.6)):
         look = {"facecolors": colour, "edgecolors": colour, "lw": rim}
         axes.add_collection(PolyCollection(triangles, **look))

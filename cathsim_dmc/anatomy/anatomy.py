@@ -1,4 +1,4 @@
-"""The anatomy as the simulator sees it, lumen, inlet and goals: metres, frame LPS."""
+"""Anatomies for simulation: lumen, inlet and goals, in metres, patient frame LPS."""
 
 import json
 import os
@@ -31,15 +31,14 @@ class Anatomy:
     """An anatomy ready for simulation.
 
     Attributes:
-        name: what to call it.
+        name: name of the anatomy.
         tree: centrelines and radii.
         inlet: where the device enters.
         goals: places to reach, by name.
         ends: flat ends of the lumen, open or capped.
-        scan: closed surface of the true lumen; None if it is the union of the tree's
-            tubes.
-        file: unit and frame of the file that it was imported from; None for metres in
-            LPS.
+        scan: closed surface of the imported lumen; None if the lumen is the union of
+            the tree's tubes.
+        file: unit and frame of the imported file; None for metres in LPS.
     """
 
     name: str
@@ -81,9 +80,9 @@ class Anatomy:
         Args:
             tree: measured centrelines (`anatomy.curves.Curve`) by name, parents
                 before their children; or a finished vessel tree, taken as it is.
-            inlet: where the device enters; what lies behind is cut off. The first
-                point of the root if None.
-            goals: places to reach; if None one in each branch, see
+            inlet: where the device enters; the lumen behind it is cut off. None for
+                the first point of the root.
+            goals: places to reach; None for one in each branch, see
                 `anatomy.builder.default_goals`.
 
         Raises:
@@ -97,20 +96,20 @@ class Anatomy:
 
     @cached_property
     def lumen(self) -> Field:
-        """Signed depth to the wall, which a device touches: m at points, > 0 inside.
+        """Signed depth field of the lumen: distance to the wall, m, > 0 inside.
 
-        Built when first asked for, and kept in `field_cache.cache_folder()`.
+        Built at the first access and cached in `field_cache.cache_folder()`.
         """
         return field_cache.field_of(self.scan or self.tree, self.ends)
 
     @cached_property
     def digest(self) -> str:
-        """Eight hexadecimal digits that tell its lumen from others."""
+        """Eight hexadecimal digits that identify the lumen."""
         return field_cache.shipped_name(self.scan or self.tree, self.ends)[:8]
 
     @cached_property
     def surface(self) -> Surface:
-        """Triangles of the lumen surface, closed."""
+        """Closed triangle mesh of the lumen surface."""
         from cathsim_dmc.anatomy.surface import lumen_surface
 
         return self.scan or lumen_surface(self.tree)
@@ -124,23 +123,23 @@ class Anatomy:
 
     @cached_property
     def murray_circulation(self) -> Circulation:
-        """Distribution of the inflow by Murray's law among all vessels."""
+        """Distribution of the inflow among all vessels by Murray's law."""
         return Circulation.of(self.tree, murray=True)
 
     @cached_property
     def motion(self) -> Motion:
-        """Motion of the anatomy with heart and breathing."""
+        """Displacement of the anatomy by heart and breathing."""
         return Motion.of(self.lumen.box, self.tree, self.ends, self.circulation)
 
     def goal(self, name: str) -> Goal:
-        """Goal called `name`; ValueError lists those that there are."""
+        """Goal called `name`; ValueError lists the known names."""
         return self.goals[bounds.choice("goal", name, self.goals)]
 
     def goal_at(self, place: ArrayLike) -> Goal:
-        """A goal at a place (3,) of the lumen, in the unit and frame of the file.
+        """Goal at a place (3,) of the lumen, in the unit and frame of the file.
 
-        Of an anatomy without a `file` the place is in metres, LPS. ValueError if it is
-        outside the lumen.
+        Without a `file` the place is in metres, LPS. Raises ValueError outside the
+        lumen.
         """
         given = np.array(bounds.vector("goal", place, 3))
         unit = "m" if self.file is None else self.file.unit
@@ -157,7 +156,7 @@ class Anatomy:
         return Goal(name, key, position, arc)
 
     def check_inside(self, what: str, position: np.ndarray) -> None:
-        """Refuses (ValueError) a place (3,), m, that is outside the lumen."""
+        """Raises ValueError if a position (3,), m, LPS, is outside the lumen."""
         depth = float(self.lumen(position))
         if not depth > 0.0:
             (low, high), unit = (
@@ -179,10 +178,10 @@ class Anatomy:
         return ["(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in corners]
 
     def goal_room(self, goal: Goal) -> float:
-        """Radius (m) of a ball around a goal that ends before what lies on the way.
+        """Largest radius (m) of a goal: the arc length to the nearest mark before it.
 
-        That is the ostium of its vessel, or the goal before a named one in the same
-        vessel.
+        Marks are the ostium of its vessel and, for a named goal, the other goals in
+        the same vessel. At least 0.5 mm; infinite without a mark.
         """
         vessel = self.tree.vessel(goal.vessel)
         before = [vessel.ostium] if vessel.parent is not None else []
@@ -207,7 +206,7 @@ class Anatomy:
     def save(self, directory: str | os.PathLike[str]) -> Path:
         """Write the anatomy into `directory` and return that path.
 
-        A reader finds the old anatomy or the new one.
+        The write is atomic: a concurrent reader finds the old or the new anatomy.
         """
         directory = files.require_folder(directory, make=True)
         arrays = {
@@ -243,8 +242,8 @@ class Anatomy:
 
         Raises:
             FileNotFoundError: if `directory` holds no anatomy.
-            ValueError: if the file is damaged, of another format, or holds what no
-                anatomy does; names the file and the entry.
+            ValueError: if the file is damaged, of another format, or has an invalid
+                entry; names the file and the entry.
         """
         path = Path(directory) / _FILE
         if not path.is_file():
@@ -262,11 +261,11 @@ def _plain(part: Goal | Inlet | End | FileFrame) -> dict[str, Any]:
 
 
 def _unpack(arrays: dict[str, np.ndarray]) -> Anatomy:
-    """The anatomy of a file's arrays; ValueError names an entry that is wrong."""
+    """Anatomy from the arrays of a file; ValueError names an invalid entry."""
     try:
         header = json.loads(str(arrays["header"]))
         kept = {key: header[key] for key in ("format", "version", "units", "frame")}
-        if repr(kept) != repr(_FORMAT):  # True is no 1
+        if repr(kept) != repr(_FORMAT):  # by repr: True == 1
             raise ValueError(f"it is {kept}, not {_FORMAT}; write it again")
         vessels = []
         for index, entry in enumerate(_listed(header, "vessels")):
@@ -288,7 +287,7 @@ def _unpack(arrays: dict[str, np.ndarray]) -> Anatomy:
         )
     except KeyError as error:
         raise ValueError(f"it lacks the entry {error}") from error
-    except TypeError as error:  # no object, or one with other entries
+    except TypeError as error:  # not an object, or unknown entries
         raise ValueError(f"an entry is wrong: {error}") from error
 
 

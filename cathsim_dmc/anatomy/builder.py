@@ -16,12 +16,12 @@ ACCESSES = ("ascending", "descending")
 
 @dataclass(frozen=True, eq=False)
 class VesselPlace:
-    """A place on a vessel: an arc length, or nearest to a position in the lumen."""
+    """A place on a vessel, given by arc length or as the nearest to a position."""
 
     vessel: str
     arc_length: float = 0.0  # m from the centreline's first point; inf for its last
     past_ostium: bool = False  # whether the arc length counts from the ostium
-    position: Array | None = None  # (3,) m, whatever the arc length
+    position: Array | None = None  # (3,) m, LPS; overrides the arc length
 
     def arc(self, tree: VesselTree) -> float:
         """Arc length (m) of the place; ValueError if it is not on the tree."""
@@ -44,7 +44,7 @@ class VesselPlace:
 def placed(
     tree: VesselTree, inlet: VesselPlace | None, goals: Mapping[str, VesselPlace] | None
 ) -> tuple[VesselTree, tuple[End, ...], Inlet, dict[str, Goal]]:
-    """The tree from its inlet on, flat ends, inlet and goals of `Anatomy.from_tree`."""
+    """Tree cut at the inlet, flat ends, inlet and goals, for `Anatomy.from_tree`."""
     places = default_goals(tree) if goals is None else goals
     found = {key: _goal(key, place, tree) for key, place in places.items()}
     inlet = inlet or VesselPlace(tree.root.name)
@@ -72,7 +72,8 @@ def placed(
 def default_goals(tree: VesselTree) -> dict[str, VesselPlace]:
     """A goal in each branch of 10 mm or more: 27 mm past its ostium if there is room.
 
-    It lies 5 mm or more before the free end, and before any branch parts from it.
+    The goal lies at least 5 mm before the free end and not past the first branch of
+    its vessel.
     """
     goals = {}
     for name, vessel in tree.vessels.items():
@@ -104,7 +105,7 @@ def _goal(name: str, place: VesselPlace, tree: VesselTree) -> Goal:
 def _cut_at(
     tree: VesselTree, inlet: VesselPlace, goals: Mapping[str, Goal]
 ) -> tuple[VesselTree, bool]:
-    """The tree cut at the inlet, and whether its first point is entered."""
+    """The tree cut at the inlet, and whether the device enters at the first point."""
     vessel = tree.vessel(inlet.vessel)
     line = vessel.centreline
     arc = inlet.arc(tree)

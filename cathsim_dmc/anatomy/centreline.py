@@ -14,12 +14,12 @@ from cathsim_dmc import bounds
 Array = NDArray[np.float64]
 
 _CHUNK_ELEMENTS = 64_000  # points x segments projected at once, within the L2 cache
-_GAP = 1e-9  # m from a cut, in which a vertex would repeat the cut point
-_END_PLANE = 1e-9  # m beyond a flat end, which still lie in the vessel
+_GAP = 1e-9  # m; a vertex this near to a cut would coincide with the cut point
+_END_PLANE = 1e-9  # m, tolerance of the plane of a flat end
 
 
 def as_points(points: ArrayLike) -> Array:
-    """Points as float64 (..., 3); ValueError if the last axis is another."""
+    """Points as float64 (..., 3); ValueError if the last axis has another length."""
     array = np.asarray(points, dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] != 3:
         raise ValueError(
@@ -30,8 +30,8 @@ def as_points(points: ArrayLike) -> Array:
 
 
 def as_rows(points: ArrayLike) -> Array:
-    """Points (..., 3) as rows (n, 3) for compiled loops."""
-    # Writable: numba would compile another function for those that are not.
+    """Points (..., 3) as contiguous float64 rows (n, 3) for compiled loops."""
+    # Writable: numba compiles a second version for read-only arrays.
     return np.require(as_points(points).reshape(-1, 3), None, ["C", "W"])
 
 
@@ -42,9 +42,9 @@ def arc_lengths(points: Array) -> Array:
 
 
 def interpolate(at: float | np.ndarray, arc: np.ndarray, points: np.ndarray) -> Array:
-    """Points (..., k) of a polyline (n, k) at arc lengths `at` (...), m; held outside.
+    """Points (..., k) of a polyline (n, k) at arc lengths `at` (...), m.
 
-    `arc` (n,) are the arc lengths of its points.
+    `arc` (n,) are the arc lengths of its points. Constant outside the polyline.
     """
     return np.stack([np.interp(at, arc, axis) for axis in points.T], axis=-1)
 
@@ -146,9 +146,9 @@ class Centreline:
         )
 
     def project_rows(self, points: ArrayLike) -> Projection:
-        """As `project`, of one point bit for bit as of one among many.
+        """As `project`, but a point has bitwise the same result alone and among many.
 
-        A matrix product of one row is rounded in another way, so none is left alone.
+        A matrix product of a single row rounds differently, so a row is appended.
         """
         points = as_points(points)
         flat = points.reshape(-1, 3)
@@ -197,7 +197,7 @@ class Centreline:
         return Centreline(place.position, place.radius)
 
     def slice(self, s0: float, s1: float) -> "Centreline":
-        """Part from `s0` to `s1` (m), maybe backwards; ValueError if it is empty."""
+        """Part from `s0` to `s1` (m), reversed if s0 > s1; ValueError if empty."""
         low, high = sorted((float(s0), float(s1)))
         low, high = max(low, 0.0), min(high, self.length)
         if high - low <= _GAP:
@@ -228,7 +228,7 @@ class Vessel:
 
     @property
     def mouth(self) -> CentrelinePoint:
-        """Place of its centreline at which it leaves its parent's lumen."""
+        """Point of the centreline at the ostium, where it leaves the parent's lumen."""
         return self.centreline.at(self.ostium)
 
 
@@ -269,11 +269,11 @@ class VesselTree:
         return next(iter(self.vessels.values()))
 
     def vessel(self, name: str) -> Vessel:
-        """Vessel called `name`; ValueError lists those that there are."""
+        """Vessel called `name`; ValueError lists the known names."""
         return self.vessels[bounds.choice("vessel", name, self.vessels)]
 
     def scaled(self, factor: float) -> "VesselTree":
-        """The tree `factor` times as large."""
+        """The tree scaled by `factor`."""
         vessels = {}
         for key, vessel in self.vessels.items():
             line = vessel.centreline
@@ -282,11 +282,11 @@ class VesselTree:
         return VesselTree(vessels)
 
     def depths(self, points: ArrayLike) -> dict[str, Array]:
-        """Radius less distance (m) of `points` (..., 3) in each vessel's own tube.
+        """Lumen radius minus distance (m) of `points` (..., 3), m, for each vessel.
 
-        Both are taken at the nearest point of the vessel's centreline: not the
-        distance to the wall, but > 0 inside. The flat ends are open; beyond one the
-        value is at most minus the distance to its plane.
+        Both are those of the nearest point of the vessel's centreline. The value is
+        > 0 inside the tube, but is not the distance to the wall. The flat ends are
+        open; beyond one the value is at most minus the distance to its plane.
         """
         points = as_points(points)
         depths = {}
@@ -297,7 +297,7 @@ class VesselTree:
             for s, outward in ((0.0, -1.0), (line.length, 1.0)):
                 end = line.at(s)
                 beyond = outward * ((points - end.position) @ end.tangent)
-                # Rounding must not put the end plane itself outside.
+                # The tolerance keeps points of the end plane inside despite rounding.
                 cut = np.isclose(near.arc_length, s) & (beyond > _END_PLANE)
                 depth = np.where(cut, np.minimum(depth, -beyond), depth)
             depths[name] = depth
@@ -328,11 +328,11 @@ class VesselTree:
         Args:
             start: vessel the device enters by.
             goal: vessel to reach.
-            goal_arc_length: place (m) on the goal's centreline, its end if infinite.
-            start_arc_length: the same of the start.
+            goal_arc_length: arc length (m) on the goal's centreline; inf for its end.
+            start_arc_length: arc length (m) on the centreline of `start`.
 
         Raises:
-            ValueError: if a name is unknown, or start and goal are one place.
+            ValueError: if a name is unknown, or start and goal coincide.
         """
         up, down = self._lineage(start), self._lineage(goal)
         common = next(name for name in up if name in down)

@@ -18,19 +18,19 @@ _AT_END = 1e-6  # m
 class Course(NamedTuple):
     """Blood flow through a vessel."""
 
-    begin: float  # way from the heart to where blood enters the vessel, m
+    begin: float  # path length from the heart to where blood enters the vessel, m
     reverse: bool  # whether blood goes towards the first point of the centreline
     outlet: float  # share of the inflow that leaves through the vessel's own free end
-    branches: Array  # (B, 2), way in the vessel to each ostium, m, and its share
+    branches: Array  # (B, 2), path length to each ostium, m, and its share
 
     def share(self, way: Array) -> Array:
-        """Share (n,) of the inflow at ways (n,) m in the vessel."""
+        """Share (n,) of the inflow at path lengths (n,), m, from where blood enters."""
         ahead = self.branches[:, 0] > np.asarray(way)[..., None]
         return self.outlet + (ahead * self.branches[:, 1]).sum(axis=-1)
 
 
 class Segments(NamedTuple):
-    """The S segments of a `Circulation`, attributes as there."""
+    """The S segments of a `Circulation`, with the shapes and units given there."""
 
     ends: Array
     radii: Array
@@ -41,19 +41,23 @@ class Segments(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Circulation:
-    """The inflow along the vessels, in S straight segments."""
+    """Distribution of the inflow along the vessels, in S straight segments."""
 
-    courses: dict[str, Course]  # of blood, by vessel
+    courses: dict[str, Course]  # by vessel
     radius: float  # of the lumen at the heart, m
     ends: Array  # (S, 2, 3), m
     radii: Array  # (S, 2), of the lumen, m
-    shares: Array  # (S, 2), of the inflow, negative against the segment
-    ways: Array  # (S, 2), from the heart, m
-    vessel: np.ndarray  # (S,) int64, number of the vessel
+    shares: Array  # (S, 2), of the inflow; negative for flow against the segment
+    ways: Array  # (S, 2), path length from the heart, m
+    vessel: np.ndarray  # (S,) int64, index of the vessel
 
     @classmethod
     def of(cls, tree: VesselTree, murray: bool = False) -> "Circulation":
-        """The circulation of a tree, perhaps with all outlets by Murray's law."""
+        """Circulation of a tree; blood enters at the wider end of the root.
+
+        BCA, LCCA and LSA get the shares of `SHARES`; with `murray`, or if one of them
+        is missing, Murray's law gives all shares.
+        """
         root = tree.root.centreline
         reverse = bool(root.radii[-1] > root.radii[0])
         courses = _courses(tree, reverse, murray)

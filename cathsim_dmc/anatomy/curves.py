@@ -15,17 +15,17 @@ from cathsim_dmc.anatomy.centreline import (
     arc_lengths,
 )
 
-# By how much a spline may miss measured positions and radii, root mean square, m: less
-# than what a lattice of 0.5 mm leaves open.
+# RMS residuals of the splines through measured positions and radii, m: below the
+# resolution of a 0.5 mm lattice.
 _SMOOTHING, _RADIUS_SMOOTHING = 0.35e-3, 0.15e-3
-_FLARE = 1e-3  # m, by which a radius grows at its ostium, if the parent has the room
+_FLARE = 1e-3  # m, increase of a radius at its ostium, if the parent is wide enough
 _STEP = 1e-3  # m, between the points of a built centreline
-_FINE = 0.25e-3  # m, steps in which an ostium is looked for
-_LEAST_BEND = 1.05  # radii of the lumen; a vessel that bends more sharply folds
+_FINE = 0.25e-3  # m, step of the search for an ostium
+_LEAST_BEND = 1.05  # least bend radius in lumen radii; below it the lumen folds
 _WIDEST_OSTIUM = 0.95  # of the parent's radius
 _FLARE_MARGIN = 1.25  # of a straight branch's flare
 _LEAST_WALL = 0.2e-3  # m, between two lumens side by side
-_LONGEST_JUNCTION = 8.0  # radii past its ostium, of a lumen shared with the parent
+_LONGEST_JUNCTION = 8.0  # radii past the ostium over which a branch joins its parent
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +36,8 @@ class Curve(Centreline):
         points: (n, 3) float64, metres; n >= 2. A branch begins inside its parent and
             runs away from it.
         radii: (n,) float64, metres: radius of the vessel's own lumen. Those of a
-            branch are not used where it still lies in its parent.
-        parent: name of the vessel it leaves, None for the root.
+            branch inside its parent are ignored.
+        parent: name of the vessel that it leaves; None for the root.
     """
 
     parent: str | None = None
@@ -52,8 +52,8 @@ def smooth_tree(curves: Mapping[str, Curve]) -> VesselTree:
 
     Raises:
         ValueError: if a branch does not begin in its parent or never leaves it, if a
-            vessel bends more sharply than its lumen allows, or if two vessels run
-            into each other; names the vessel and the place.
+            vessel bends more sharply than its lumen allows, or if two vessels
+            intersect; names the vessel and the place.
     """
     vessels: dict[str, Vessel] = {}
     for name, curve in curves.items():
@@ -73,13 +73,13 @@ def smooth_tree(curves: Mapping[str, Curve]) -> VesselTree:
 
 
 def _smooth(points: Array, step: float, first_weight: float = 1.0) -> Array:
-    """Points (n, 3) of a cubic spline at equal arcs of about `step` (m), with ends."""
+    """Points (n, 3), m, of a smoothing spline at equal steps of about `step` (m)."""
     from scipy import interpolate  # slow to import
 
     chord = arc_lengths(points)
     weights = np.ones(len(points))
     weights[0] = first_weight
-    # In millimetres, which fitpack's tolerances suit.
+    # In millimetres, the scale that fitpack's tolerances suit.
     degree, miss = min(3, len(points) - 1), len(points) * (1e3 * _SMOOTHING) ** 2
     (knots, coefficients, _), _ = interpolate.splprep(
         1e3 * points.T, u=chord, w=weights, k=degree, s=miss
@@ -89,12 +89,12 @@ def _smooth(points: Array, step: float, first_weight: float = 1.0) -> Array:
     parameter = np.linspace(0.0, end, max(20, 10 * math.ceil(end / step)))
     arc = arc_lengths(spline(parameter))
     count = max(2, math.ceil(arc[-1] / step) + 1)
-    # Chords between the points interpolated would show as wrinkles in its curvature.
+    # Evaluates the spline: interpolation between points would disturb the curvature.
     return spline(np.interp(np.linspace(0.0, arc[-1], count), arc, parameter))
 
 
 def _radii(places: Array, values: Array, at: Array) -> Array:
-    """Smooth radii at arc lengths `at` from measured ones, constant outside them."""
+    """Smoothed radii (m) at arc lengths `at` (m); constant outside the measurements."""
     from scipy import interpolate
 
     if len(places) < 4:
@@ -102,19 +102,19 @@ def _radii(places: Array, values: Array, at: Array) -> Array:
     miss = len(values) * (1e3 * _RADIUS_SMOOTHING) ** 2
     spline = interpolate.splrep(places, 1e3 * values, s=miss)
     smooth = 1e-3 * interpolate.splev(np.clip(at, places[0], places[-1]), spline)
-    # A spline may overshoot where the calibre changes at once.
+    # A spline may overshoot where the calibre changes abruptly.
     return np.clip(smooth, 0.9 * values.min(), 1.1 * values.max())
 
 
 def _places(line: Centreline, points: Array) -> tuple[Array, np.ndarray]:
-    """Arc lengths (n,) m of points along a line, and which are past the one before."""
+    """Non-decreasing arc lengths (n,), m, of points, and a mask of those that grow."""
     places = np.maximum.accumulate(line.project(points).arc_length)
     return places, np.append(True, np.diff(places) > 1e-6)
 
 
 def _branch(name: str, curve: Curve, parent: Vessel) -> Vessel:
     start = _onto_parent(name, curve.points, parent)
-    # The start is no measurement: it lies on the parent.
+    # The weight holds the start, which is not measured, on the parent's centreline.
     dense = _smooth(start, _FINE, first_weight=100.0)
     dense[0] = start[0]
     fine = Centreline(dense, np.ones(len(dense)))
@@ -154,9 +154,10 @@ def _branch(name: str, curve: Curve, parent: Vessel) -> Vessel:
 
 
 def flare_begin(wide: float, parent_radius: float, tilt: float, ostium: float) -> float:
-    """Arc length (m) at which a branch's flare begins, up to `wide` (m) at its ostium.
+    """Arc length (m) at which the flare of a branch begins.
 
-    The branch stands `tilt` (rad) off the normal of the parent's wall.
+    The branch has the radius `wide` (m) at its ostium and the angle `tilt` (rad) to
+    the normal of the parent's wall.
     """
     sag = parent_radius - math.sqrt(parent_radius**2 - min(wide, parent_radius) ** 2)
     inwards = _FLARE_MARGIN * (sag + wide * math.tan(tilt)) + 1e-3
@@ -164,7 +165,7 @@ def flare_begin(wide: float, parent_radius: float, tilt: float, ostium: float) -
 
 
 def _onto_parent(name: str, points: Array, parent: Vessel) -> Array:
-    """The branch's points with the first on its parent's centreline."""
+    """Points (n, 3), m, of a branch that start on its parent's centreline."""
     line = parent.centreline
     first = line.project(points[0])
     if first.distance > first.radius:
@@ -174,7 +175,7 @@ def _onto_parent(name: str, points: Array, parent: Vessel) -> Array:
             "let it begin in its parent, or name another"
         )
     foot = line.at(first.arc_length).position
-    # A point next to the foot would make a sharp turn of its own.
+    # Points near the foot are dropped, as they would make a sharp turn.
     near = np.linalg.norm(points - foot, axis=1) < max(0.25 * first.radius, 1e-3)
     kept = points[np.argmin(near) :] if not near.all() else points[-1:]
     return np.concatenate([foot[None], kept])
@@ -184,7 +185,7 @@ def ostium_of(name: str, line: Centreline, parent: Vessel) -> float:
     """Arc length (m) at which a branch leaves its parent's lumen for good.
 
     Raises:
-        ValueError: if it ends inside of it.
+        ValueError: if the branch ends inside its parent.
     """
     near = parent.centreline.project(line.points)
     outside = near.distance - near.radius
@@ -200,7 +201,7 @@ def ostium_of(name: str, line: Centreline, parent: Vessel) -> float:
 
 def _check_bends(vessel: Vessel) -> None:
     line = vessel.centreline
-    # Over a lumen radius, below which a kink is no bend.
+    # The bend is taken over one lumen radius; a shorter kink is no bend.
     s = np.arange(vessel.ostium, line.length, 1e-3)
     if len(s) < 3:
         return
@@ -235,7 +236,7 @@ def _junction_end(vessel: Vessel, parent: Vessel) -> float:
 
 
 def check_septa(tree: VesselTree) -> None:
-    """Raise ValueError if two lumens touch away from where one leaves the other."""
+    """Raise ValueError if two lumens touch other than at a junction."""
     free = {
         name: _junction_end(vessel, tree.vessel(vessel.parent))
         for name, vessel in tree.vessels.items()

@@ -26,20 +26,20 @@ from cathsim_dmc.anatomy.surface import sampled
 TRIANGLES = 3_000  # of the surface that carries prisms; others are decimated
 THICKNESS = 4e-3  # m, of the wall where no other lumen is near
 THINNEST = 0.3e-3  # m, of the wall between two lumens
-SHIFT = 0.2e-3  # m, of the wall outwards, which chords take back
+SHIFT = 0.2e-3  # m, of the wall outwards; it offsets the chords of the triangles
 MOVE = 0.6e-3  # m, largest outward movement of a vertex
 TOLERANCE = 0.25e-3  # m, that a merged piece may protrude into the lumen
 _CHORD = 0.08e-3  # m, that a prism may protrude into the lumen
 CAP_OVERLAP = 2e-3  # m, of the inlet's cap under the wall around it
 CAP_SECTORS = 12
 _BEHIND = 0.05e-3  # m, of the surface that is cut off ahead of the inlet's flat cap
-_AHEAD = 1e-3  # m from an open end, from where on its depth is that of the wall alone
-_LONGER = 6e-3  # m, by which the lumen goes on behind an open end
-_PLACES = 10_000  # of the wall that are looked at
-# Levels (m) along the normal at which pieces are looked for, > 0 in the lumen.
+_AHEAD = 1e-3  # m from an open end, beyond which the depth is that of the wall alone
+_LONGER = 6e-3  # m, by which the lumen is extended behind an open end
+_PLACES = 10_000  # sample points of the wall
+# Offsets (m) along the normal at which pieces are searched, > 0 in the lumen.
 _LEVELS = np.arange(-1.5e-3, 1.5e-3, 0.05e-3)
-_GRAZE = 0.05e-3  # m, by which a piece may touch a 5 Fr catheter on a centreline
-_OFF = 0.3e-3  # m; farther from the wall a place of the surface is on an open end
+_GRAZE = 0.05e-3  # m, allowed overlap of a piece and a 5 Fr catheter on a centreline
+_OFF = 0.3e-3  # m; surface points farther from the wall are on an open end
 
 
 class _Shell(NamedTuple):
@@ -49,7 +49,7 @@ class _Shell(NamedTuple):
         inner: (V, 3) m, on the lumen.
         outer: (V, 3) m, where the wall ends.
         faces: (F, 3) triangles of both, without the inlet's cap.
-        cap: pieces that close the inlet but for its hole.
+        cap: pieces that close the inlet except for its hole.
     """
 
     inner: np.ndarray
@@ -61,16 +61,16 @@ class _Shell(NamedTuple):
 def wall_pieces(anatomy: Anatomy, wall: str = "merged") -> tuple[np.ndarray, ...]:
     """Vertices (n_i, 3) m of convex pieces around the lumen.
 
-    The pieces lie outside the lumen but for some tenths of a millimetre. The inlet is
-    closed but for a hole of `INLET_HOLE_RADIUS`.
+    The pieces protrude into the lumen by some tenths of a millimetre at most. A cap
+    closes the inlet except for a hole of `INLET_HOLE_RADIUS`.
 
     Args:
-        wall: How the wall is divided, of `WALLS`: "merged" prisms, "prisms" as they
-            are, or "coacd".
+        wall: Division of the wall, a key of `WALLS`: "merged" prisms, "prisms", one
+            for each triangle, or "coacd".
 
     Raises:
         ValueError: if there is no such wall.
-        ModuleNotFoundError: if CoACD is asked for and not installed.
+        ModuleNotFoundError: if "coacd" is chosen and CoACD is not installed.
     """
     check_wall(wall)
     shell = _shell(bounds.instance("anatomy", anatomy, Anatomy))
@@ -78,7 +78,7 @@ def wall_pieces(anatomy: Anatomy, wall: str = "merged") -> tuple[np.ndarray, ...
 
 
 def check_wall(wall: str) -> None:
-    """Raise ValueError or ModuleNotFoundError unless there are pieces of that kind."""
+    """Raise ValueError or ModuleNotFoundError if this wall cannot be made."""
     bounds.choice("wall", wall, WALLS)
     if wall == "coacd":
         extras.require("export", "coacd")
@@ -87,8 +87,8 @@ def check_wall(wall: str) -> None:
 def _shell(anatomy: Anatomy) -> _Shell:
     inlet, depth = anatomy.inlet, _depth(anatomy)
     vertices, faces = anatomy.surface.vertices.copy(), anatomy.surface.faces
-    # The rim of the inlet's flat cap would be rounded when triangles are merged: it
-    # is moved away, and what lies behind the inlet is cut off afterwards.
+    # Decimation would round the rim of the inlet's flat cap. The cap is moved away, and
+    # the part behind the inlet is cut off afterwards.
     behind = (vertices - inlet.position) @ inlet.direction < 2 * _BEHIND
     around = np.linalg.norm(vertices - inlet.position, axis=1) < 1.5 * inlet.radius
     vertices[behind & around] -= _LONGER * inlet.direction
@@ -104,7 +104,7 @@ def _shell(anatomy: Anatomy) -> _Shell:
     for s in np.arange(0.4e-3, THICKNESS + 1e-9, 0.2e-3):
         going &= -depth(points + s * normals) > 0.35 * s
         reach[going] = s
-    # Between two lumens there is no room to move into.
+    # The movement is limited where another lumen is near.
     room = np.minimum(MOVE, 0.5 * reach)
     moved = np.minimum(SHIFT, room)
     for _ in range(4):
@@ -121,7 +121,7 @@ def _shell(anatomy: Anatomy) -> _Shell:
 
 
 def _depth(anatomy: Anatomy) -> Callable[[np.ndarray], np.ndarray]:
-    """Depth of points in the lumen, which goes on behind the inlet as a tube."""
+    """Depth function (m) of the lumen, extended behind the inlet by a straight tube."""
     inlet = anatomy.inlet
 
     def depth(points: np.ndarray) -> np.ndarray:
@@ -135,7 +135,7 @@ def _depth(anatomy: Anatomy) -> Callable[[np.ndarray], np.ndarray]:
 def _before(
     points: np.ndarray, position: np.ndarray, inward: np.ndarray, radius: float
 ) -> np.ndarray:
-    """Points, of which those at an open end or behind it are moved ahead of it."""
+    """Points (..., 3), with those at or behind an open end moved `_AHEAD` of it."""
     away = points - position
     height = away @ inward
     aside = np.linalg.norm(away - height[..., None] * inward, axis=-1)
@@ -144,7 +144,7 @@ def _before(
 
 
 def _prisms(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
-    """A prism on every triangle."""
+    """One prism for each triangle."""
     del anatomy
     ends = shell.inner[shell.faces], shell.outer[shell.faces]
     return list(np.concatenate(ends, axis=1))
@@ -173,7 +173,7 @@ def _coacd(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
     label = kmeans2(features, count, minit="++", seed=0)[1]
     solid, size = 1e3 * np.concatenate([inner, outer]), len(inner)
     pieces = []
-    # Minutes: on a terminal a bar says so.
+    # This takes minutes: a terminal shows a progress bar.
     for k in tqdm(np.unique(label), "CoACD", unit=" patches", disable=None):
         patch = faces[label == k]
         edges = patch[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -197,7 +197,7 @@ _COACD: dict[str, Any] = {
 
 
 def _inlet_cap(border: np.ndarray, inlet: Inlet) -> list[np.ndarray]:
-    """Convex sectors behind edges (n, 2, 3) m of the cut; they leave the hole open."""
+    """Convex sectors of the cap behind the edges (n, 2, 3), m, of the cut."""
     spokes = border - inlet.position
     reach = np.linalg.norm(spokes, axis=-1, keepdims=True)
     spokes = spokes / np.maximum(reach, 1e-9)
@@ -207,7 +207,7 @@ def _inlet_cap(border: np.ndarray, inlet: Inlet) -> list[np.ndarray]:
     sector = (angle * CAP_SECTORS / (2 * np.pi)).astype(int)
     sectors = []
     for k in range(CAP_SECTORS):
-        # Edges across a border of sectors belong to both.
+        # An edge across the border of two sectors belongs to both.
         rows = (sector == k).any(axis=1)
         middle = 2 * np.pi * (k + 0.5) / CAP_SECTORS
         span = np.abs((angle[rows] - middle + np.pi) % (2 * np.pi) - np.pi)
@@ -225,14 +225,14 @@ def _inlet_cap(border: np.ndarray, inlet: Inlet) -> list[np.ndarray]:
 
 
 def _outward_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3) that lean outwards from all triangles around a vertex."""
+    """Unit vertex normals (V, 3) that point outwards from all adjacent triangles."""
     import igl
 
     flat = igl.per_face_normals(vertices, faces, np.zeros(3))
     weighting = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
     normals = igl.per_vertex_normals(vertices, faces, weighting)
     normals[~np.isfinite(normals)] = 0.0  # of vertices without triangles
-    # Where the surface folds sharply the mean may point into one of the triangles.
+    # At a sharp fold the mean normal may point into one of the triangles.
     for _ in range(20):
         lean = np.einsum("fkd,fd->fk", normals[faces], flat)
         push = np.zeros_like(vertices)
@@ -250,10 +250,11 @@ def fidelity(anatomy: Anatomy, pieces: Sequence[np.ndarray]) -> dict[str, Any]:
     """Measures convex pieces (n_i, 3) m against the lumen of an anatomy.
 
     Returns:
-        Over `places` all over the wall, mean, 95th percentile and maximum of how far
-        the pieces stand in the lumen (`intrusion_mm`), and of how far they stay behind
-        the wall (`recession_mm`); `open_places`, where no piece is met within 1.5 mm
-        behind the wall; and the vessels whose centreline is `closed_to_5fr`.
+        `intrusion_mm` and `recession_mm`: mean, 95th percentile and maximum, over
+        sample points of the wall, of the protrusion of the pieces into the lumen and
+        of their distance behind the wall. `places`: number of sample points.
+        `open_places`: number of those without a piece within 1.5 mm behind the wall.
+        `closed_to_5fr`: vessels whose centreline a 5 Fr catheter cannot follow.
     """
     points, inward = _wall_places(anatomy)
     met = _within(points[:, None] + _LEVELS[:, None] * inward[:, None], pieces)
@@ -301,7 +302,7 @@ def _within(points: np.ndarray, pieces: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _wall_places(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
-    """Places (n, 3) m all over the wall, and unit normals (n, 3) into the lumen."""
+    """Sample points (n, 3), m, of the wall, and unit normals (n, 3) into the lumen."""
     points, _ = sampled(anatomy.surface, _PLACES)
     inside = points
     for end in anatomy.ends:
@@ -324,14 +325,14 @@ def write_mjcf(
 
     Args:
         path: of the file, which must end in .xml; lengths in it are metres.
-        wall: How the wall is divided, see `wall_pieces`.
+        wall: Division of the wall, see `wall_pieces`.
 
     Returns:
-        Number of `pieces`, and how well they stand for the lumen, see `fidelity`.
+        Number of `pieces`, and their deviations from the lumen, see `fidelity`.
 
     Raises:
         ValueError: if the file name has another ending, or there is no such wall.
-        ModuleNotFoundError: if CoACD is asked for and not installed.
+        ModuleNotFoundError: if "coacd" is chosen and CoACD is not installed.
     """
     import mujoco
 

@@ -1,4 +1,4 @@
-"""The lumen as a field: signed depth on sparse bricks, looked up by all that ask."""
+"""Signed depth of a lumen, sampled on sparse bricks."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from cathsim_dmc.anatomy.parts import MARGIN, End, Surface
 from cathsim_dmc.laws.field import END, FIRST_END, FieldArrays, depths, gradients
 
 EDGE = 4e-3  # m, of a brick
-# Depths, m, between which a device touches the wall: from as deep as an impact takes
-# its axis into the wall to somewhat more than the radius of the thickest.
+# Range of depths, m, of the axis of a device in contact: from the deepest penetration
+# in an impact to slightly more than the radius of the thickest device.
 SHELL = (-1e-3, 1.3e-3)
-# m that linear interpolation may miss there: at 95 % of the points of a brick, and at
-# any of a brick that keeps the coarse lattice.
+# Largest error, m, of linear interpolation in this range: at 95 % of the points of a
+# brick with a lattice of its own, and at any point of a brick without one.
 TOLERANCE, _COARSE = 8e-6, 3e-5
-LARGEST = 5_000_000  # bytes; where tolerance asks for more, it grows
+LARGEST = 5_000_000  # bytes of a field; the tolerance grows until it fits
 MOST_CELLS = 12  # along the edge of a brick
 QUANTUM = 1e-6  # m, of the depths kept in 16 bits, which reach to 32.767 mm
 _LARGEST = 32767
-_STEP = 0.25e-3  # m, to both sides, over which a gradient is taken
+_STEP = 0.25e-3  # m, to both sides, of the central differences of a gradient
 _CHUNK = 2048  # bricks measured at once
-_FAR = -25e-3  # m; nothing asks for the depth farther outside of the lumen
+_FAR = -25e-3  # m; depths farther outside the lumen are not used
 _TOGETHER = 4  # corners along each axis that are measured at once
 
 # Depths (n, m) m at blocks (n, 3) + points (m, 3) m.
@@ -39,18 +39,19 @@ Measure = Callable[[Array, Array], Array]
 class Field:
     """Signed depth in a lumen: distance to its wall, m, > 0 inside.
 
-    Space is divided into bricks of `EDGE`. A brick next to the wall holds a lattice as
-    fine as the curvature of the depth asks for; between its points the depth is
-    linear. All other bricks have the depths at their eight corners.
+    Space is divided into bricks of `EDGE`. A brick near the wall holds a lattice whose
+    resolution follows the curvature of the depth. Any other brick has the depths at its
+    eight corners. Between these points the depth is trilinear.
 
     Attributes:
         head: float64; origin (3) m, edge m, bricks along x, y and z (3), m a unit,
             number of open ends, and of each: position (3) m, direction out of the
             lumen (3), radii of the lumen and of the hole in its cap, m.
         coarse: ((a + 1)(b + 1)(c + 1),) int16, depths at the corners of the bricks.
-        index: (a b c,) int32, first place of a brick in `samples`, -1 for none.
-        samples: int16; of each brick the cells n along its edge and (n + 1)^3 depths.
-        pages: the mapped file that the arrays lie in, if there is one.
+        index: (a b c,) int32, offset of a brick in `samples`; -1 for none.
+        samples: int16; for each brick the number n of cells along its edge and
+            (n + 1)^3 depths.
+        pages: memory-mapped file that holds the arrays, or None.
     """
 
     head: Array
@@ -64,19 +65,19 @@ class Field:
 
         Args:
             points: m.
-            free: what lies behind an open end, in the straight continuation of the
-                lumen, is `laws.field.FREE` deep; otherwise it is outside, by its
-                distance from the plane of the end.
+            free: whether points behind an open end, in the straight continuation of
+                the lumen, have the depth `laws.field.FREE`; otherwise they are outside
+                by their distance from the plane of the end.
         """
         flat, out = as_rows(points), np.empty(np.shape(points)[:-1])
         depths(self.arrays, flat, free, out.reshape(-1))
         return out
 
     def gradient(self, points: ArrayLike) -> Array:
-        """Gradients (..., 3) of the depth at points (..., 3) m; open ends do not count.
+        """Gradients (..., 3) of the depth at points (..., 3) m; open ends are ignored.
 
-        They point away from the wall and change without jumps from cell to cell; NaN
-        at points that are not finite.
+        They point away from the wall and are continuous from cell to cell; NaN at
+        points that are not finite.
         """
         flat = as_rows(points)
         out = np.empty_like(flat)
@@ -85,7 +86,7 @@ class Field:
 
     @property
     def arrays(self) -> FieldArrays:
-        """The arrays, as the laws take them."""
+        """The arrays in the form that the laws take."""
         return FieldArrays(self.head, self.coarse, self.index, self.samples)
 
     @property
@@ -100,7 +101,7 @@ class Field:
 
     @cached_property
     def body(self) -> bytes:
-        """SHA-256 of the arrays but for the head."""
+        """SHA-256 of the arrays without the head."""
         joined = hashlib.sha256()
         for array in self.arrays[1:]:
             joined.update(np.ascontiguousarray(array).data)
@@ -112,7 +113,7 @@ class Field:
         return hashlib.sha256(self.head.tobytes() + self.body).digest()
 
     def with_hole(self, radius: float) -> Field:
-        """The same lumen with flat caps over its open ends, but for a hole (m) each."""
+        """The same lumen with capped open ends, each with a hole of `radius` (m)."""
         head = self.head.copy()
         head[FIRST_END + END - 1 :: END] = radius
         field = replace(self, head=head)
@@ -120,12 +121,12 @@ class Field:
         return field
 
     def release(self) -> None:
-        """Gives back memory that can be read again from the file it is mapped from."""
+        """Releases the memory of the mapped file, which is read again when needed."""
         if self.pages is not None:
             file_maps.release(self.pages)
 
     def __getstate__(self) -> dict[str, object]:
-        """What copies hold: arrays in memory of their own."""
+        """State of copies and pickles: the arrays without the mapped file."""
         return {**vars(self), "pages": None}
 
     @classmethod
@@ -133,7 +134,7 @@ class Field:
         """Field of the union of a tree's tubes, or of what a surface encloses.
 
         Args:
-            lumen: a surface is closed, with normals outwards, and flat over the ends.
+            lumen: vessel tree, or closed surface with outward normals and flat ends.
             ends: flat ends; those that are open let a device pass.
         """
         from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
@@ -148,12 +149,12 @@ class Field:
     def sampled(
         cls, measure: Measure, low: Array, high: Array, ends: Sequence[End] = ()
     ) -> Field:
-        """Field of a measured depth.
+        """Field that samples a depth function.
 
         Args:
             measure: exact depths; open ends do not limit them.
-            low: (3,) m, least corner of a box around the lumen.
-            high: (3,) m, largest corner.
+            low: (3,) m, lower corner of a box around the lumen.
+            high: (3,) m, upper corner.
             ends: flat ends of the lumen.
         """
         origin = np.asarray(low) - MARGIN
@@ -164,7 +165,7 @@ class Field:
         rows = np.argwhere(_near_wall(low, high))
         middles = origin + EDGE * (rows + 0.5)
         depth = measure(middles, np.zeros((1, 3)))[:, 0]
-        # Behind an open end the depth jumps from one corner to the other.
+        # The depth is discontinuous behind an open end.
         across = (low < SHELL[1]) & (high > SHELL[0])
         near = _near_wall(depth, depth) | across[tuple(rows.T)]
         rows, middles = rows[near], middles[near]
@@ -192,7 +193,7 @@ class Field:
 
 
 def _corners(measure: Measure, origin: Array, shape: np.ndarray) -> Array:
-    """Depths m at all corners of bricks; far outside, those of a block's middle."""
+    """Depths (m) at all brick corners; far outside, one depth for a block of them."""
     blocks, half = -(-shape // _TOGETHER), (_TOGETHER - 1) / 2
     middles = origin + EDGE * (
         _TOGETHER * _lattice([np.arange(count) for count in blocks]) + half
@@ -207,12 +208,12 @@ def _corners(measure: Measure, origin: Array, shape: np.ndarray) -> Array:
 
 
 def _lattice(along: Sequence[np.ndarray]) -> Array:
-    """Points (n, 3) of a lattice by their places along the three axes."""
+    """Points (n, 3) of a lattice with the given coordinates along the three axes."""
     return np.stack(np.meshgrid(*along, indexing="ij"), -1).reshape(-1, 3)
 
 
 def _near_wall(low: Array, high: Array) -> np.ndarray:
-    """Which bricks may come into the shell, from depths at their corners or middles."""
+    """Mask of bricks that may reach the shell, from depths at corners or middles."""
     reach = EDGE * np.sqrt(3.0) / 2.0
     # The depth changes by at most the distance moved.
     return (high + reach > SHELL[0]) & (low - reach < SHELL[1])
@@ -232,14 +233,15 @@ def _in_shell(depth: Array) -> Array:
 
 
 def _cells(exact: Array, eight: Array, room: int) -> np.ndarray:
-    """Cells (n,) along the edges of bricks, 1 for no lattice, that fit `room` bytes.
+    """Number of cells (n,) along the edge of each brick, 1 for no lattice.
 
-    Their depths are known at points (n, 5, 5, 5) and at the corners (n, 2, 2, 2), m.
+    All lattices fit in `room` bytes. The depths, m, are given at the points `exact`
+    (n, 5, 5, 5) and at the corners `eight` (n, 2, 2, 2).
     """
     shell = _in_shell(exact)
     plain = np.abs(_in_shell(_refined(eight, 4)) - shell).reshape(len(exact), -1)
     halves = np.abs(_in_shell(_refined(exact[:, ::2, ::2, ::2], 2)) - shell)
-    # Of the points in the shell, of which a brick may have few.
+    # Only points in the shell count, and a brick may have few of them.
     within = (exact == shell).reshape(len(exact), -1)
     halves = np.sort(np.where(within, halves.reshape(within.shape), -1.0), axis=1)
     rank = within.shape[1] - 1 - (0.05 * within.sum(axis=1)).astype(int)

@@ -1,6 +1,6 @@
-"""Cache of fields, by the content that they are built from.
+"""Cache of fields, keyed by the geometry that they are built from.
 
-Those of the phantoms ship in `data`, written by `tools/ship_fields.py`.
+The fields of the phantoms ship in `data`, written by `tools/ship_fields.py`.
 """
 
 import contextlib
@@ -28,21 +28,20 @@ _SHIPPED = Path(__file__).parent / "data"
 _DIGITS = 9  # of lengths, m, that count: processors round differently
 _SUFFIX = ".npy"
 _FILTERS = [{"id": lzma.FILTER_DELTA, "dist": 2}, {"id": lzma.FILTER_LZMA2}]
-# Whose code decides what a field holds.
+# Modules whose code determines a field; it is part of the key.
 _MODULES = ("field", "tree_depth", "surface_depth")
 
 
 def cache_folder() -> Path:
-    """Where fields are kept: ``cathsim_dmc/fields`` in the user's cache folder."""
+    """Folder of the cache: ``cathsim_dmc/fields`` in the user's cache folder."""
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(home) / "cathsim_dmc" / "fields"
 
 
 def field_of(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Field:
-    """As `Field.of`, mapped from its file in the cache if it was built before.
+    """As `Field.of`, but memory-mapped from the cache if it was built before.
 
-    A damaged file is built again; nothing is kept in a folder that is read-only, nor
-    without a home.
+    A damaged file is built again. Without a writable folder nothing is cached.
 
     Raises:
         ValueError: if the box around the lumen is larger than `MOST_ROOM`.
@@ -53,7 +52,7 @@ def field_of(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Field:
     try:
         path = cache_folder() / name
         field = _read(path)
-    except (OSError, ValueError, RuntimeError):  # of a user without a home
+    except (OSError, ValueError, RuntimeError):  # RuntimeError without a home folder
         field = _shipped(shipped_name(lumen, ends)) or Field.of(lumen, ends)
         with contextlib.suppress(OSError, ValueError):
             if path is not None:
@@ -82,12 +81,12 @@ def _require_size(lumen: VesselTree | Surface) -> None:
 
 
 def shipped_name(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> str:
-    """What the field of a lumen is called, if it comes with the package."""
+    """Name of the field of a lumen among those that ship: 16 hexadecimal digits."""
     return _name(lumen, ends)[:16]
 
 
 def _shipped(name: str) -> Field | None:
-    # A file has its fields in the order of their names in its own.
+    # The file name lists the names of its fields in their order.
     for path in _SHIPPED.glob(f"*{name}*.field"):
         stream = io.BytesIO(lzma.decompress(path.read_bytes()))
         for one in path.stem.split("-"):
@@ -134,7 +133,7 @@ def _code() -> bytes:
 
 
 def ship(folder: Path, fields: Mapping[str, Field]) -> Path:
-    """Writes similar fields, by `shipped_name`, to one file of a quarter their size."""
+    """Writes similar fields, by `shipped_name`, to one compressed file in `folder`."""
     stream = io.BytesIO()
     for field in fields.values():
         np.save(stream, _record(field), allow_pickle=False)
@@ -144,7 +143,7 @@ def ship(folder: Path, fields: Mapping[str, Field]) -> Path:
 
 
 def _record(field: Field) -> np.ndarray:
-    """One record (1,) of all arrays of a field and their checksum."""
+    """Record (1,) of all arrays of a field and their checksum."""
     digest = np.frombuffer(field.digest, np.uint8)
     arrays = dict(zip((*_NAMES, _DIGEST), (*field.arrays, digest), strict=True))
     kinds = [(name, array.dtype, array.shape) for name, array in arrays.items()]
@@ -158,7 +157,7 @@ def _keep(field: Field, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with files.atomic_path(path) as temporary, open(temporary, "wb") as stream:
         np.save(stream, _record(field), allow_pickle=False)
-    with contextlib.suppress(OSError):  # another process drops one
+    with contextlib.suppress(OSError):  # another process may delete a file
         kept = [(entry.stat(), entry) for entry in path.parent.glob(f"*{_SUFFIX}")]
         kept.sort(key=lambda pair: pair[0].st_mtime, reverse=True)
         total = np.cumsum([size.st_size for size, _ in kept])

@@ -1,4 +1,4 @@
-"""Points of a lattice inside a lumen, and the shortest paths among them to one."""
+"""Lattice points inside a lumen, and shortest paths among them to a target."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,10 +9,10 @@ from scipy import ndimage
 Depth = Callable[[np.ndarray], np.ndarray]
 
 SPACING = 1.5e-3  # m: vessels down to a radius of 1.3 mm stay connected
-FINEST = 0.4e-3  # m: the lattice is refined down to here where they do not
+FINEST = 0.4e-3  # m: finest lattice for thinner vessels
 
 _BLOCKS = ((8, 2), (2, 1))  # points along the edges of blocks, and of their parts
-_SLOPE = 1.2  # m per m, most of an interpolated depth
+_SLOPE = 1.2  # m per m, largest slope of an interpolated depth
 
 
 def inside(
@@ -36,20 +36,20 @@ def inside(
 
 
 def nearest_cell(cells: np.ndarray, place: np.ndarray) -> tuple[int, ...]:
-    """The cell of (n, 3) that is nearest to a place (3,) in cells."""
+    """Cell among `cells` (n, 3) that is nearest to a place (3,), in cell units."""
     return tuple(cells[np.square(cells - place).sum(axis=1).argmin()].tolist())
 
 
 def search(price: np.ndarray, start: tuple[int, ...]) -> tuple[Any, np.ndarray]:
-    """Cheapest ways from a cell of a lattice to all others (26 neighbours).
+    """Cheapest paths from a cell of a lattice to all others (26 neighbours).
 
     Args:
-        price: (X, Y, Z) of a way by a cell through each; negative where there is none.
+        price: (X, Y, Z) cost of a path per cell of length; negative for no passage.
         start: The cell.
 
     Returns:
-        The graph, whose `traceback(cell)` lists the cells of a way, and the cost of the
-        way to each cell (X, Y, Z), inf where there is none.
+        The graph, whose `traceback(cell)` lists the cells of a path, and the cost
+        (X, Y, Z) of the path to each cell, inf where there is none.
     """
     from skimage.graph import MCP_Geometric  # slow to import
 
@@ -58,10 +58,10 @@ def search(price: np.ndarray, start: tuple[int, ...]) -> tuple[Any, np.ndarray]:
 
 
 class LumenDistance:
-    """Length of the shortest way inside the lumen to a target, as a lattice.
+    """Length of the shortest path inside the lumen to a target, on a lattice.
 
-    Ways run along the edges and diagonals of the lattice (26 neighbours), which makes
-    them up to a tenth too long, never too short by more than a cell.
+    Paths run along the edges and diagonals of the lattice (26 neighbours): they are up
+    to a tenth too long, and too short by at most one cell.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class LumenDistance:
             depth: Signed depth (n,) of points (n, 3) in the lumen, m, > 0 inside.
             bounds: (2, 3), m, corners of a box that holds the lumen.
             target: (3,), m, point in the lumen.
-            origin: (3,), m, another one; ValueError if no way joins it to the target.
+            origin: (3,), m, another one; ValueError if no path joins it to the target.
         """
         (low, high), spacing = np.asarray(bounds, float), SPACING
         while True:
@@ -104,9 +104,9 @@ class LumenDistance:
         self._own = np.where(self._inside, self._ways, 0.0)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Length (...) of the ways from points (..., 3), m."""
-        # Lattice points outside the lumen, which may be nearer to another vessel, count
-        # only where there is no other.
+        """Length (...), m, of the paths from points (..., 3), m, to the target."""
+        # Lattice points outside the lumen may belong to another vessel. They count only
+        # if none of the eight is inside.
         points = np.asarray(points, float)
         cell = ((points.reshape(-1, 3) - self._low) / self._spacing).T
         total, weight = (
@@ -115,6 +115,6 @@ class LumenDistance:
         )
         last = np.array(self._ways.shape)[:, None] - 1
         nearest = self._ways[tuple(np.rint(cell).astype(int).clip(0, last))]
-        with np.errstate(invalid="ignore"):  # no lattice point inside
+        with np.errstate(invalid="ignore"):  # 0 / 0 without a lattice point inside
             lengths = np.where(weight < 1e-6, nearest, total / weight)
         return lengths.reshape(points.shape[:-1])

@@ -7,10 +7,10 @@ import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
 
-BRANCH_LEVEL = 10e-3  # m past its ostium, where a branch is measured, funnel over
+BRANCH_LEVEL = 10e-3  # m past its ostium, where a branch is measured, past its flare
 _END_CHORD = 30e-3  # m, of the direction of an end of the aorta
 _START_CHORD = 15e-3  # m, the same at the root, where it bends most
-_OUT_OF_PLANE_AT = 40e-3  # m past its ostium, where a branch stands out of the plane
+_OUT_OF_PLANE_AT = 40e-3  # m past its ostium, where `out_of_plane_mm` is taken
 _BEND_CHORD = 15e-3  # m, between the tangents of a bend
 
 
@@ -22,7 +22,7 @@ def arch_type(drop: float) -> str:
 def bca_drop(tree: VesselTree) -> float:
     """Height of the top of the arch over the BCA's ostium, in diameters of the LCCA.
 
-    NaN without these branches; a right carotid of its own stands in the BCA's place.
+    A right carotid that leaves the arch counts as the BCA. NaN if a branch is missing.
     """
     first, lcca = tree.vessels.get("bca", tree.vessels.get("rcca")), "lcca"
     if first is None or lcca not in tree.vessels:
@@ -48,7 +48,7 @@ def measure(tree: VesselTree) -> dict[str, Any]:
     }
     first = min(levels.values(), default=0.5 * aorta.length)
     last = max(levels.values(), default=0.5 * aorta.length)
-    # Half-way to the branches on one side and to the end on the other.
+    # Half-way from the start to the first branch, and from the last branch to the end.
     end = 0.5 * (last + aorta.length)
     stations = {"ascending": 0.5 * first, **levels, "descending": end}
     turn = _angle(_chord(aorta, 0.0, _START_CHORD), aorta.at(first).tangent)
@@ -93,7 +93,7 @@ def _branch(
         # From the ostium to the free end.
         "length_mm": _mm(own.length),
         # From the vertical in the plane of the arch, positive upstream; and out of the
-        # plane, positive to the patient's right and back, as 40 mm past the ostium.
+        # plane, positive to the patient's right and back: angle, and offset at 40 mm.
         "take_off_deg": _degrees(math.atan2(-(direction @ along), direction[2])),
         "lean_deg": _degrees(math.atan2(direction @ normal, direction[2])),
         "out_of_plane_mm": _mm((far - ostium) @ normal),

@@ -1,6 +1,6 @@
-"""Convex pieces that are merged while their hulls stay out of the lumen.
+"""Merging of convex pieces whose hulls stay out of the lumen.
 
-A hull of two pieces contains both, so merging opens no gap.
+The hull of two pieces contains both, so merging opens no gap.
 """
 
 import heapq
@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 _LONG = 2.5e-3  # m; triangles of a hull with longer edges are sampled densely
-_ORDER = 6  # subdivision of these
-# Pieces that reach far are merged last: m of depth for each m of radius.
+_ORDER = 6  # subdivision of these triangles
+# Extra cost of a hull by its radius, m of depth per m, so that long ones merge last.
 _PER_RADIUS = 0.01
 
 Depth = Callable[[np.ndarray], np.ndarray]
@@ -23,16 +23,16 @@ def merged(
     depth: Depth,
     tolerance: float,
 ) -> list[np.ndarray]:
-    """Merges neighbouring convex pieces, those first whose hull stays farthest out.
+    """Merges neighbouring convex pieces, first those with the shallowest hull.
 
     Args:
         pieces: Vertices (n_i, 3) m.
-        pairs: Numbers of pieces that are neighbours.
+        pairs: Pairs of indices of neighbouring pieces.
         depth: Depth (n,) m of points (n, 3) in the lumen, negative outside.
         tolerance: Largest depth that a merged hull may have, m.
 
     Returns:
-        Vertices of the hulls of what was merged, and the other pieces.
+        Vertices (n_i, 3) m of the merged hulls and of the pieces left alone.
     """
     alive = dict(enumerate(pieces))
     near: dict[int, set[int]] = {number: set() for number in alive}
@@ -66,7 +66,7 @@ def merged(
 
 
 def hull_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) all over the convex hull of points (m, 3), and its vertices."""
+    """Sample points (n, 3) of the convex hull of points (m, 3), and its vertices."""
     try:
         hull = ConvexHull(1e3 * points)
     except QhullError:  # nearly flat

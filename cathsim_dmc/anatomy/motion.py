@@ -1,4 +1,4 @@
-"""How heart and breathing move an anatomy, as displacements of space.
+"""Motion of an anatomy with heart and breathing, as displacements of space.
 
 A place x in space holds what lies at X = x - u(x, t) in the anatomy at rest, with
 u = a(t) H(x) + b(t) B(x); the radius grows by g(X) p(t - s/c): docs/vessel_model.md.
@@ -24,29 +24,29 @@ from cathsim_dmc.laws.motion import (
 )
 
 _STEP = 6e-3  # m, of the lattice
-_SMOOTH = 25e-3  # m, over which a displacement is that of the aorta around
-_ACROSS = 2e-3  # m, over which a radius passes into that of the branch
-_FADE = 60e-3  # m, from an open end, over which displacements begin
+_SMOOTH = 25e-3  # m, standard deviation of the Gaussian average over segments
+_ACROSS = 2e-3  # m, over which the radius changes from vessel to vessel
+_FADE = 60e-3  # m from an open end, over which displacements rise from zero
 _HEART_REACH = 50e-3  # m along the aorta, over which the heart's motion fades
-_HEART_WAY = np.array([0.3, -0.3, -0.9]) / np.sqrt(0.99)  # LPS
-# Breathing: ascending aorta, BCA, LSA, descending aorta, m (Sailer 2015), and to the
-# left where medial is.
+_HEART_WAY = np.array([0.3, -0.3, -0.9]) / np.sqrt(0.99)  # unit vector, LPS
+# Breathing: amplitudes of ascending aorta, BCA, LSA and descending aorta, m (Sailer
+# 2015), and +1 where medial is to the left.
 _BREATHING = np.array([8.9e-3, 12.0e-3, 11.1e-3, 4.9e-3])
 _MEDIAL = np.array([1.0, 1.0, -1.0, -1.0])
 _INSPIRATION = (0.33, -0.47, -0.82)  # medial, posterior, superior
 PULSE_PRESSURE = 5.33  # kPa, 40 mmHg
-# Numbers of a motion in a recording; those from 1 to 8 are
-# `laws.motion.MotionParameters`, the others are not used.
+# Length of the parameters of a motion in a recording. Entries 1 to 8 are
+# `laws.motion.MotionParameters`; the others are unused.
 PARAMETERS = 11
-STEEPEST = 0.6  # norm of the gradient of a displacement, at most; at 1 space folds
+STEEPEST = 0.6  # largest norm of a displacement gradient; at 1 space folds
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
     """Displacements of space around an anatomy, on a lattice.
 
-    It is (7 + 8 a b c,): origin (3) and step, m, shape (a, b, c), and at each point
-    what `laws.motion.VALUES` says.
+    `lattice` is (7 + 8 a b c,) float64: origin (3) and step, m, shape (a, b, c), and at
+    each point the values that `laws.motion.VALUES` describes.
     """
 
     lattice: Array
@@ -59,7 +59,7 @@ class Motion:
         ends: Sequence[End],
         blood: Circulation,
     ) -> "Motion":
-        """The motion of an anatomy whose field has corners (3,), (3,) m."""
+        """Motion of an anatomy whose field has the corners `box` (3,), (3,), m."""
         low, high = box
         heart, breath = _along_aorta(blood, tree)
         shape = np.ceil((high - low) / _STEP).astype(int) + 1
@@ -75,7 +75,7 @@ class Motion:
         return cls(np.concatenate([low, [_STEP], shape, values.ravel()]))
 
     def check(self, name: str, heart: float, breathing: float) -> None:
-        """ValueError if the largest heart (m) and breathing amplitudes fold space."""
+        """ValueError if the amplitudes of heart (m) and breathing fold space."""
         shape = self.lattice[4:7].astype(int)
         values = self.lattice[7:].reshape((*shape, 8))
         steepest = 0.0
@@ -90,7 +90,7 @@ class Motion:
             )
 
     def to_rest(self, parameters: Array, time: float, points: Array) -> Array:
-        """Places at rest (..., 3) of places in space (..., 3), m."""
+        """Points at rest (..., 3), m, of points in space (..., 3), m, at a time, s."""
         out, course = np.empty((points.size // 3, 3)), course_of(parameters, time)
         to_rest(self.lattice, course, as_rows(points), scratch(), out)
         return out.reshape(points.shape)
@@ -98,7 +98,7 @@ class Motion:
     def to_space(
         self, parameters: Array, time: float, points: Array
     ) -> tuple[Array, Array]:
-        """Places in space (..., 3) m of those at rest, and growth of radii (...) m."""
+        """Points in space (..., 3), m, of points at rest, and growth of radii (...)."""
         flat = as_rows(points)
         out, growth = np.empty_like(flat), np.empty(len(flat))
         course = course_of(parameters, time)
@@ -106,23 +106,23 @@ class Motion:
         return out.reshape(points.shape), growth.reshape(points.shape[:-1])
 
     def surface(self, parameters: Array, time: float, rest: Surface) -> Surface:
-        """The lumen's surface at a time, s, of that at rest."""
+        """Surface of the lumen at a time, s, from that at rest."""
         places, growth = self.to_space(parameters, time, rest.vertices)
         return Surface(places + growth[:, None] * rest.normals, rest.faces)
 
 
 def scratch() -> Array:
-    """Memory of `laws.motion.to_rest` and `to_space`."""
+    """Work array of `laws.motion.to_rest` and `to_space`."""
     return np.empty((VALUES + WARP // 4, 4))
 
 
 def course_of(parameters: Array, time: float) -> Course:
-    """Motion at a time, s, of numbers (PARAMETERS,)."""
+    """Motion at a time, s, from parameters (PARAMETERS,)."""
     return course_at(MotionParameters(*parameters[1:9].tolist()), time)
 
 
 def distensibility(radius: Array) -> Array:
-    """Area distensibility over that of a wide artery (n,), radii (n,) m.
+    """Area distensibility (n,) relative to that of a wide artery, by radii (n,), m.
 
     From Eh/r = 3e6 exp(-13.5 r) + 3.37e5 g/s²/cm, r in cm (Mynard, in pwdb).
     """
@@ -132,7 +132,7 @@ def distensibility(radius: Array) -> Array:
 def _values(
     points: Array, ends: Sequence[End], blood: Circulation, heart: Array, breath: Array
 ) -> Array:
-    """What the lattice holds (n, 8) at points (n, 3) m."""
+    """Values (n, 8) of the lattice at points (n, 3), m."""
     middles, radii = blood.ends.mean(axis=1), blood.radii.mean(axis=1)
     ways = blood.ways.mean(axis=1)
     distance = np.linalg.norm(points[:, None] - middles, axis=-1)
@@ -152,7 +152,7 @@ def _values(
 
 
 def _along_aorta(blood: Circulation, tree: VesselTree) -> tuple[Array, Array]:
-    """Displacements (S, 3), (S, 3) of the segments by heart and breathing."""
+    """Displacements (S, 3), (S, 3) of the segments, m, by heart and breathing at 1."""
     ways = blood.ways.mean(axis=1)
     root, names = tree.root, list(tree.vessels)
     length = root.centreline.length

@@ -29,7 +29,7 @@ def _unit(name: str, value: ArrayLike) -> Array:
 
 
 class _Part:
-    """A place in a vessel, whose fields are checked by their names."""
+    """A place in a vessel; each field has the check of its name."""
 
     _CHECKS: ClassVar[dict[str, Callable]] = {
         "name": bounds.text,
@@ -91,7 +91,7 @@ class FileFrame:
 
     Attributes:
         unit: name of the unit of its coordinates, such as "mm".
-        to_lps: (3, 3), takes its coordinates to metres, LPS.
+        to_lps: (3, 3), matrix from its coordinates to metres, LPS.
     """
 
     unit: str
@@ -136,7 +136,7 @@ class Surface:
 
     @cached_property
     def normals(self) -> Array:
-        """Unit normals (V, 3) of the vertices, by area; +z where there is no area."""
+        """Area-weighted unit normals (V, 3) of vertices; +z where there is no area."""
         import igl
 
         weighting = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_AREA

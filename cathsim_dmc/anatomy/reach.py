@@ -5,23 +5,23 @@ import numpy as np
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.parts import Inlet
 
-# The head of a device starts half the way to the first ostium deep, but 5 mm at least
-# (`tasks.placement`), and turns into ostia that are 5 mm or more ahead of it; less in
+# The head of a device starts half-way to the first ostium, but at least 5 mm past the
+# inlet (`tasks.placement`), and enters ostia that are 5 mm or more ahead of it; less in
 # vessels narrower than 6.7 mm.
-OSTIUM_AHEAD = 10e-3  # m, least distance of an ostium from the inlet, at most
-AHEAD_RADII = 3.0  # of the inlet, that are enough
+OSTIUM_AHEAD = 10e-3  # m, distance of an ostium from the inlet that always suffices
+AHEAD_RADII = 3.0  # the same in radii of the inlet
 
 
 def least_ahead(inlet: Inlet) -> float:
-    """Least distance (m) from an inlet of an ostium that a device can turn into."""
+    """Least distance (m) from an inlet to an ostium that a device can enter."""
     return min(OSTIUM_AHEAD, AHEAD_RADII * inlet.radius)
 
 
 def unreachable(anatomy: Anatomy) -> dict[str, list[str]]:
-    """Names of the goals that a device is past when it starts, by the reason.
+    """Lists of names of unreachable goals, by the reason.
 
-    They lie behind the inlet, or in a branch that leaves the inlet's vessel less than
-    `least_ahead` past the inlet, or before it.
+    They lie behind the inlet, or in a branch whose ostium is less than `least_ahead`
+    ahead of the inlet.
     """
     inlet, tree = anatomy.inlet, anatomy.tree
     line = tree.vessel(inlet.vessel).centreline

@@ -7,12 +7,12 @@ from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.parts import Surface
 
 SPACING = 2.2e-3  # m: at most 20,000 triangles on an aortic arch with its branches
-_NARROW = 0.9  # of the least radius: a wider step would show gaps
+_NARROW = 0.9  # of the least radius; a wider step would leave gaps
 _LEAST_SPACING = 1e-3  # m
 
 
 def _depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
-    """Depths (nx, ny, nz) m, far outside -2 spacing, and the first point (3,)."""
+    """Depths (nx, ny, nz) m, far outside -2 spacing, and the first point (3,), m."""
     lines = [(one.centreline, one.parent is None) for one in tree.vessels.values()]
     margin = 3.0 * spacing
     low = np.min([(x.points - x.radii[:, None]).min(0) for x, _ in lines], axis=0)
@@ -37,8 +37,8 @@ def _depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
             x, y, z = np.meshgrid(near_x, near_y, near_z, indexing="ij")
             near = part.project(np.stack([x, y, z], axis=-1))
             depth = near.radius - near.distance
-            # Pieces have round ends, which only repeat what the neighbouring piece
-            # says; those that reach over a flat end of the vessel are cut there.
+            # Pieces have round ends, which lie in the neighbouring piece; a piece that
+            # reaches beyond a flat end of the vessel is cut there.
             for s, side, reaches in (
                 (line.length, 1.0, line.length - s1 < reach),
                 (0.0, -1.0, s0 < reach and is_root),
@@ -54,9 +54,10 @@ def _depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
 
 
 def lumen_surface(tree: VesselTree, spacing: float | None = None) -> Surface:
-    """Closed triangulated surface of the lumen, flat ends too, normals outwards.
+    """Closed triangulated surface of the lumen with flat ends, normals outwards.
 
-    The grid step (m) of the marching cubes shows the narrowest lumen without gaps.
+    ``spacing`` is the grid step (m) of the marching cubes; None adapts it to the
+    narrowest lumen, so that there are no gaps.
     """
     from scipy.ndimage import binary_fill_holes
     from skimage.measure import marching_cubes
@@ -66,7 +67,7 @@ def lumen_surface(tree: VesselTree, spacing: float | None = None) -> Surface:
         spacing = min(SPACING, max(_NARROW * float(min(radii)), _LEAST_SPACING))
     bounds.number("spacing", spacing, positive=True)
     grid, origin = _depth_grid(tree, spacing)
-    # Vessels that meet may leave a grid point between them by less than a micrometre.
+    # Vessels that meet may leave a grid point outside both by less than a micrometre.
     grid[binary_fill_holes(grid > 0.0) & (grid <= 0.0)] = 0.1 * spacing
     vertices, faces, _, _ = marching_cubes(
         grid, level=0.0, spacing=(spacing,) * 3, gradient_direction="ascent"
@@ -75,7 +76,7 @@ def lumen_surface(tree: VesselTree, spacing: float | None = None) -> Surface:
 
 
 def sampled(surface: Surface, count: int) -> tuple[Array, Array]:
-    """Random places (n, 3) m all over a surface, and unit normals (n, 3) out of it."""
+    """Random points (n, 3) m, uniform on a surface, and outward unit normals (n, 3)."""
     import trimesh
 
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)

@@ -1,4 +1,4 @@
-"""Distances to a triangulated surface, by libigl."""
+"""Signed distance to a triangulated surface, by libigl."""
 
 from collections.abc import Sequence
 
@@ -8,17 +8,18 @@ from scipy.sparse import coo_array
 from cathsim_dmc.anatomy.centreline import Array
 from cathsim_dmc.anatomy.parts import MARGIN, End, Surface
 
-# Cosines: of normals of neighbours, and up to which a normal tells inside from outside.
+# Least cosine between normals of neighbours at a smooth place, and least cosine between
+# normal and direction at which a normal tells inside from outside at a sharp one.
 _SMOOTH, _BEFORE = 0.5, 0.9
 _CAP = 1e-6  # m, within which a triangle lies in the plane of an open end
-_SAME = 1e-6  # m; points nearer to each other than this are one
+_SAME = 1e-6  # m; nearer points are evaluated once
 
 
 class SurfaceDepth:
-    """Distance to a closed surface, inside and outside of it."""
+    """Signed distance to a closed surface, m, > 0 inside."""
 
     def __init__(self, surface: Surface, ends: Sequence[End] = ()):
-        """Prepares for a surface, normals outwards; open ends of it are no wall."""
+        """Takes a surface with outward normals; its open ends are no wall."""
         import igl
 
         faces = np.ascontiguousarray(surface.faces, dtype=np.int64)
@@ -37,7 +38,7 @@ class SurfaceDepth:
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         sizes = np.linalg.norm(normals, axis=1, keepdims=True)
         self._normals = normals / np.maximum(sizes, 1e-300)
-        # Triangles with a neighbour, at a corner, whose normal turns sharply.
+        # Triangles with a neighbour, by a common corner, whose normal differs much.
         count = len(self._wall)
         places = np.repeat(np.arange(count), 3), self._wall.ravel()
         at = coo_array((np.ones(3 * count), places), (count, len(vertices))).tocsr()
@@ -53,12 +54,12 @@ class SurfaceDepth:
             self._vertices, self._wall, points
         )
         distance = np.sqrt(squared)
-        # The normal of a triangle says on which side a point lies, unless the surface
-        # turns sharply there; then, and at an open end, the winding number does.
+        # The normal of a triangle gives the side of a point, except where the surface
+        # turns sharply; there, and at an open end, the winding number does.
         level = np.vecdot(place - points, self._normals[face])
         depth = np.copysign(distance, level)
         doubtful = self._sharp[face] & (np.abs(level) < _BEFORE * distance)
-        # Beyond an open end the lumen goes on as a straight tube.
+        # Beyond an open end the lumen continues as a straight tube.
         moved = points.copy()
         for end in self._free:
             offset = points - end.position
@@ -75,7 +76,7 @@ class SurfaceDepth:
 
     @property
     def box(self) -> tuple[Array, Array]:
-        """Corners (3,), (3,) of a box around the surface, m."""
+        """Corners (3,), (3,), m, of a box around the surface."""
         return self._vertices.min(axis=0), self._vertices.max(axis=0)
 
     def around(self, blocks: Array, points: Array) -> Array:

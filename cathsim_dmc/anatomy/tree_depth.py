@@ -1,4 +1,4 @@
-"""True distance to the wall of a vessel tree, inside and outside of it."""
+"""Signed distance to the wall of a vessel tree, > 0 inside."""
 
 from __future__ import annotations
 
@@ -12,28 +12,27 @@ from cathsim_dmc.anatomy.centreline import Array, Centreline, VesselTree
 from cathsim_dmc.anatomy.parts import End
 from cathsim_dmc.compiled import compiled
 
-_SLACK = 3e-3  # m from the wall; a vessel farther off does not matter to a point
-_AROUND = 120  # points of a ring from which creases are looked for
-_SEED, _APART = 1.5e-3, 0.1e-3  # m, most of their way to one, and between two of them
+_SLACK = 3e-3  # m; a vessel that is less deep by more does not affect a point
+_AROUND = 120  # points of a ring that are seeds of the search for creases
+_SEED, _APART = 1.5e-3, 0.1e-3  # m, distance of a seed from a wall; thinning grid
 _GROUP = 2.5  # points along each axis of a group, about
-_ROUNDS = 30  # projections on both walls; those that meet at 30° take the most
-_MEETING = 3e-5  # m from both walls after them, within which walls meet
-_TOUCHING = 5e-6  # m; what lies no further inside another vessel is wall
-_BEHIND = 20e-3  # m behind an open end, in which its lumen goes on
+_ROUNDS = 30  # projections on both walls; walls that meet at 30° need the most
+_MEETING = 3e-5  # m, largest distance of a crease from both walls
+_TOUCHING = 5e-6  # m, largest depth of a wall point in another vessel
+_BEHIND = 20e-3  # m behind an open end, over which the lumen continues
 
 
 class TreeDepth:
-    """Distance to the wall of a union of tubes.
+    """Signed distance to the wall of a union of tubes, m, > 0 inside.
 
-    A tube is the union of its cross-sections: rings around the centreline, across it,
-    whose centres, directions and radii change linearly between its points. Where a ring
-    lies in another vessel there is no wall, and where two walls meet there is an edge,
-    a crease, which is kept as points. Closed ends are flat walls; an open end goes on
-    as a straight tube.
+    A tube is the union of its cross-sections: rings normal to the centreline, whose
+    centres, directions and radii change linearly between its points. A ring inside
+    another vessel is no wall. Two walls meet in a crease, which is stored as points.
+    Closed ends are flat walls; an open end continues as a straight tube.
     """
 
     def __init__(self, tree: VesselTree, ends: Sequence[End] = ()):
-        """Finds the creases; flat ends that are not named are closed."""
+        """Finds the creases; flat ends that are not in `ends` are closed."""
         lines = [vessel.centreline for vessel in tree.vessels.values()]
         stops = np.cumsum([0, *(len(line.points) for line in lines)])
         free = [end.position for end in ends if end.open]
@@ -68,7 +67,7 @@ class TreeDepth:
 
     @property
     def box(self) -> tuple[Array, Array]:
-        """Corners (3,), (3,) of a box around the lumen, m."""
+        """Corners (3,), (3,), m, of a box around the lumen."""
         return _box(self._nodes)
 
     def _find_creases(self, rings: list[Array]) -> Array:
@@ -83,13 +82,13 @@ class TreeDepth:
             for other in set(range(len(rings))) - {one, two}:
                 inside = self._onto(other, two, seeds, 0)[:, 0] > _TOUCHING
                 seeds = seeds[~inside]
-            # Many seeds come to one place.
+            # Many seeds converge to one point.
             _, kept = np.unique(np.rint(seeds / _APART), axis=0, return_index=True)
             found.append(seeds[kept])
         return np.concatenate(found)
 
     def _onto(self, one: int, two: int, seeds: Array, rounds: int) -> Array:
-        """Moves seeds (n, 3) onto both walls; their depths (n, 2) in both, m."""
+        """Moves seeds (n, 3) onto both walls; returns their depths (n, 2), m."""
         left = np.empty((len(seeds), 2))
         _onto_creases(self._tree, (one, two), seeds, rounds, left)
         return left
@@ -121,7 +120,7 @@ def _box(nodes: Array) -> tuple[Array, Array]:
 
 
 def _grouped(points: Array) -> tuple[np.ndarray, Array, Array]:
-    """Groups (m,) of near points (m, 3), their middles (g, 3) and reaches (g,)."""
+    """Labels (m,) of groups of near points (m, 3), their middles and radii (g,)."""
     along = max(1, round(len(points) ** (1 / 3) / _GROUP))
     size = max(float(np.ptp(points, axis=0).max()), 1e-9) / along
     cells = ((points - points.min(axis=0)) / size).astype(int).clip(0, along - 1)
@@ -135,7 +134,7 @@ def _grouped(points: Array) -> tuple[np.ndarray, Array, Array]:
 
 @compiled
 def _ring(nodes, k, u, x, y, z):
-    """A ring between nodes k and k + 1: axial and radial place of a point, radius."""
+    """Axial and radial place of a point at the ring between nodes k, k + 1; radius."""
     v = 1.0 - u
     a, b = nodes[k], nodes[k + 1]
     dx = x - (v * a[0] + u * b[0])
@@ -149,7 +148,7 @@ def _ring(nodes, k, u, x, y, z):
 
 @compiled
 def _from_ring(nodes, k, u, x, y, z):
-    """Squared distance of a point from a ring between nodes k and k + 1."""
+    """Squared distance of a point from the ring at share u of nodes k to k + 1."""
     axial, radial, radius = _ring(nodes, k, u, x, y, z)
     return axial * axial + (radial - radius) ** 2
 
@@ -174,7 +173,7 @@ def _nearest(nodes, first, last, chosen, x, y, z):
         value = _from_node(nodes, k, x, y, z)
         if value < best:
             best, at = value, k
-    # In a segment the square is a parabola, but for how much the tangent turns.
+    # In a segment the square is nearly a parabola, as the tangent turns little.
     place, value = min(at, last - 1), best
     share = 1.0 if at == last else 0.0
     for k in range(max(at - 1, first), min(at + 1, last)):
@@ -197,7 +196,7 @@ def _signed(tree, vessel, chosen, x, y, z, out):
     k, u, value = _nearest(nodes, first, last, chosen, x, y, z)
     axial, radial, radius = _ring(nodes, k, u, x, y, z)
     inside = radial < radius
-    # The place on the ring, in the point's half plane.
+    # Point of the ring in the half plane of the given point.
     a, b, v = nodes[k], nodes[k + 1], 1.0 - u
     tx, ty, tz = v * a[3] + u * b[3], v * a[4] + u * b[4], v * a[5] + u * b[5]
     shift = axial / math.sqrt(tx * tx + ty * ty + tz * tz)
@@ -220,8 +219,8 @@ def _signed(tree, vessel, chosen, x, y, z, out):
             node = nodes[first] if end == 0 else nodes[last]
             ways = (cx - node[0]) ** 2 + (cy - node[1]) ** 2 + (cz - node[2]) ** 2
             if ways > radius * radius:
-                continue  # beside another part of a vessel that turns back
-            # Beyond an open end the lumen goes on as a straight tube.
+                continue  # the point is near another part of a curved vessel
+            # Beyond an open end the lumen continues as a straight tube.
             inside = flats[end] == 0 and level < _BEHIND
         if flats[end] == 1 and abs(level) < distance:
             distance = abs(level)
@@ -239,7 +238,7 @@ def _square(place, x, y, z):
 
 @compiled
 def _rings_near(nodes, among, x, y, z, margin, chosen):
-    """Depth of one vessel's rings; those that matter, behind their number, `chosen`."""
+    """Depth in one vessel's rings; `chosen` gets the count and indices of near ones."""
     best, deepest, count = np.inf, -np.inf, 0
     for k in among:
         best = min(best, _from_node(nodes, k, x, y, z))
@@ -255,7 +254,7 @@ def _rings_near(nodes, among, x, y, z, margin, chosen):
 
 @compiled
 def _at_flat_ends(tree, vessel, deepest, x, y, z):
-    """Least of the depth of a vessel's rings, whose spheres pass its flat ends."""
+    """Depth in a vessel's rings, limited by its flat ends, which spheres reach over."""
     nodes, ends, flats = tree[0], tree[1][vessel], tree[2][vessel]
     for end in range(2):
         node = nodes[ends[end]]
@@ -271,7 +270,7 @@ def _at_flat_ends(tree, vessel, deepest, x, y, z):
 
 @compiled
 def _creases_near(creases, among, x, y, z, margin, near):
-    """Those of the creases that matter around a place, a part of `near`."""
+    """Indices of the creases that may be nearest around a point, a part of `near`."""
     closest, found = np.inf, 0
     for c in among:
         closest = min(closest, _square(creases[c], x, y, z))
@@ -285,7 +284,7 @@ def _creases_near(creases, among, x, y, z, margin, near):
 
 @compiled
 def _tree_depths(tree, creases, blocks, points, reach, groups, out):
-    """Signed distances (n, q) m at blocks (n, 3) + points (q, 3) within a reach, m."""
+    """Signed distances (n, q) m at blocks (n, 3) + points (q, 3) within `reach`, m."""
     nodes, spans, _ = tree
     group, middles, reaches = groups
     vessels = len(spans)
@@ -330,8 +329,8 @@ def _tree_depths(tree, creases, blocks, points, reach, groups, out):
 @compiled
 def _tree_depth(tree, here, x, y, z):
     """Signed distance (m) of one point from the walls, without creases."""
-    # Which vessels matter, and their rings; the same of those that may hold another's
-    # wall; scratch.
+    # Near vessels and their rings; the same of vessels that may hold the wall of
+    # another one; work array.
     matters, close, others, wide, places = here
     inside, distance = False, np.inf
     for v in range(len(matters)):
@@ -354,7 +353,7 @@ def _tree_depth(tree, here, x, y, z):
 
 @compiled
 def _onto_creases(tree, pair, seeds, rounds, left):
-    """Moves seeds (n, 3) to where the walls of two vessels meet; (n, 2) depths left."""
+    """Moves seeds (n, 3) to the crease of two vessels; `left` (n, 2) gets depths."""
     nodes, spans, _ = tree
     every, place = np.arange(len(nodes)), np.empty(3)
     for n in range(len(seeds)):

@@ -1,4 +1,4 @@
-"""Vessel trees in JSON; docs/anatomy_files.md has the format."""
+"""Vessel trees in JSON; docs/anatomy_files.md describes the format."""
 
 import json
 import math
@@ -18,9 +18,9 @@ FORMAT = "cathsim-vessel-tree"
 FORMAT_VERSION = 1
 _MM = 1e-3
 _FRAMES = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}  # factors to LPS
-_FARTHEST, _RADII = 2000.0, (0.3, 60.0)  # mm: other coordinates have another unit
+_FARTHEST, _RADII = 2000.0, (0.3, 60.0)  # mm; values outside have another unit
 _MOST_POINTS = 20_000
-_WAYS = {  # to say where inlets and goals are
+_WAYS = {  # keys that give the place of inlets and goals
     "inlets": ("end", "arc_length_mm"),
     "goals": ("arc_length_mm", "past_ostium_mm", "position_mm"),
 }
@@ -32,11 +32,11 @@ class TreeFile:
 
     name: str
     curves: Mapping[str, Curve]  # the root first
-    inlets: Mapping[str, VesselPlace]  # by access; the first is the usual one
+    inlets: Mapping[str, VesselPlace]  # by access; the first is the default
     goals: Mapping[str, VesselPlace] | None = None  # None for one in each branch
 
     def build(self, access: str | None = None) -> Anatomy:
-        """Anatomy that is entered by `access`, by default the first inlet's."""
+        """Anatomy with the inlet of `access`; by default the first one."""
         if access is None:
             access = next(iter(self.inlets))
         inlet = self.inlets[bounds.choice("access", access, self.inlets)]
@@ -44,7 +44,7 @@ class TreeFile:
 
 
 def read_tree(path: str | os.PathLike[str]) -> TreeFile:
-    """Read a tree file; ValueError names the entry that is not as described."""
+    """Read a tree file; ValueError names an invalid entry."""
     try:
         return parse_tree(json.loads(files.read_text(path)))
     except (ValueError, RecursionError) as error:  # of JSON, or of its entries
@@ -52,7 +52,7 @@ def read_tree(path: str | os.PathLike[str]) -> TreeFile:
 
 
 def parse_tree(content: Any) -> TreeFile:
-    """Tree file from what JSON holds; ValueError names an entry that is wrong."""
+    """Tree file from parsed JSON; ValueError names an invalid entry."""
     needed = ("format", "version", "name", "units", "frame", "vessels")
     _entries("the file", content, needed, ("note", "inlets", "goals"))
     fixed = {"format": FORMAT, "version": FORMAT_VERSION}

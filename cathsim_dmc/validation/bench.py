@@ -21,15 +21,15 @@ from cathsim_dmc.validation.bench_data import Bench, Wire
 from cathsim_dmc.validation.bench_rig import Held
 from cathsim_dmc.validation.checks import Check, Report
 
-# Median RMS distance, mm, of straight wires, and of angled ones at their best turn.
+# Bounds of the median RMS distance, mm: straight wires; angled ones at their best turn.
 STRAIGHT, ANGLED = 2.0, 3.0
 TURNS = 12  # of an angled wire about its axis, evenly spread
-# How a wire comes to its place: pushed from the entry without steering; steered, turned
-# where it enters a wrong branch, pushed too far and pulled back; laid along another
-# measured wire and let go, so that it is on the side of each branch to which the
-# operator has steered it; laid along the measured wire itself.
+# Insertion histories of a wire. "pushed": from the entry without steering. "steered":
+# turned where it enters a wrong branch, pushed too far and pulled back. "led": released
+# from the shape of another measured wire, so that it is on the side of each branch to
+# which the operator steered it. "laid": released from the measured shape itself.
 WAYS = ("pushed", "steered", "led", "laid")
-TOO_FAR = 40e-3  # m, of steered wires; fitted among 20, 40 and 60 mm (docs/bench.md)
+TOO_FAR = 40e-3  # m, overshoot of "steered"; fitted of 20, 40, 60 mm (docs/bench.md)
 EITHER = "pushed or led"  # the better of two histories, since the true one is unknown
 BASELINES = ("centreline", "nearest", "hull")
 
@@ -53,19 +53,19 @@ DOWN = "left"  # of the patient, see docs/bench.md
 
 
 class Result(NamedTuple):
-    """Distances of a simulated wire from the measured one at T turns, mm."""
+    """RMS and largest distance of simulated from measured wire at T turns, mm."""
 
     rms: np.ndarray  # (T,)
     largest: np.ndarray  # (T,)
 
 
 class Experiment:
-    """A bench, its fields and baselines, made once."""
+    """A bench with its fields and baselines, which are cached."""
 
     def __init__(self, bench: Bench):
-        """Takes a bench that was read."""
+        """Takes a bench from `bench_data.read`."""
         self.bench = bench
-        # Lumen, larger by a factor.
+        # Field of the lumen by its enlargement.
         self.field = functools.cache(bench.field)
 
     @functools.cached_property
@@ -75,7 +75,7 @@ class Experiment:
     def held(
         self, wire: Wire, wall: Field | Surface, turn: float = 0.0, **changes: Any
     ) -> Held:
-        """A wire on the bench, with changes of `Held`, see `compare`."""
+        """A wire on the bench; `changes` are those of `compare`."""
         device = changes.pop("device", DEVICES)[wire.kind]
         down = self.bench.down[changes.pop("down", DOWN)]
         return Held(wall, wire, device, down, turn, **changes)
@@ -88,11 +88,11 @@ class Experiment:
         scale: float = 1.0,
         **changes: Any,
     ) -> Result:
-        """Simulates a wire that comes to its place in one of `WAYS`.
+        """Simulates a wire with one of the insertion histories `WAYS`.
 
         Args:
-            turns: of the wire about its axis, rad.
-            scale: by which the lumen is larger.
+            turns: rotations of the wire about its axis, rad.
+            scale: enlargement of the lumen.
             **changes: of the setting: `friction`, `down`, `overshoot`; `device` by kind
                 of the wire.
         """
@@ -106,7 +106,7 @@ class Experiment:
         return _result(wire, shapes)
 
     def _arrival(self, wire: Wire, way: str) -> Callable[[Held], np.ndarray] | None:
-        """How a wire comes to its place; None if it is led and there is no other."""
+        """Simulation of an insertion history; None if it lacks another wire."""
         if way == "pushed":
             return Held.push
         if way == "steered":
@@ -116,13 +116,13 @@ class Experiment:
         return None if start is None else lambda held: held.release(start.points)
 
     def centreline(self, wire: Wire) -> Result:
-        """The vessel's centreline from the entry to the vessel that the tip is in."""
+        """Baseline: the centreline from the entry to the vessel of the tip."""
         node = self._ways.node(self.bench.ends[wire.vessel])
         before = self._ways.deepest_from(self._ways.node(self.bench.entry.position))
         return _result(wire, [self._ways.points[self._ways.trace(before, node)]])
 
     def nearest(self, wire: Wire) -> Result:
-        """Another measured wire of the product: where a wire that is led starts."""
+        """Baseline: another measured wire of the product, the start of "led"."""
         other = self._nearest(wire)
         return _result(wire, [] if other is None else [other.points])
 
@@ -137,7 +137,7 @@ class Experiment:
         return min(others, key=away, default=None)
 
     def hull(self, wire: Wire) -> Result:
-        """The wire pushed into MuJoCo's own mesh, which is its convex hull."""
+        """Baseline: the wire pushed into MuJoCo's mesh geom, which is a convex hull."""
         return _result(wire, [self.held(wire, self.bench.surface).push()])
 
 
@@ -148,7 +148,7 @@ def _result(wire: Wire, shapes: Sequence[np.ndarray]) -> Result:
 
 
 def halves(wires: Iterable[Wire]) -> dict[str, str]:
-    """Which half a frame belongs to: parameters are fitted to one, tested on other."""
+    """Half of each frame by name: "fit", for parameters, or "test"."""
     turn = {kind: itertools.cycle(("fit", "test")) for kind in bench_data.KINDS}
     return {wire.name: next(turn[wire.kind]) for wire in wires}
 
@@ -164,7 +164,7 @@ def validate_bench(
 
     Raises:
         FileNotFoundError: if a file is missing.
-        ValueError: if one is not as stated, or recommends no frame.
+        ValueError: if one is not as stated, or no wire is recommended.
     """
     bench = bench_data.read(folder)
     wires = [wire for wire in bench.wires if wire.recommended]
@@ -202,7 +202,7 @@ def _row(experiment: Experiment, wire: Wire, half: str) -> dict[str, Any]:
 
 
 def _checks(rows: Sequence[dict[str, Any]]) -> Iterator[Check]:
-    """Medians against the aims and the baselines; folded frames apart."""
+    """Medians against the bounds and the baselines, without folded frames."""
     for kind, bound in zip(bench_data.KINDS, (STRAIGHT, ANGLED), strict=True):
         chosen = [row for row in rows if row["wire"] == kind and not row["folded"]]
         if not chosen:
@@ -212,7 +212,7 @@ def _checks(rows: Sequence[dict[str, Any]]) -> Iterator[Check]:
         note = ", ".join(f"{key} {value:.2f} mm" for key, value in baseline.items())
         least = min(value for value in baseline.values() if np.isfinite(value))
         for way in ("pushed", "steered", EITHER, "laid"):
-            # Steering makes a choice of the turn unnecessary.
+            # A steered wire is turned by the operator, so its best turn is not chosen.
             rms = "median_rms" if way == "steered" else "rms"
             each = [row[way][rms] for row in chosen]
             tested = [row[way][rms] for row in chosen if row["half"] == "test"]

@@ -21,14 +21,14 @@ from cathsim_dmc.recording.geometry import along
 
 MESH, WIRES = "phantom.stl", "wires.json"
 KINDS = ("straight", "angled")
-ARCH = "arch"  # tip region of a wire that is in no branch
-# Turning of a wire from the entry to the tip, rad, from which on it is folded or
-# buckled: a wire that follows an arch into a branch turns by less.
+ARCH = "arch"  # tip region of a wire whose tip is in no branch
+# Total turning angle of a wire from the entry to the tip, rad, above which it is folded
+# or buckled: a wire that follows an arch into a branch turns by less.
 FOLDED = np.radians(150.0)
 _CHORD = 6e-3  # m, over which directions are taken
 _STEP = 1e-3  # m
-_WITHIN = 6e-3  # m past an ostium, from which on an operator sees a tip in the branch
-_AROUND = 3e-3  # m beyond three radii and the ends of a branch: landmarks are coarse
+_WITHIN = 6e-3  # m past an ostium, beyond which an operator sees a tip in the branch
+_AROUND = 3e-3  # m, tolerance around a branch: landmarks are coarse
 _CUTS = (0.0, 0.5e-3, 1e-3, 1.5e-3, 2e-3, 3e-3)  # m into the lumen, tried in turn
 _SIDES = {"superior": "inferior", "left_about": "right", "posterior_about": "front"}
 
@@ -39,8 +39,8 @@ class Wire:
 
     name: str  # run and frame
     kind: str  # one of `KINDS`
-    vessel: str  # that of the tip
-    recommended: bool  # whether it is to be compared
+    vessel: str  # vessel of the tip
+    recommended: bool  # whether the comparison uses it
     points: np.ndarray  # (n, 3) m, from the entry to the tip
     direction: np.ndarray  # (3,) unit vector towards the tip, at the entry
 
@@ -51,7 +51,7 @@ class Wire:
 
     @property
     def folded(self) -> bool:
-        """Whether it turns by more than `FOLDED`: folded back or buckled."""
+        """Whether the wire turns by more than `FOLDED`: folded back or buckled."""
         line = along(self.points, np.arange(0.0, self.length, _CHORD))
         steps = np.diff(line, axis=0)
         steps /= np.linalg.norm(steps, axis=1)[:, None]
@@ -60,9 +60,9 @@ class Wire:
 
 
 class Branch(NamedTuple):
-    """A branch of the phantom, by landmarks."""
+    """A branch of the phantom, given by landmarks."""
 
-    pieces: np.ndarray  # (n, 2, 3) m, straight ones; the first from the ostium
+    pieces: np.ndarray  # (n, 2, 3) m, ends of straight pieces, first the ostium
     radius: float  # m
 
     def has(self, point: np.ndarray) -> bool:
@@ -83,9 +83,9 @@ class Bench:
 
     surface: Surface  # of the lumen, m, cut off and flat at the entry
     entry: End  # where the wires enter; its direction points out
-    ends: Mapping[str, np.ndarray]  # (3,) m, of each vessel by a tip's region
+    ends: Mapping[str, np.ndarray]  # (3,) m, end of each vessel by tip region
     branches: Mapping[str, Branch]
-    down: Mapping[str, np.ndarray]  # (3,) by name, among them gravity's
+    down: Mapping[str, np.ndarray]  # (3,) unit directions of gravity by name
     wires: tuple[Wire, ...]  # as measured
 
     def is_astray(self, wire: Wire, tip: np.ndarray) -> bool:
@@ -95,14 +95,14 @@ class Bench:
         )
 
     def field(self, scale: float = 1.0) -> Field:
-        """Depth in the lumen, larger by a factor about the entry."""
+        """Field of the lumen, scaled about the entry."""
         middle, vertices = self.entry.position, self.surface.vertices
         surface = Surface(middle + scale * (vertices - middle), self.surface.faces)
         return Field.of(surface, [self.entry])
 
 
 def distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Distances (k,) m of two lines (n, 3), (m, 3) at equal arc lengths, every mm."""
+    """Distances (k,), m, of two lines (n, 3), (m, 3), m, at each mm of arc length."""
     length = min(arc_lengths(one)[-1], arc_lengths(other)[-1])
     at = np.arange(0.0, length + 1e-9, _STEP)
     return np.linalg.norm(along(one, at) - along(other, at), axis=1)
@@ -145,7 +145,7 @@ def read(folder: str | Path) -> Bench:
                 end = "end_mm" if "end_mm" in mark else "fork_mm"
                 ends[name] = _vector(mark, end) / 1e3
                 branches[name] = _branch(mark, ends[name])
-        # Directions to the patient's six sides, and none.
+        # Directions to the six sides of the patient, and zero.
         down = {"none": np.zeros(3)}
         for key, opposite in _SIDES.items():
             axis = _unit(marks["patient_axes"], key)
@@ -168,7 +168,10 @@ def _branch(mark: Mapping[str, Any], end: np.ndarray) -> Branch:
 def _opened(
     vertices: np.ndarray, faces: np.ndarray, inlet: Inlet
 ) -> tuple[Surface, np.ndarray]:
-    """The surface cut off at the inlet, and where: farther in if its end is uneven."""
+    """The surface cut open at the inlet, and the place (3,), m, of the cut.
+
+    The cut is farther in if the end is uneven.
+    """
     volume = Surface(vertices, faces).volume
     for inwards in _CUTS:
         place = inlet.position + inwards * inlet.direction

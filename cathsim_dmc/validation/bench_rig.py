@@ -25,19 +25,19 @@ from cathsim_dmc.validation.bench_data import Wire
 from cathsim_dmc.validation.rig import Rig
 
 _LINK = 7e-3  # m, longest of the shaft
-# At rest no node moves by more than this, m, in a time, s; not later than another, s.
+# Rest: no node moves by more than _REST, m, in _WHILE, s. Limit of the wait, s.
 _REST, _WHILE, _LONGEST = 0.1e-3, 0.4, 20.0
 _SPEEDS = {"insertion": MAX_PUSH_SPEED, "rotation": MAX_ROTATION_SPEED}
-# An operator looks after each such advance, m; where the tip is astray, it pulls
-# back, m, and turns by the golden angle, so many times at most.
+# Steering: the operator looks after each advance, m. If the tip is astray, it pulls
+# back, m, and turns by the golden angle, rad, up to so many times.
 _LOOK, _BACK, _TURN, _ATTEMPTS = 5e-3, 30e-3, np.pi * (3.0 - 5.0**0.5), 12
 
 
 class Held:
-    """A wire held by the middle of its first link, where and as it enters.
+    """A wire clamped at the entry, in the middle of its first link.
 
-    At full insertion the middle of link 0 is at the entry, so the chain behind it has
-    no part in its shape. The device stands upright at the origin; the wall is turned.
+    At full insertion the middle of link 0 is at the entry, so no link outside affects
+    the shape. The device is upright at the origin; the wall is rotated instead.
     """
 
     def __init__(
@@ -54,18 +54,18 @@ class Held:
         """Builds the scene; vectors are in the frame of the mesh.
 
         Args:
-            wall: lumen; of a surface its convex hull.
-            wire: whose entry and length are taken.
-            device: the wire.
-            down: (3,) direction of gravity; 0 for none.
-            turn: of the device about its axis, rad.
+            wall: lumen; a surface acts as its convex hull.
+            wire: measured wire, which gives entry and length.
+            device: model of the wire.
+            down: (3,) unit direction of gravity; 0 for none.
+            turn: rotation of the device about its axis, rad.
             friction: Coulomb coefficient.
             overshoot: by which the wire is pushed too far and pulled back, m.
 
         Raises:
-            ValueError: if less of the wire is inserted than its tip is long.
+            ValueError: if less of the wire is inserted than its tip and one link.
         """
-        # Rest does not depend on damping; so much makes it soon.
+        # The shape at rest does not depend on damping; strong damping saves time.
         device = replace(device, loss_factor=2.0)
         self.length, self._entry = wire.length, wire.points[0]
         self._reach = reach = wire.length + overshoot
@@ -75,7 +75,7 @@ class Held:
                 f"{wire.name} is inserted by {1e3 * wire.length:.0f} mm; at least "
                 f"{1e3 * (device.tip_length + _LINK):.0f} mm are needed"
             )
-        # n - 1/2 links of the shaft are in.
+        # The inserted shaft has n - 1/2 links.
         first = shaft / (np.ceil(shaft / _LINK) - 0.5)
         fine = Discretisation(reach + first / 2, shaft_link=first * (1 + 1e-6))
         stroke = reach + 1e-3
@@ -103,7 +103,7 @@ class Held:
         rig.compile()
 
     def push(self) -> np.ndarray:
-        """Pushes the wire in, from outside; its shape (n, 3) at rest, m.
+        """Pushes the wire in; returns its shape (n, 3), m, at rest, 1 mm apart.
 
         Raises:
             RuntimeError: if the simulation diverges.
@@ -112,12 +112,12 @@ class Held:
         return self._to_rest()
 
     def steer(self, astray: Callable[[np.ndarray], bool]) -> np.ndarray:
-        """Pushes the wire in as an operator does who sees its tip; see `push`.
+        """Pushes the wire in like an operator who sees its tip; see `push`.
 
-        Where the tip is astray, the wire is pulled back and turned before it goes on.
+        If the tip is astray, the wire is pulled back and turned before the next push.
 
         Args:
-            astray: Whether a place (3,) of the tip, m, is in a wrong vessel.
+            astray: Whether a position (3,) of the tip, m, is in a wrong vessel.
         """
         self.rig.data.qpos[:] = 0.0
         place, attempts = 0.0, 0
@@ -131,10 +131,10 @@ class Held:
         return self._to_rest()
 
     def release(self, points: np.ndarray) -> np.ndarray:
-        """Lays the wire along a line and lets it go; see `push`.
+        """Releases the wire from the shape of a line; see `push`.
 
         Args:
-            points: (n, 3) m, moved to the entry and, where too short, made longer.
+            points: (n, 3) m; shifted to the entry and, if too short, extended.
         """
         rig = self.rig
         end = points[-1] - points[-2]
@@ -151,7 +151,7 @@ class Held:
         return self._to_rest()
 
     def _to_rest(self) -> np.ndarray:
-        """Moves the carriage to the inserted length; the shape of `push`."""
+        """Moves the carriage to the inserted length; returns the shape of `push`."""
         rig = self.rig
         for goal in (self._reach, self.length):
             self._go("insertion", goal)
@@ -168,7 +168,7 @@ class Held:
         return along(nodes, arcs)
 
     def _go(self, motion: str, goal: float) -> None:
-        """Moves the base at full speed, m or rad."""
+        """Moves the base at full speed to `goal`, m or rad."""
         servo, speed = self._servo(motion), _SPEEDS[motion]
         data, step = self.rig.data, speed * self.rig.model.opt.timestep
         place = data.act[servo] * speed

@@ -1,4 +1,4 @@
-"""Checks: a measured figure, the bound it must keep, and reports of many of them."""
+"""Checks of measured values against bounds, and reports of checks."""
 
 import dataclasses
 import json
@@ -8,15 +8,15 @@ from typing import Any
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """One figure against its bound.
+    """One measured value and its bound.
 
     Attributes:
         name: what was measured, unique in its report.
-        value: the figure, in `unit`.
+        value: measured value, in `unit`.
         unit: such as "%" or "mm"; "" for a pure number.
         bound: the bound as text, such as "<= 2".
         passed: whether the value keeps the bound.
-        note: the quantities behind the figure, for the reader of the table.
+        note: further quantities for the reader of the table.
     """
 
     name: str
@@ -30,7 +30,7 @@ class Check:
     def at_most(
         cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
     ) -> "Check":
-        """A check of value <= bound; a value that is no number fails."""
+        """A check of value <= bound; NaN fails."""
         kept = bool(value <= bound)
         return cls(name, float(value), unit, f"<= {bound:g}", kept, note)
 
@@ -38,7 +38,7 @@ class Check:
     def at_least(
         cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
     ) -> "Check":
-        """A check of value >= bound; a value that is no number fails."""
+        """A check of value >= bound; NaN fails."""
         kept = bool(value >= bound)
         return cls(name, float(value), unit, f">= {bound:g}", kept, note)
 
@@ -65,10 +65,10 @@ class Report:
     """Results of one validation.
 
     Attributes:
-        title: of the validation.
-        checks: figures with a bound.
-        findings: figures without one, plain values that JSON can hold.
-        data: measurements behind the checks by name, for figures; not in JSON.
+        title: title of the validation.
+        checks: values with a bound.
+        findings: values without a bound, as JSON values.
+        data: measurements behind the checks by name, for plots; not in JSON.
     """
 
     title: str
@@ -82,7 +82,7 @@ class Report:
         return all(check.passed for check in self.checks)
 
     def as_dict(self) -> dict[str, Any]:
-        """The object that `--json` prints; numbers that JSON lacks become null."""
+        """The object that `--json` prints; NaN and infinities become null."""
         found = {
             "checks": [dataclasses.asdict(check) for check in self.checks],
             "title": self.title,

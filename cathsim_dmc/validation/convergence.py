@@ -1,4 +1,4 @@
-"""Scripted insertions; convergence of tip path and wall force with step and links."""
+"""Convergence of tip path and wall force of scripted insertions."""
 
 import dataclasses
 import itertools
@@ -22,14 +22,14 @@ DEFAULTS = {
     "physics_timestep": config.PHYSICS_TIMESTEP,
     "shaft_link": config.NavigationConfig().shaft_link,
 }
-# The start of an episode is displaced by up to 1 mm; a coarser model may not move the
+# The start of an episode varies by up to 1 mm; a coarser model may not displace the
 # path by more than that on average.
 PATH_BOUND = 1.0  # mm
 FORCE_BOUND = 10.0  # % of the mean wall force
 # Least mean wall force of a script whose force is compared, N.
 LEAST_FORCE = 1e-3
-# Judged force on the published tasks: of pushes with these commands of the tip, for so
-# long, at half speed.
+# Judged force on the published tasks: tip commands and duration of pushes, which are at
+# half speed.
 TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
 CURLS = ((0.0, 0.0), (0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3), (0.2, 0.2))
 PUSH = 6.0  # s
@@ -41,9 +41,9 @@ FIGURES = ("path_mean_mm", "path_max_mm", "track_max_mm", "force_mean")
 
 @dataclasses.dataclass(frozen=True)
 class Script:
-    """An insertion that depends on nothing but the time."""
+    """An open-loop insertion."""
 
-    name: str  # where it leads in the type-I arch
+    name: str  # its course in the type-I arch
     speed: float  # of the base, share of its full speed
     curl: tuple[float, float]  # commands of tip motors about x and y, after `CURL_TIME`
     duration: float  # s
@@ -58,7 +58,7 @@ class Script:
         return action
 
 
-# Over the arch along its wall, into the first branch, into the last one.
+# Over the arch along its wall, into the first branch, and into the last.
 SCRIPTS = (
     Script("over the arch", 0.5, (0.3, 0.0), 8.0),
     Script("into the BCA", 0.5, (0.0, 0.0), 6.4),
@@ -95,18 +95,19 @@ def study(script: Script, parameter: str, values: Sequence[float]) -> dict[str, 
         parameter: "physics_timestep" (s) or "shaft_link" (m).
 
     Returns:
-        "script" (name), "parameter", and lists with an entry for each value: "value"
-        and `FIGURES`: mean and largest distance (mm) of the head from the finest run's
-        at the same time, largest one from its track, and mean wall force, N.
+        "script" (name), "parameter", and lists with an entry for each value, ascending:
+        "value" and `FIGURES`: mean and largest distance (mm) of the head from that of
+        the finest run at the same time, largest distance (mm) from the track of the
+        finest run, and mean wall force, N.
     """
     ascending = sorted(float(value) for value in values)
-    # A tiny goal: the script runs to its end.
+    # With a tiny goal the script runs to its end.
     fixed: dict[str, Any] = {"goal_radius": 1e-5, "outside_range": True}
     options: list[dict[str, Any]] = [fixed | {parameter: one} for one in ascending]
     runs = [run(script, **each) for each in options]
     heads = [one.head[1:] for one in runs]
     away = 1e3 * np.linalg.norm(np.array(heads) - heads[0], axis=-1)
-    # What stands still is no line.
+    # A centreline needs distinct points: steps without motion are left out.
     moves = np.append(True, np.any(np.diff(heads[0], axis=0) != 0.0, axis=1))
     track = Centreline(heads[0][moves], np.ones(moves.sum()))
     off = [1e3 * track.project(head).distance.max() for head in heads]
@@ -132,7 +133,7 @@ def studies() -> list[dict[str, Any]]:
 
 
 def checks(results: Sequence[dict[str, Any]]) -> Iterator[Check]:
-    """Whether the defaults, which are among the values, are converged."""
+    """Checks that the default resolution, one of the values, is converged."""
     units = {"physics_timestep": ("step", "ms"), "shaft_link": ("links", "mm")}
     for one in results:
         default, (kind, unit) = DEFAULTS[one["parameter"]], units[one["parameter"]]
@@ -150,15 +151,15 @@ def checks(results: Sequence[dict[str, Any]]) -> Iterator[Check]:
 
 
 def judged(task: str, timestep: float) -> tuple[float, float]:
-    """Judged force of pushes in a task: of the sum, mean over a control step, N.
+    """Judged force of pushes in a task: mean over a control step of the force sum, N.
 
     Args:
         task: Name of the task.
         timestep: Physics step, s.
 
     Returns:
-        Its mean over all control steps, and its largest value of a push, mean over
-        the pushes.
+        Its mean over all control steps and pushes, and the mean over the pushes of its
+        largest value, N.
     """
     made = suite.make_task(task, physics_timestep=timestep, observation="tracking")
     batch = BatchSimulation(made, len(CURLS), num_threads=1, seeds=[0] * len(CURLS))
@@ -171,7 +172,7 @@ def judged(task: str, timestep: float) -> tuple[float, float]:
 
 
 def judged_checks() -> Iterator[Check]:
-    """Whether the judged force of the published tasks is converged."""
+    """Checks that the judged force of the published tasks is converged."""
     for task in TASKS:
         usual, fine = (judged(task, one) for one in (config.PHYSICS_TIMESTEP, FINE))
         name = f"{task}: judged force, step of {1e3 * config.PHYSICS_TIMESTEP:g} ms "

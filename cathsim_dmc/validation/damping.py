@@ -1,7 +1,7 @@
-"""Release of a bent device in blood and air, its turning in a bend, its deflection.
+"""Release of a bent device in blood and air, turning in a bend, three-point bending.
 
-The release is compared with the equation of a beam whose material damps as it is stated
-(Kelvin-Voigt) and on which blood acts as it is stated, in four modes.
+The reference of the release is the equation of a beam with Kelvin-Voigt damping and the
+stated drag of blood, in four modes.
 """
 
 import dataclasses
@@ -27,18 +27,18 @@ from cathsim_dmc.validation.rig import Rig, half_circle
 
 RELEASE_BOUND = 5.0  # % of frequency and decay
 RELEASE = 0.01  # m, deflection of the end before the release
-_FREE = 0.2  # m
-_SWINGING = 3.0  # s
+_FREE = 0.2  # m, free length
+_SWINGING = 3.0  # s, simulated
 LINK = 0.0175  # m, default of the tasks
 # Roots β L of a clamped beam with a free end.
 _ROOTS = np.array([1.875104069, 4.694091133, 7.854757438, 10.99554073])
 SPEEDS = (0.3, 1.0, MAX_ROTATION_SPEED)  # rad/s
-SLOW = 0.05  # rad/s, where links of `LINK` jerk rather than turn
+SLOW = 0.05  # rad/s, at which links of `LINK` turn in jerks
 SPIN_BOUND = 5.0  # % of the lag
 _BEND = 0.04  # m, radius of the half circle
 SPANS = (0.06, 0.1, 0.15)  # m
 SPAN_BOUND = 3.0  # % of the deflection
-SHORT_LINK = 7e-3  # m, that of the tip
+SHORT_LINK = 7e-3  # m, as in the tip
 
 
 def _uniform() -> devices.Device:
@@ -49,7 +49,7 @@ def _uniform() -> devices.Device:
 
 
 def _swing(time: np.ndarray, curve: np.ndarray) -> tuple[float, float]:
-    """Frequency (Hz) and decay rate (1/s) of the first swings of a curve."""
+    """Frequency (Hz) and decay rate (1/s) of the first swings of a curve (n,)."""
     crossings = np.flatnonzero(curve[:-1] * curve[1:] < 0)[:5]
     share = curve[crossings] / (curve[crossings] - curve[crossings + 1])
     zeros = time[crossings] + share * (time[1] - time[0])
@@ -60,7 +60,7 @@ def _swing(time: np.ndarray, curve: np.ndarray) -> tuple[float, float]:
 
 
 def cantilever(blood: StillBlood | None) -> Rig:
-    """A uniform device of which 0.2 m are free, in blood or without any fluid."""
+    """A uniform device with a free length of 0.2 m, in blood or without fluid."""
     rig = Rig(_uniform(), devices.Discretisation(working_length=_FREE + LINK / 2))
     rig.compile(blood)
     return rig
@@ -70,7 +70,7 @@ def release(*, blood: bool = True) -> tuple[float, float, float, float]:
     """Releases a cantilever of 0.2 m from its first mode, in blood or without fluid.
 
     Returns:
-        Frequencies, simulated and of the beam, Hz; decay rates likewise, 1/s.
+        Frequency of the simulation and of the beam, Hz; decay rates likewise, 1/s.
     """
     rig = cantilever(StillBlood() if blood else None)
     one = rig.device
@@ -102,7 +102,7 @@ def release(*, blood: bool = True) -> tuple[float, float, float, float]:
 
 
 def _modes(places: np.ndarray) -> np.ndarray:
-    """Modes (4, n) of a beam at fractions of its length; their squares have mean 1."""
+    """Modes (4, n) of a beam at fractions (n,) of its length, of mean square 1."""
     ratio = (np.cosh(_ROOTS) + np.cos(_ROOTS)) / (np.sinh(_ROOTS) + np.sin(_ROOTS))
     x = _ROOTS[:, None] * places
     return np.cosh(x) - np.cos(x) - ratio[:, None] * (np.sinh(x) - np.sin(x))
@@ -114,8 +114,8 @@ def _beam(
     """Deflection (n,) of the end of a beam released from its first mode, m."""
     mass = device.linear_density + (carried_mass([device]) if blood else 0.0)
     squares = (_ROOTS / length) ** 4
-    # The rotors of the hinges stand for no mass of the device. The reference in air
-    # contains them, so it does not show what they change; in blood it does not.
+    # The armature of the hinges is artificial. The reference in air contains it and
+    # does not show its effect; the reference in blood does not contain it.
     rotor = hinge_armatures(device, np.full(round(length / LINK), LINK))[0]
     rotors = 0.0 if blood else rotor * LINK / mass * squares
     rates = device.shaft.bending_stiffness / mass * squares / (1 + rotors)
@@ -138,7 +138,7 @@ def _beam(
 
 
 def drag(velocity: np.ndarray, diameter: float) -> np.ndarray:
-    """Drag of still blood on a cylinder per length, N/m (Sucker and Brauer 1975)."""
+    """Drag (n,) of still blood on a cylinder, N/m (Sucker and Brauer 1975)."""
     speed = np.maximum(np.abs(velocity), 1e-12)
     reynolds = BLOOD_DENSITY * speed * diameter / BLOOD_VISCOSITY
     coefficient = 1.18 + 6.8 / reynolds**0.89 + 1.96 / np.sqrt(reynolds)
@@ -149,21 +149,20 @@ def drag(velocity: np.ndarray, diameter: float) -> np.ndarray:
 def spin(
     speed: float, link: float = SHORT_LINK, loss: float = 1.0
 ) -> tuple[float, float]:
-    """Mean lag of the end and Σ τ ω θ²/C of the joints through the twist, rad.
+    """Lag of the end of a device that turns in a half circle of 40 mm, and theory.
 
-    A device turns in a half circle of 40 mm, for one turn after the first quarter. A
-    joint of compliance C that is bent by θ brakes with τ ω θ²/C, τ being the relaxation
-    time of the material; a torsion hinge bears the sum of all joints beyond it. The
-    polygon of long links has places of rest, from one to the next of which it jerks; a
-    jerk dissipates more than steady turning.
+    The lag is the mean over one turn. A joint of compliance C that is bent by θ brakes
+    with the torque τ ω θ²/C, where τ is the relaxation time of the material; a torsion
+    hinge bears the sum of all joints beyond it. The polygon of long links jerks between
+    stable angles, which dissipates more than steady turning.
 
     Args:
-        speed: Of the base, rad/s.
+        speed: Angular velocity of the base, rad/s.
         link: Length of the links of the shaft, m.
-        loss: Relaxation time of the simulated device over that of the formula.
+        loss: Relaxation time of the simulated device relative to that of the formula.
 
     Returns:
-        Both lags, rad.
+        Lag of the simulation and of the formula, rad.
     """
     length = devices.Discretisation(
         working_length=0.3, torsion_joints=4, shaft_link=link
@@ -201,12 +200,12 @@ def spin(
 
 
 def three_point(span: float, link: float, on_joint: bool) -> float:
-    """Deflection of a device in three-point bending over that of a beam, FS³/48EI.
+    """Deflection in three-point bending relative to that of a beam, F S³ / 48 EI.
 
     Args:
         span: distance of the supports, m.
         link: length of the links, m.
-        on_joint: whether the load is on a joint, or in the middle of a link.
+        on_joint: whether the load is on a joint; else on the middle of a link.
     """
     rig = Rig(_uniform(), devices.Discretisation(shaft_link=link))
     rig.compile()
@@ -235,7 +234,7 @@ def three_point(span: float, link: float, on_joint: bool) -> float:
 
 
 def checks() -> Iterator[Check]:
-    """Release, turning and three-point bending."""
+    """Checks of release, turning and three-point bending."""
     for medium, blood in (("still blood", True), ("air", False)):
         mine, theirs, decay, expected = release(blood=blood)
         name = f"release of a cantilever in {medium}"

@@ -1,4 +1,4 @@
-"""`cathsim validate forces`: sensors against known loads, the published protocol."""
+"""`cathsim validate forces`: sensors against known loads, and published protocol."""
 
 import itertools
 from collections.abc import Iterator
@@ -20,29 +20,29 @@ from cathsim_dmc.validation.rig import Rig, in_tube
 
 BALANCE_BOUND = 1.0  # %
 RESTING_LOADS = (0.01, 0.1, 1.0)  # N
-RESTING_TIME = 5.0  # s, of which the first is for raising the load
-# Shares of the full speed; a stalled carriage pushes with 4 N times that.
+RESTING_TIME = 5.0  # s; the load rises in the first second
+# Commands, shares of the full speed; a stalled carriage pushes with 4 N times that.
 PUSHES = (0.1, 0.25, 0.5, 1.0)
-# A blind tube that guides the device, and one in which it buckles: length, radius, m.
+# Blind tubes, length and radius, m: one guides the device, in the other it buckles.
 GUIDING_TUBE = (0.04, 1.5e-3)
 WIDE_TUBE = (0.1, 2e-3)
 AVERAGING = 1.0  # s
 LARGEST_PUSH = 4.0  # N, in a dead end
-SETTLING = 3.0  # s, after the tip could have arrived there
+SETTLING = 3.0  # s, after the tip can have reached the dead end
 INSERTION_SPEEDS = (0.25, 0.5, 1.0)  # of 40 mm/s
 INSERTION_SEEDS = 5
-# The tip straight, and bent towards the wall of the branch.
+# Tip commands: straight, and bent towards the wall of the branch.
 INSERTION_CURLS = ((0.0, 0.0), (0.0, -0.3))
-USUAL_FORCE = 0.2  # N, most forces on phantoms lie below
-USUAL_SHARE = 90.0  # %, "most"
+USUAL_FORCE = 0.2  # N; most forces on phantoms are below
+USUAL_SHARE = 90.0  # %, meaning of "most"
 
 
 def resting_link(load: float) -> np.ndarray:
     """Presses the last link of the straight device on a plate with a load, N.
 
     Returns:
-        Force of the device on the plate by the contact sensor, by the load cell under
-        the plate, and by the sensor of the base, N; penetration, m.
+        Lateral force by the contact sensor, by the load cell under the plate, and by
+        the sensor of the base, N; penetration depth, m.
     """
     rig, rows = Rig(), []
     rig.add_plate(rig.device.outer_radius)
@@ -61,11 +61,11 @@ def resting_link(load: float) -> np.ndarray:
 
 
 class DeadEnd(NamedTuple):
-    """The device pushed against the blind end of a tube; averages over a second, N."""
+    """Forces of the device in the blind end of a tube, averaged over 1 s, N."""
 
-    motor: float  # what the stalled carriage pushes with
+    motor: float  # force limit of the stalled carriage
     push: float  # push force at the base
-    load_cell: float  # of the phantom, along the axis
+    load_cell: float  # reading of the phantom's load cell along the axis
     contacts: float  # sum of the contact sensor along the axis
     sheath: float  # axial force on the rim of the sheath
     ripple: float  # standard deviation of the push force
@@ -75,10 +75,10 @@ def dead_end(command: float, size: tuple[float, float] = GUIDING_TUBE) -> DeadEn
     """Pushes the device of the tasks against the end of a straight tube.
 
     Args:
-        command: of the translation, in (0, 1].
+        command: command of the translation, in (0, 1].
         size: length and radius of the tube, m.
     """
-    # Bare physics steps do not hold the device in the sheath.
+    # Physics steps without the task do not guide the device in the sheath.
     environment = in_tube(size, sheath_clearance=CLEARANCE)
     task = environment.task
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
@@ -107,8 +107,8 @@ def _axial_force_on(model, data, sheath: np.ndarray) -> float:
     for index, contact in enumerate(data.contact[: data.ncon]):
         first, second = np.isin(model.geom_bodyid[contact.geom], sheath)
         mujoco.mj_contactForce(model, data, index, wrench)
-        # The frame's first row is the normal from the first geom to the second, on
-        # which the force acts.
+        # The first row of the frame is the normal from the first geom to the second.
+        # The force acts on the second geom.
         on_second = (contact.frame.reshape(3, 3).T @ wrench[:3])[2]
         total += (second or -int(first)) * on_second
     return float(total)
@@ -150,7 +150,7 @@ def _checks(pushed: dict[str, list[DeadEnd]]) -> Iterator[Check]:
 
 
 def expert_cannulation(seed: int = 0) -> Episode:
-    """An episode of the expert on type1_bca."""
+    """Episode of the scripted expert on type1_bca."""
     environment = suite.load(suite.DOMAIN, "type1_bca", {"random": seed})
     act = policies.in_environment(policies.make_policy("expert", seed), environment)
     episode = EpisodeRecorder(environment, "type1_bca").record_episode(act, seed)
@@ -164,14 +164,14 @@ def compare_forces(
     sd: float = protocol.REFERENCE_SD,
     margin: float = protocol.EQUIVALENCE_MARGIN,
 ) -> Report:
-    """Compares forces of a cannulation with a normal distribution, see `protocol`.
+    """Compares the forces of a cannulation with a normal reference, see `protocol`.
 
     Args:
         episode: Recorded cannulation, such as a manual one of `cathsim play`; None
             records one of the expert.
         mean: Mean of the normal reference, N.
         sd: Standard deviation of the reference, N.
-        margin: Means closer than this count as equal, N.
+        margin: Equivalence margin of the means, N.
 
     Returns:
         A report without checks, with findings "protocol" and data "samples" (n,) N.
@@ -197,7 +197,7 @@ def validate_forces(**protocol_options: Any) -> Report:
     Args:
         **protocol_options: Arguments of `compare_forces`.
     """
-    # Now: an episode without contacts is refused before the checks.
+    # Compared first, to refuse an episode without contacts before the long checks.
     compared = compare_forces(**protocol_options)
     pushed = {"guiding": [dead_end(command) for command in PUSHES]}
     pushed["wide"] = [dead_end(command, WIDE_TUBE) for command in PUSHES]

@@ -1,4 +1,4 @@
-"""Friction of devices on a wall: sliding, sticking, and pulled round a drum."""
+"""Friction of devices on a wall: sliding, sticking, and the capstan."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -18,42 +18,42 @@ SPEEDS = (0.001, 0.01, 0.04)  # m/s
 ACTING_BOUND = 5.0  # % of the coefficient of friction
 RIPPLE_BOUND = 5.0  # % of the pull, its standard deviation
 CREEP_LOAD = 0.2  # N
-CREEP_BOUND = 0.02  # mm/s, pulled sideways with half of what friction can hold
-_PRESSED = 0.07  # m of the end of the device, under the load
-_DROP = 1e-3  # m, from the base to the plate: what is not pressed does not touch
+CREEP_BOUND = 0.02  # mm/s, under a lateral pull of half the friction limit
+_PRESSED = 0.07  # m, loaded length at the end of the device
+_DROP = 1e-3  # m, from the base to the plate: unloaded links do not touch it
 _SETTLED = 2.0  # s
-_SLID = 0.02  # m, after which the device slides as a whole
-_WATCHED = 0.02  # m
+_SLID = 0.02  # m, travel after which the whole device slides
+_WATCHED = 0.02  # m, travel that is evaluated
 
 CAPSTAN_BOUND = 3.0  # % of the coefficient of friction
-CAPSTAN_RIPPLE = 3.0  # % of the mean pull, its standard deviation in 5 mm of way
+CAPSTAN_RIPPLE = 3.0  # % of the mean pull, its standard deviation in 5 mm of travel
 DRUM_RADIUS = 0.05  # m
-# Coefficient and angle of the wrap, rad: default friction, and about the ends of the
-# range of lubricated silicone to bare steel.
+# Coefficient of friction and wrap angle, rad: the default friction, and about the
+# limits of the range from lubricated silicone to bare steel.
 QUARTER, HALF = 0.5 * np.pi, np.pi
 CAPSTANS = ((0.05, QUARTER), (FRICTION, HALF), (0.05, HALF), (0.2, HALF))
 CAPSTANS += ((0.05, 3 * QUARTER), (0.2, QUARTER), (0.2, 3 * QUARTER))
-# Dead load on the distal end, N: far above EI/R² = 0.02 N. Under 0.5 N a free end of
-# 45 to 65 mm swings at a physics step of 4 ms; at 2 ms it does not.
+# Dead load on the distal end, N: far above EI/R² = 0.02 N. Under 0.5 N a free end of 45
+# to 65 mm oscillates at a physics step of 4 ms, but not at 2 ms.
 TENSION = 0.4
-PULL_SPEED = 0.02  # m/s, no load
+PULL_SPEED = 0.02  # m/s, without load
 _AXIS = DRUM_RADIUS + devices.STEERABLE_5F.outer_radius  # m, radius of the rod's axis
 # Friction acts on the surface of the drum, tension in the axis of the rod.
 _LEVER = DRUM_RADIUS / _AXIS
-# Energy of bending per length over the tension at the end, EI κ² / 2 T, by which the
-# rod is less tense on the drum than beside it.
+# Bending energy per length over the tension at the end, EI κ² / 2 T: the relative drop
+# of the tension from the straight part to the part on the drum.
 _BENT = devices.STEERABLE_5F.shaft.bending_stiffness / (2 * _AXIS**2 * TENSION)
-# Radius, m, of the tube that is bent into an arch about the drum.
+# Radius, m, of a tube that is bent around the drum into an arch.
 ARCH_RADIUS = 9e-3
 ARCH_RIPPLE = 2.0  # % of the force at the base, its standard deviation
 _SETTLING = 0.5  # s, before the pull
-_LEAD = 0.02  # m of rod between the clamp and the drum; first part of the pull
-_PULL = 0.1  # m
-_PART = 5e-3  # m
+_LEAD = 0.02  # m of rod between clamp and drum; the first part of the pull is ignored
+_PULL = 0.1  # m, travel of the base
+_PART = 5e-3  # m, travel over which the ripple is taken
 
 
 def _on_plate(device: Any, load: float) -> tuple[Rig, np.ndarray]:
-    """A straight device, settled on a plate, its end loaded; loads of its bodies, N."""
+    """A straight device at rest on a plate under a load (N); loads (nbody,), N."""
     rig = Rig(device, straight=True)
     rig.add_plate(rig.device.outer_radius + _DROP)
     rig.compile()
@@ -72,8 +72,8 @@ def slid(device: Any, load: float, speed: float) -> tuple[float, float]:
     """Pulls a device (see `Rig`) over a plate under a load, N, with a speed, m/s.
 
     Returns:
-        Coefficient of friction that acts, pull over load; standard deviation of the
-        pull over its mean.
+        Acting coefficient of friction, pull over load; standard deviation of the pull
+        over its mean.
     """
     rig, _ = _on_plate(device, load)
     rig.data.actuator(f"{rig.name}/insertion").ctrl[0] = -speed / MAX_PUSH_SPEED
@@ -87,7 +87,7 @@ def slid(device: Any, load: float, speed: float) -> tuple[float, float]:
 
 
 def creep(device: Any) -> float:
-    """Speed (m/s) of devices that stick, pulled sideways at half the limit."""
+    """Creep speed (m/s) of a sticking device under a lateral pull of half the limit."""
     rig, loads = _on_plate(device, CREEP_LOAD)
     rig.data.xfrc_applied[:, 0] = 0.5 * FRICTION * loads
     rig.run(0.5 * _SETTLED)
@@ -97,36 +97,39 @@ def creep(device: Any) -> float:
 
 
 class Capstan(NamedTuple):
-    """A rod pulled round a drum."""
+    """Measurement of a rod that is pulled round a drum."""
 
     friction: float  # Coulomb coefficient
-    angle: float  # by which the drum turns the force in the rod, rad
-    mean: float = np.nan  # ratio of the tensions at base and end, in steady sliding
+    angle: float  # between the forces at both ends of the drum, rad
+    mean: float = np.nan  # ratio of the tensions at base and end in steady sliding
     free: float = 1.0  # the same without friction: bending dissipates a little
-    travel: np.ndarray = np.zeros(1)  # (n,), way of the base, m
-    ratio: np.ndarray = np.zeros(1)  # (n,), of the tensions
+    travel: np.ndarray = np.zeros(1)  # (n,), travel of the base, m
+    ratio: np.ndarray = np.zeros(1)  # (n,), ratio of the tensions
 
     @property
     def expected(self) -> float:
-        """Ratio of the tensions of this rod with the friction that was set."""
+        """Ratio of the tensions by the capstan equation with bending."""
         return float(_BENT + (1 - _BENT) * np.exp(self.friction * self.angle * _LEVER))
 
     @property
     def acting(self) -> float:
-        """Coefficient of friction that the exponent shows."""
+        """Acting coefficient of friction, from the measured exponent."""
         ratio = (self.mean - (self.free - 1) - _BENT) / (1 - _BENT)
         return float(np.log(ratio) / (self.angle * _LEVER))
 
     @property
     def ripple(self) -> float:
-        """Largest standard deviation of the ratio over its mean, in 5 mm of way."""
+        """Largest standard deviation of the ratio over its mean, in 5 mm of travel."""
         part = (self.travel // _PART).astype(int)
         sliding = range(round(_LEAD / _PART), part.max() + 1)
         deviations = [self.ratio[part == each].std() for each in sliding]
         return float(max(deviations)) / self.mean
 
     def checks(self) -> Iterator[Check]:
-        """Coefficients (a ratio near 1 would hide errors of a small one) and ripple."""
+        """Checks of the coefficient and the ripple.
+
+        A ratio of tensions near 1 would hide errors of a small coefficient.
+        """
         angle = np.degrees(self.angle)
         name = f"capstan, friction {self.friction:g} over {angle:.0f}°"
         note = f"friction {self.acting:.4f} acts, ratio {self.mean:.4f}, "
@@ -140,8 +143,8 @@ class Capstan(NamedTuple):
 def capstan(friction: float, wrap: float = np.pi) -> Capstan:
     """Pulls the rod over a drum, by `wrap` rad, with and without friction.
 
-    The distal end carries a dead load; the base retracts. Both forces are measured, and
-    so is the angle between them, because a rod with bending stiffness leaves the drum
+    The distal end carries a dead load; the base retracts. Both forces and the angle
+    between them are measured, because a rod with bending stiffness leaves the drum
     earlier than a string. Above half a turn the rod passes through itself.
 
     Raises:
@@ -155,7 +158,7 @@ def capstan(friction: float, wrap: float = np.pi) -> Capstan:
 def _pulled(
     friction: float, wrap: float, tube: float | None = None
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Angle of a rod round a drum, or in a tube about it; ways and ratios (n,)."""
+    """Angle (rad) of a rod round a drum or in a tube; travel (m) and ratio (n,)."""
     length = 2 * _LEAD + _PULL + wrap * _AXIS
     fine = devices.Discretisation(working_length=length)
     rig = Rig("steerable_5f", fine, straight=True, stroke=_PULL, friction=friction)
@@ -188,22 +191,22 @@ def _pulled(
             moved = 1e3 * travel[-1]
             raise RuntimeError(f"the rod stuck on the drum after {moved:.1f} mm")
     way, force = np.array(travel[1:]), np.array(force)
-    # Link 0 never turns, so its frame is the world's. Both forces point away from
-    # the drum; that of the base against its heading, which is about 0.
+    # Link 0 does not rotate, so its frame is the world frame. Both forces point away
+    # from the drum; that of the base is opposite to its heading, which is about 0.
     heading = np.arctan2(-force[:, 0], -force[:, 2])[way > _LEAD]
     tension = np.linalg.norm(force, axis=1)
     return float(wrap - heading.mean()), way, tension / TENSION
 
 
 def arch_ripple() -> float:
-    """Deviation over mean of the force that draws a device round an arch."""
+    """Standard deviation over mean of the force that pulls a device round an arch."""
     _, travel, ratio = _pulled(FRICTION, np.pi, ARCH_RADIUS)
     sliding = ratio[travel > _LEAD]
     return float(sliding.std() / sliding.mean())
 
 
 def checks(pulled: list[Capstan]) -> Iterator[Check]:
-    """Friction on devices, sliding and sticking; capstans are put into `pulled`."""
+    """Checks of sliding and sticking friction; capstans are appended to `pulled`."""
     for what, device in (("steerable_5f", "steerable_5f"), ("pair", PAIR)):
         for load in LOADS:
             found = [slid(device, load, speed) for speed in SPEEDS]

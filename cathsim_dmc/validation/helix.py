@@ -11,30 +11,30 @@ from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import in_tube
 
 TUBE = 0.3, 4e-3  # m, length and radius
-LINK = 5e-3  # m, of the check; those of the tasks are a finding
+LINK = 5e-3  # m, in the check; links of the tasks give a finding without bound
 FORCE = 2.0  # N, at which the push stops
 HELIX_BOUND = 3.0  # % of the force
 _REST = 50  # control steps
 _MOST = 1000  # control steps of a push
 _LEAST = 0.9  # of the largest distance from the axis, where the helix begins
-_MARGIN = 0.15  # of the helix, left out at both its ends
+_MARGIN = 0.15  # of the helix, left out at both ends
 
 
 def helix(link: float, force: float = FORCE) -> tuple[float, float, float]:
     """Pushes a uniform device against the end of a frictionless tube.
 
-    Its helix of the angle α to the axis bears F = 2 EI sin²α cos α / r² (the change of
-    the bending energy with the shortening of a rod that is free to turn).
+    A helix with the angle α to the axis bears F = 2 EI sin²α cos α / r², the derivative
+    of the bending energy by the shortening of a rod that is free to rotate.
 
     Args:
         link: Length of the links, m.
         force: Push force at which the base stops, N.
 
     Returns:
-        Push force and F, N, and α, rad.
+        Push force of the simulation and F, N; α, rad.
 
     Raises:
-        RuntimeError: the push force is not reached.
+        RuntimeError: if the push force is not reached.
     """
     shaft = devices.STEERABLE_5F.shaft
     uniform = dataclasses.replace(
@@ -63,13 +63,13 @@ def helix(link: float, force: float = FORCE) -> tuple[float, float, float]:
 
 
 def one_hand(line: np.ndarray) -> np.ndarray:
-    """The part (L, 3) of a line (N, 3) around z that is a helix of one hand.
+    """The first part (L, 3) of a line (N, 3) around z that is a helix of one hand.
 
-    The first one from the base, where the push acts: a rod whose base does not turn
-    may buckle into helices of both hands.
+    A rod whose base does not rotate may buckle into helices of both hands; the push
+    acts on the first one from the base.
 
     Raises:
-        RuntimeError: it is less than one turn.
+        RuntimeError: if the part is less than one turn.
     """
     distance = np.linalg.norm(line[:, :2], axis=1)
     first = int(np.argmax(distance > _LEAST * distance.max()))
@@ -83,7 +83,7 @@ def one_hand(line: np.ndarray) -> np.ndarray:
 
 
 def checks() -> Iterator[Check]:
-    """The helix of short links."""
+    """Check of a helix of short links."""
     push, theory, angle = helix(LINK)
     name = f"helix of {np.degrees(angle):.0f}° in a straight tube, links of "
     name += f"{1e3 * LINK:g} mm: push"
@@ -91,6 +91,6 @@ def checks() -> Iterator[Check]:
 
 
 def long_links() -> float:
-    """Deviation (%) of the push that a helix of the links of the tasks needs."""
+    """Deviation (%) of the push force of a helix with the links of the tasks."""
     push, theory, _ = helix(NavigationConfig().shaft_link)
     return 100 * (push / theory - 1)

@@ -1,4 +1,4 @@
-"""First mode of a free end, of the chain of links against the beam."""
+"""First mode of a free end: chain of links against beam."""
 
 from collections.abc import Iterator
 
@@ -12,18 +12,18 @@ from cathsim_dmc.entities.devices import DEVICES, Discretisation
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import Rig
 
-FREE = 0.12  # m
+FREE = 0.12  # m, length of the free end
 MODE_BOUND = 10.0  # % of the frequency
 _ELEMENTS = 240
 
 
 def beam_frequency(lengths: np.ndarray, bending: np.ndarray, mass: float) -> float:
-    """First frequency (Hz) of a stepped cantilever by finite elements of Hermite.
+    """First frequency (Hz) of a stepped cantilever, by Hermite finite elements.
 
     Args:
-        lengths: (S,) of uniform sections from the clamp on, m.
-        bending: (S,) EI, N·m².
-        mass: Per length, kg/m.
+        lengths: (S,) lengths of uniform sections from the clamp on, m.
+        bending: (S,) bending stiffness EI of the sections, N·m².
+        mass: Mass per length, kg/m.
     """
     edges = np.linspace(0.0, lengths.sum(), _ELEMENTS + 1)
     h, middles = edges[1], (edges[1:] + edges[:-1]) / 2
@@ -46,7 +46,7 @@ def beam_frequency(lengths: np.ndarray, bending: np.ndarray, mass: float) -> flo
 
 
 def chain_frequency(rig: Rig) -> float:
-    """First frequency (Hz) of a straight chain in a plane, its base held."""
+    """First frequency (Hz) of a straight chain in a plane with a fixed base."""
     model, data = rig.model, rig.data
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
@@ -59,7 +59,7 @@ def chain_frequency(rig: Rig) -> float:
 
 
 def frequencies(device: str) -> tuple[float, float]:
-    """First frequency of a free end of a device in blood, Hz: of chain and beam."""
+    """First frequencies (Hz) of chain and beam, for a free end of a device in blood."""
     rig = Rig(device, Discretisation(working_length=FREE), straight=True)
     rig.compile()
     lengths, bending, _ = rig.sections
@@ -69,7 +69,7 @@ def frequencies(device: str) -> tuple[float, float]:
 
 
 def checks() -> Iterator[Check]:
-    """The first mode of every device of the library."""
+    """Checks of the first mode of every device of the library."""
     for device in DEVICES:
         name = f"first mode of a free end of {1e3 * FREE:g} mm, {device}"
         chain, beam = frequencies(device)

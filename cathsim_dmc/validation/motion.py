@@ -1,4 +1,4 @@
-"""A moving vessel against what is prescribed: where its wall is, what it carries."""
+"""A moving vessel against its prescribed motion: wall, flow, and carried links."""
 
 from collections.abc import Iterator, Sequence
 
@@ -28,19 +28,19 @@ FRAME_BOUND = 1.0  # %
 FLOW_BOUND = 1.0  # %
 FLOW_TIMES = (1.2, 2.3)  # s
 PLACES = (0.09, 0.13, 0.17)  # m along the tube
-RADIUS, _PROBE = 0.01, 5e-4  # m
+RADIUS, _PROBE = 0.01, 5e-4  # m, of the tube and of probe spheres
 _HEART, _BREATHING, _SOFT = 5.5e-3, 1.0, 0.02
-_GRAVITY, _RIDE = 9.81, 2.0  # m/s², s
+_GRAVITY, _RIDE = 9.81, 2.0  # m/s²; s, duration of a ride
 
 
 def parameters(heart: float, breathing: float, soft: float) -> np.ndarray:
-    """Parameters of a motion at 60 beats and 15 breaths a minute, of geom 0."""
+    """Parameters (PARAMETERS,) of a motion at 60 beats and 15 breaths a minute."""
     course = [heart, breathing, soft, 1.0, 0.0, 4.6, 0.25, 0.0]
     return np.array([0.0, *course, 0.0, -1.0])
 
 
 def stirred(lumen, lattice: np.ndarray, friction: float = 0.0) -> mujoco.MjSpec:
-    """A model of a moving wall alone, geom 0."""
+    """MuJoCo spec of a moving wall, geom 0, without a device."""
     fixed = {"solref": contact.CONTACT_SOLREF, "solimp": contact.CONTACT_SOLIMP}
     spec = bare(lumen, lattice, friction=(friction, 0, 0), **fixed)
     spec.nuserdata = PARAMETERS
@@ -50,7 +50,7 @@ def stirred(lumen, lattice: np.ndarray, friction: float = 0.0) -> mujoco.MjSpec:
 
 
 def begin(model: mujoco.MjModel, course: np.ndarray, bore: int = -1) -> mujoco.MjData:
-    """Data of a model whose wall moves by parameters, past the bore of a sheath."""
+    """Data of a model whose wall moves with the parameters `course`."""
     data = mujoco.MjData(model)
     law = dispatcher.Law("motion", "contact", adapters.motion, 1)
     places = dispatcher.Places(1, np.zeros(0), wall=0, bore=bore)
@@ -62,12 +62,12 @@ def begin(model: mujoco.MjModel, course: np.ndarray, bore: int = -1) -> mujoco.M
 def clearances(
     anatomy: Anatomy, course: np.ndarray, times: Sequence[float], points: np.ndarray
 ) -> np.ndarray:
-    """Distances (T, n) m of points from a moving wall, as small spheres measure them.
+    """Distances (T, n), m, of points from a moving wall, measured by probe spheres.
 
     Args:
-        course: of the motion, see `parameters`.
+        course: parameters of the motion, see `parameters`.
         times: (T,) s.
-        points: (n, 3) or (T, n, 3), m; NaN is returned where they are too far away.
+        points: (n, 3) or (T, n, 3), m; the distance is NaN where it is too large.
     """
     points = np.broadcast_to(points, (len(times), *points.shape[-2:]))
     spec = stirred(anatomy.lumen, anatomy.motion.lattice)
@@ -89,13 +89,13 @@ def diameters(anatomy: Anatomy) -> tuple[float, np.ndarray, np.ndarray]:
     """Diameters at `PLACES` of a straight tube along z over a beat.
 
     Returns:
-        Largest difference from what is prescribed, m; delays (2,) of the pulse between
-        the places, and distance over pulse wave velocity (2,), s.
+        Largest error of a diameter, m; delays (2,) of the pulse between the places, s;
+        and expected delays (2,), distance over pulse wave velocity, s.
     """
     course = parameters(0.0, 0.0, _SOFT)
     sides = np.array([[1, 0, 0], [-1, 0, 0]]) * (RADIUS - 1e-3)
     points = np.concatenate([sides + [0, 0, z] for z in PLACES])
-    # From 2 s on all of it moves.
+    # The motion has its full amplitude from 2 s on.
     times = 2.0 + np.linspace(0.0, 1.0, 251)
     found = clearances(anatomy, course, times.tolist(), points)
     found = 2 * (RADIUS - 1e-3) + found.reshape(len(times), -1, 2).sum(axis=-1)
@@ -109,7 +109,7 @@ def diameters(anatomy: Anatomy) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def wall_place(anatomy: Anatomy, number: int = 40) -> float:
-    """Largest distance, m, of the wall that probes find from where motions put it."""
+    """Largest distance, m, between the measured and the prescribed wall."""
     course, lumen = parameters(_HEART, _BREATHING, _SOFT), anatomy.lumen
     random = np.random.RandomState(0)
     vertices, normals = anatomy.surface.vertices, anatomy.surface.normals
@@ -118,10 +118,10 @@ def wall_place(anatomy: Anatomy, number: int = 40) -> float:
     chosen = random.choice(np.flatnonzero(far > 0.02), number, replace=False)
     inwards = -normals[chosen]
     at = vertices[chosen] + 3e-3 * inwards
-    # Where the field has its wall along the normal.
+    # The zero of the field along the normal.
     for _ in range(20):
         at -= lumen(at)[:, None] * inwards
-    # Away from the edges of ostia.
+    # Points at the edges of ostia are left out.
     smooth = (lumen.gradient(at + 1e-3 * inwards) * inwards).sum(axis=1) > 0.99
     at, inwards = at[smooth], inwards[smooth]
     times, places = (1.2, 2.3, 3.35), []
@@ -135,9 +135,10 @@ def wall_place(anatomy: Anatomy, number: int = 40) -> float:
 
 
 def section_flow(anatomy: Anatomy, time: float) -> float:
-    """Flow through a section of a straight tube in motion, over that prescribed.
+    """Flow through a section of a moving straight tube, relative to the prescribed one.
 
-    The velocity relative to space is integrated over where `Motion.to_space` puts it.
+    The velocity relative to space is integrated over the section that
+    `Motion.to_space` displaces.
     """
     course = parameters(_HEART, _BREATHING, _SOFT)
 
@@ -165,7 +166,7 @@ def section_flow(anatomy: Anatomy, time: float) -> float:
 
 
 def rigid_motion(anatomy: Anatomy, way: np.ndarray) -> Motion:
-    """All of space moved along (3) by the heart alone."""
+    """Rigid motion of all space along `way` (3,) by the heart alone."""
     low, high = anatomy.lumen.box
     values = np.tile([*way, 0, 0, 0, 0, 0.0], 8)
     return Motion(np.concatenate([low, [np.max(high - low)], [2, 2, 2], values]))
@@ -177,11 +178,12 @@ def ride(
     friction: float,
     inertial: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ways (T, 3) m of a link in a tube along z whose wall moves rigidly, and of that.
+    """Displacements (T, 3), m, of a link in a rigidly moving tube, and of the tube.
 
     Args:
-        way: Direction of the motion, of `_HEART` in a beat.
-        inertial: Whether the wall rests instead, and all feel its acceleration.
+        way: Direction of the motion, whose amplitude is `_HEART`.
+        friction: Coulomb coefficient.
+        inertial: Whether the wall is fixed and the link has an inertial force instead.
     """
     course = parameters(_HEART, 0.0, 0.0)
     motion = rigid_motion(anatomy, np.array(way))
@@ -189,7 +191,7 @@ def ride(
     capsule = {"size": (1e-3, 2e-3, 0), "mass": 1e-3, "friction": (friction, 0, 0)}
     capsule["type"] = mujoco.mjtGeom.mjGEOM_CAPSULE
     slider(spec, np.eye(3), (RADIUS - 1e-3 - 1e-6, 0, 0.1), **capsule)
-    # As `physics.motion.add_clock`.
+    # The clock is that of `physics.motion.add_clock`.
     clock = spec.worldbody.add_body(gravcomp=1, mass=0.1, inertia=(1e-5,) * 3)
     clock.explicitinertial = True
     clock.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(0, 1, 0))
@@ -202,7 +204,7 @@ def ride(
     for time in times:
         model.opt.gravity[:] = _GRAVITY, 0, 0
         if inertial:
-            # The wall's velocities are those in the middle of each step.
+            # Velocities of the wall are those of the middle of each step.
             gain = course_of(course, time + half).heart_rate
             gain -= course_of(course, time - half).heart_rate
             model.opt.gravity[:] -= gain / PHYSICS_TIMESTEP * np.array(way)
@@ -213,13 +215,13 @@ def ride(
 
 
 def slip(anatomy: Anatomy) -> float:
-    """Way of a link along a wall that carries it, over the wall's, %."""
+    """Largest slip of a link that a wall carries along, relative to its motion, %."""
     link, wall = (each[:, 2] for each in ride(anatomy, (0, 0, 1), friction=0.5))
     return float(100 * np.abs(link - wall).max() / np.abs(wall).max())
 
 
 def frame(anatomy: Anatomy) -> float:
-    """Motion seen from a moving wall against that under its inertia at rest, %."""
+    """Error, %, of motion on a moving wall, against a wall at rest with inertia."""
     way = (0.0, 0.8, 0.6)
     link, wall = ride(anatomy, way, friction=0.005)
     expected = ride(anatomy, way, friction=0.005, inertial=True)[0][:, 1:]
@@ -228,7 +230,7 @@ def frame(anatomy: Anatomy) -> float:
 
 
 def checks(tube: Anatomy, phantom: Anatomy) -> Iterator[Check]:
-    """Checks of a straight tube along z, and of a phantom."""
+    """Checks of the motion of a straight tube along z and of a phantom."""
     for time in FLOW_TIMES:
         name = f"flow through a section in motion at {time:g} s"
         yield Check.deviation(name, section_flow(tube, time), 1.0, FLOW_BOUND)

@@ -3,7 +3,7 @@
 Real-time factor: simulated seconds per CPU second of this process, one thread. It
 depends on the machine, so the checks bound the calibrated speed: the real-time factor
 times the microseconds of one `mj_step` of dm_control's humanoid, timed in alternation.
-Every figure is the median of repeated runs after a warm-up. `speed.py` measures more:
+Every value is the median of repeated runs after a warm-up. `speed.py` measures more:
 threads, images, stages, memory; it is a script of the source tree, in benchmarks.
 """
 
@@ -25,15 +25,15 @@ from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check, Report
 
 RUNS = 5
-STEPS = 150  # control steps; a push is then in the branch
-RATIOS = 24  # runs of a ratio
-# A curved arch, and the straight idealised one that it is held against.
+STEPS = 150  # control steps, after which a push is in the branch
+RATIOS = 24  # runs for the overhead ratio
+# A curved arch, and the straight idealised one for comparison.
 SCENES = ("type1_bca", "simple1_bca")
-# Calibrated speed that each policy must keep on each of them, µs.
+# Least calibrated speed of each policy on each of them, µs.
 BARS = {"push": (150.0, 280.0), "random": (420.0, 850.0), "curl": (220.0, 280.0)}
-MOST_OVERHEAD = 1.25  # of a suite step over its mj_step calls
-NEVER = 1e-6  # m, goal radius that no policy meets
-_WARM_STEPS = 1000  # of the humanoid, 5 s: it has come to lie on the floor
+MOST_OVERHEAD = 1.25  # time of a suite step divided by that of its mj_step calls
+NEVER = 1e-6  # m, goal radius that no policy reaches
+_WARM_STEPS = 1000  # of the humanoid, 5 s, after which it lies on the floor
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Pace:
     Attributes:
         insertion: (T,), m, after each control step.
         seconds: (T,), CPU seconds of each control step.
-        contacts: (T,), with the wall at its end.
+        contacts: (T,), contacts with the wall at the end of each control step.
     """
 
     insertion: np.ndarray
@@ -57,7 +57,7 @@ class Pace:
 
 
 def speed(say: Callable[[str], None] = lambda text: None) -> Report:
-    """Calibrated speeds and the overhead of a suite step, as checks."""
+    """Report of the calibrated speeds and of the overhead of a suite step."""
     say("real-time factors")
     checks, calibration = calibrated_speeds()
     say("overhead")
@@ -73,10 +73,10 @@ def speed(say: Callable[[str], None] = lambda text: None) -> Report:
 
 
 def calibrated_speeds() -> tuple[list[Check], dict[str, dict[str, dict[str, float]]]]:
-    """Calibrated speeds, and their two factors by scene and policy.
+    """Checks of the calibrated speeds, and their two factors by scene and policy.
 
-    The scenes and the humanoid take turns, so that their figures can be compared
-    though the machine's speed drifts.
+    Runs of the scenes and the humanoid alternate, which cancels a drift of the
+    machine's speed.
     """
     environments = [load(scene) for scene in SCENES]
     checks, table = [], {scene: {} for scene in SCENES}
@@ -108,7 +108,7 @@ def calibrated_speeds() -> tuple[list[Check], dict[str, dict[str, dict[str, floa
 
 
 def load(task: str = "type1_bca", **options) -> composer.Environment:
-    """A suite environment whose episodes never end in success."""
+    """Loads a suite environment whose episodes never end in success."""
     options.setdefault("goal_radius", NEVER)
     return suite.load(suite.DOMAIN, task, task_kwargs={"random": 0, **options})
 
@@ -134,7 +134,7 @@ def pace(
 
 
 def suite_overhead(policy: str, steps: int = STEPS) -> list[float]:
-    """CPU time of suite environment steps over that of their bare mj_step calls."""
+    """Overheads (RATIOS,): CPU time of suite steps divided by that of `mj_step`."""
     environment = load()
     pairs = [
         against_bare_steps(environment, policy, steps, run) for run in range(RATIOS + 1)
@@ -143,10 +143,10 @@ def suite_overhead(policy: str, steps: int = STEPS) -> list[float]:
 
 
 class Begun(NamedTuple):
-    """What the physics steps of a control step begin with.
+    """State before the physics steps of a control step.
 
     Attributes:
-        state: (nstate,), with the control, see `Stepper.before`.
+        state: (nstate,), including the control, see `Stepper.before`.
         fields: Fields of the model that are written at every control step, by name.
     """
 
@@ -155,7 +155,7 @@ class Begun(NamedTuple):
 
     @classmethod
     def last(cls, environment: composer.Environment) -> "Begun":
-        """Of the last control step of a suite environment."""
+        """The one of the last control step of a suite environment."""
         task = environment.task
         names = {name for effect in task.effects for name in effect.step_fields}
         fields = {name: task.stepper.field(0, name).copy() for name in names}
@@ -167,11 +167,11 @@ def against_bare_steps(
 ) -> tuple[float, float]:
     """CPU seconds of an episode, and of the bare `mj_step` calls of its control steps.
 
-    The two take turns by episodes: by steps each would find the caches full of the
-    other's data. Control steps that are done again are part of the episode alone.
+    The two alternate by episodes: alternating by steps, each would find the CPU caches
+    filled by the other. Repeated control steps count in the episode only.
     """
     timestep, seconds = environment.reset(), 0.0
-    # None of these policies looks at the observation.
+    # None of these policies uses the observation.
     act = in_environment(make_policy(policy, seed), environment)
     actions, begun = [act(timestep) for _ in range(steps)], []
     for action in actions:
@@ -185,11 +185,11 @@ def against_bare_steps(
 def bare_steps(
     environment: composer.Environment, begun: Sequence[Begun]
 ) -> tuple[float, np.ndarray]:
-    """Does the physics steps of control steps again, and nothing but them.
+    """Repeats the physics steps of control steps, without the task.
 
     Args:
         environment: Suite environment of the control steps.
-        begun: What each of them began with.
+        begun: State before each of them.
 
     Returns:
         CPU seconds of the `mj_step` calls, and states (T, nstate) after each control
@@ -211,7 +211,7 @@ def bare_steps(
 
 
 def humanoid_step(steps: int = 2000) -> float:
-    """CPU time of one `mj_step` of dm_control's humanoid, µs: the speed of the machine.
+    """CPU time of one `mj_step` of dm_control's humanoid, µs, a measure of the machine.
 
     The humanoid of `stand` falls without controls from its standing pose; the first
     steps warm it up and are not timed.

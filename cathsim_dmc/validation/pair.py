@@ -1,4 +1,4 @@
-"""`cathsim validate pair`: coaxial devices against theory, at rest and on the move."""
+"""`cathsim validate pair`: coaxial devices against theory, at rest and in motion."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -23,25 +23,25 @@ from cathsim_dmc.validation.rig import Rig, half_circle, in_tube
 PAIR = ("wire_035_glide", "berenstein_5f")
 PROTRUSIONS = (0.0, 0.02, 0.05, 0.10)  # m, of the wire out of the catheter
 END_ANGLES = (15.0, 45.0)  # degrees
-# Largest step of the free end as one device slides in the other, in that of the curve:
-# a chain whose hinges jumped one after the other would make several at once.
+# Largest step of the free end as one device slides in the other, relative to that of
+# the continuous curve: hinges that jump one after the other take several at once.
 STEP_BOUND = 1.1
 
-# Unloaded shapes turned about the axis, and twist of the chain in a bend.
-_FINE = 0.05e-3  # m, of the curve that is integrated
+# Unloaded shapes rotated about the axis, and twist of the chain in a bend.
+_FINE = 0.05e-3  # m, step of the integration of the curve
 TURNS = np.radians(np.arange(0, 360, 15))
 SLIDING_PAIR = ("wire_035_amplatz", "diagnostic_5f_simmons")
 # Distances (m) of the ends of wire and catheter from the end of the chain.
 GAPS = ((0.0, 0.02), (0.012, 0.0), (0.0, 0.005))
-SHAPE_BOUND = 1.0  # % of the displacement of the end from the straight line
+SHAPE_BOUND = 1.0  # % of the displacement of the end from a straight device
 DIRECTION_BOUND = 1.5  # °, of the last link
 BEND_RADIUS = 0.04  # m, of half a circle
-TWIST_BOUND = 1.0  # °, of the last frame there
+TWIST_BOUND = 1.0  # °, of the last frame in this bend
 
 SLIDING_TASK = "femoral_type1_lcca"
-SPEED = 0.01  # m/s, of one device through the other
-# mm, of the end of the chain in a control step: 0.1 m/s, as it snaps from one wall of
-# the vessel to the other. What the sliding itself adds, `smoothness` compares.
+SPEED = 0.01  # m/s, of one device in the other
+# Largest movement of the end of the chain in a control step, mm: 0.1 m/s, as it snaps
+# from one wall of the vessel to the other. `smoothness` checks the sliding itself.
 LARGEST_STEP = 4.0
 # Steps of the script: name, speeds of wire and catheter in m/s, rotation of the
 # catheter in rad/s, duration in s.
@@ -53,26 +53,27 @@ SCRIPT = (
     ("catheter turned", 0.0, 0.0, np.pi / 2, 4.0),
 )
 
-TURNED = "berenstein_5f"  # alone in a tube
+TURNED = "berenstein_5f"  # single device in a tube
 TUBE_RADIUS = 4e-3  # m
-# m: length of a straight tube, and that before and after a bend.
+# m: length of a straight tube, and length before and after a bend.
 STRAIGHT_TUBE, BENT_TUBE = 0.275, 0.05
 TURN_RATE, TURNED_BY = 0.5, 4 * np.pi  # rad/s and rad, of the base
-STRAIGHT_LAG = 45.0  # °, of the end in a straight tube
-WHIP = 3.0  # least rate of turning of the end in a bend, in that of the base
+STRAIGHT_LAG = 45.0  # °, largest lag of the end in a straight tube
+WHIP = 3.0  # least ratio of the angular velocities of end and base in a bend
 
 
 def free_curve(chosen: Sequence[Device], gaps: ArrayLike, length: float) -> np.ndarray:
-    """End (3,), m, of the curve of a length (m) of the EI-weighted curvature at rest.
+    """End (3,), m, of the unloaded curve of K devices, over a length (m).
 
-    The gaps (K,), m, are those from the end of each of K devices, which are not turned,
-    to that of the curve. It lies in the plane of x and z.
+    Its curvature is the EI-weighted mean of the devices. `gaps` (K,), m, are the
+    distances from their ends to that of the curve. Devices are not rotated, so the
+    curve lies in the plane of x and z.
     """
     arc = np.arange(0.0, length, _FINE)
     steps = np.diff(np.append(arc, length))
     middle = length - (arc + steps / 2)  # from the end
     bending, _, own = theory.profile(chosen, gaps, middle)
-    # Where no device is, there is no curvature.
+    # There is no curvature without a device.
     stiffness = np.maximum(bending.sum(axis=0), 1e-12)
     turning = (bending * own).sum(axis=0) / stiffness * steps
     heading = np.cumsum(turning) - turning / 2
@@ -80,12 +81,12 @@ def free_curve(chosen: Sequence[Device], gaps: ArrayLike, length: float) -> np.n
 
 
 def turned(names: Sequence[str], gaps: Sequence[float]) -> tuple[float, float, float]:
-    """Largest deviations of the unloaded end of K devices with gaps (K,), m, turned.
+    """Largest deviations of the unloaded end of K rotated devices with gaps (K,), m.
 
     Returns:
-        Deviation from the turned shape of 0° and from the continuous curve of the
-        EI-weighted curvature, as fractions of the displacement of the end; deviation of
-        the last link's direction from that of 0°, rad.
+        Deviation from the rotated shape of 0° and from the curve of `free_curve`, as
+        fractions of the displacement of the end; deviation of the last link's direction
+        from that of 0°, rad.
     """
     rig = Rig(names)
     rig.compile()
@@ -108,13 +109,13 @@ def turned(names: Sequence[str], gaps: Sequence[float]) -> tuple[float, float, f
 
 
 def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float, float]:
-    """Twist at the last joint of links (L,), m, in half a circle of 40 mm.
+    """Twist at the last joint of links (L,), m, in a half circle of 40 mm.
 
-    It begins after `start`, m, and lies in a plane about the axis, rad.
+    The half circle begins after `start`, m, in a plane at `plane`, rad, about the axis.
 
     Returns:
-        Angles, rad, by which the command of the last motor, and the unloaded shape at
-        the last joint, are turned against a frame that does not twist.
+        Angles, rad, of the command of the last motor, and of the unloaded shape at the
+        last joint, relative to a twist-free frame.
     """
     end = [[2 * BEND_RADIUS, 0, -1.0]]
     line = np.vstack([[[0, 0, 0]], half_circle(BEND_RADIUS, start, 399), end])
@@ -130,7 +131,7 @@ def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float,
         across *= np.arcsin(sine) / sine if sine else 1.0
         still = Rotation.from_rotvec(across) * still
     twist = (still.inv() * frame).as_rotvec()[2]
-    ordered = angles.copy()  # as the hinges lie
+    ordered = angles.copy()  # in the order of the hinges
     ordered[1::2] = angles[1::2, ::-1]
     bends = hinges.Bends(np.empty(len(ordered), complex), np.empty(len(ordered)))
     command, turned = np.array([[1.0, 0.0]]), np.empty((1, 2))
@@ -140,13 +141,13 @@ def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float,
 
 
 def smoothness() -> Check:
-    """Steps of the unloaded end as the wire slides at 10 mm/s, against the curve's."""
-    # By how much the wire is ahead of the catheter, m; negative where it is behind.
+    """Check of the steps of the unloaded end as the wire slides at 10 mm/s."""
+    # Lead of the wire over the catheter, m; negative if it is behind.
     leads = np.arange(-0.06, 0.06, SPEED * CONTROL_TIMESTEP)
     entity = DeviceStack(SLIDING_PAIR)
     stack, length = entity.stack, float(entity.link_lengths.sum())
     gaps = np.stack([np.maximum(-leads, 0.0), np.maximum(leads, 0.0)], axis=-1)
-    # All shapes lie in one plane here.
+    # All shapes lie in one plane.
     angles = np.array([stack.overlap(gap).rest.sum(axis=0) for gap in gaps])
     heading = np.cumsum(np.pad(angles, ((0, 0), (1, 0))), axis=-1)
     links = stack.link_lengths * np.stack([np.sin(heading), np.cos(heading)])
@@ -162,7 +163,7 @@ def smoothness() -> Check:
 
 
 def slide() -> Iterator[Check]:
-    """Slides two devices through each other in a vessel."""
+    """Checks of two devices that slide in each other in a vessel."""
     options = {"devices": SLIDING_PAIR, "random": 0, "observation": "tracking"}
     environment = suite.load(suite.DOMAIN, SLIDING_TASK, options)
     environment.reset()
@@ -193,15 +194,15 @@ def turn(bent: bool) -> tuple[np.ndarray, np.ndarray, float]:
     """Advances a pre-shaped catheter through a tube and turns its base slowly.
 
     Returns:
-        Rotations (T,) of base and end, rad; A/K, rad, of the torque A by which the
-        shape resists at most, EI κ α, 0 in a straight tube, and the torsional stiffness
-        K of the device. Without friction the end follows the base until, at a ratio
-        above 1, it whips round.
+        Rotations (T,) of base and end, rad; and A/K, rad. A is the largest torque of
+        the bent shape, EI κ α, 0 in a straight tube; K is the torsional stiffness of
+        the device. Without friction the end follows the base for A/K below 1, and whips
+        above.
     """
     size = (STRAIGHT_TUBE, TUBE_RADIUS), (BENT_TUBE, TUBE_RADIUS, BEND_RADIUS)
     environment = in_tube(size[bent], devices=(TURNED,), observation="tracking")
     play, device = environment.task, devices.get(TURNED)
-    # Until its bend lies at the far end of the half circle.
+    # The catheter advances until its bend is at the far end of the half circle.
     ahead = 0.05 + np.pi * BEND_RADIUS - play.scene.placement.start_depth
     for _ in range(round(ahead / (0.5 * MAX_PUSH_SPEED * CONTROL_TIMESTEP))):
         environment.step(np.array([0.5, 0.0]))
@@ -219,7 +220,7 @@ def turn(bent: bool) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def _shape_checks() -> Iterator[Check]:
-    """Turned shapes of all devices and pairs, and twist in half a circle."""
+    """Checks of rotated shapes of devices and pairs, and of twist in a half circle."""
     alone = [
         ((name,), (0.0,)) for name, one in devices.DEVICES.items() if one.tip_shape
     ]

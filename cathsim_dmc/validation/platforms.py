@@ -1,4 +1,4 @@
-"""Platforms of the drives when the command changes: speed, acceleration, overshoot."""
+"""Speed, acceleration and overshoot of the drives when the command changes."""
 
 import itertools
 from collections.abc import Iterator
@@ -12,24 +12,24 @@ from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import Rig
 
-SPEED_BOUND, ACCELERATION_BOUND = 1.1, 1.0  # of the largest ones
+SPEED_BOUND, ACCELERATION_BOUND = 1.1, 1.0  # of the limits `LARGEST`
 OVERSHOOT_BOUND = {"insertion": 0.05e-3, "rotation": 1e-3}  # m, rad
-LOADS = (0.0, 2.0)  # N on the base, against its way
-# Speed and acceleration of the platforms.
+LOADS = (0.0, 2.0)  # N on the base, against the insertion
+# Limits of speed and acceleration of the platforms.
 LARGEST = {
     "insertion": (chain.MAX_PUSH_SPEED, chain.MAX_PUSH_ACCELERATION),
     "rotation": (chain.MAX_ROTATION_SPEED, chain.MAX_ROTATION_ACCELERATION),
 }
 COMMANDS = (0.0, 1.0, 0.0, -1.0, 1.0, 0.0, 0.25, 0.0)
-_WHILE = 0.4  # s, of each command
-_MIDDLE = 0.25  # m, of the stroke
+_WHILE = 0.4  # s, duration of each command
+_MIDDLE = 0.25  # m, middle of the stroke
 
 
 class Ride(NamedTuple):
-    """A platform whose command changes."""
+    """Response of a platform to changes of its command."""
 
-    speed: float  # largest, of the largest one
-    acceleration: float  # largest in a physics step, of the largest one
+    speed: float  # largest speed, relative to the limit
+    acceleration: float  # largest mean over a physics step, relative to the limit
     overshoot: float  # past the place at which it stops, m or rad
 
 
@@ -50,7 +50,7 @@ def ride(joint: str, load: float = 0.0) -> Ride:
     dof = rig.model.joint(f"{rig.name}/{joint}").dofadr[0]
 
     def run(value: float) -> np.ndarray:
-        """Places and speeds (2, T) of the physics steps of a command."""
+        """Positions and speeds (2, T) at the physics steps of a command."""
         rows, command = [], np.zeros((1, 2))
         command[0, which] = value
         for _ in range(round(_WHILE / CONTROL_TIMESTEP)):
@@ -77,7 +77,7 @@ def ride(joint: str, load: float = 0.0) -> Ride:
 
 
 def checks() -> Iterator[Check]:
-    """Rides of both platforms, and one under a load."""
+    """Checks of both platforms, and of the insertion under a load."""
     rides = [("insertion", load) for load in LOADS] + [("rotation", 0.0)]
     for joint, load in rides:
         one = ride(joint, load)

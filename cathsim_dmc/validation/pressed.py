@@ -1,4 +1,4 @@
-"""Devices pressed on a wall and pushed along it: rest, contacts, repeated steps."""
+"""Devices pressed on a wall and pushed along it: depth, forces, repeated steps."""
 
 from collections.abc import Iterator
 
@@ -13,22 +13,22 @@ from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import bare, in_tube, slider
 
-# N, on a gram: about what a link of the pair weighs as a contact feels it.
+# N, on a mass of a gram, about the effective mass of a link of the pair at a contact.
 LOADS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, MAX_PUSH_FORCE)
 _MASS = 1e-3  # kg
-_SETTLING, _WATCHED = 1200, 300  # physics steps
+_SETTLING, _WATCHED = 1200, 300  # physics steps, before and during the measurement
 RIPPLE = 1e-3  # mm, of the depth under a dead load
-DEPTH = 0.3  # mm, 99th percentile; as in the soak
+DEPTH = 0.3  # mm, 99th percentile, as in the soak test
 
-# Tube, m. In one of 4 mm radius, a link of 7 mm wedges across the lumen as the
-# tip folds, and bears up to four times the push, because links do not bend.
-JAM_TUBE = 0.275, 5e-3  # length and radius
-_JAMMED = 2.0  # s, of pushing with the stroke used up
-_END = 1.0  # s, of it that counts
+# In a tube of 4 mm radius, a link of 7 mm jams across the lumen as the tip folds, and
+# bears up to four times the push, because links are rigid.
+JAM_TUBE = 0.275, 5e-3  # m, length and radius
+_JAMMED = 2.0  # s, of pushing beyond the time for the full stroke
+_END = 1.0  # s, last part, which is evaluated
 
 # Devices pushed at full speed.
 TASKS = ("type1_lcca", "femoral_type1_lcca_pair")
-REPEATED = 0.5  # %, of the control steps
+REPEATED = 0.5  # % of the control steps
 DEEPEST = 0.6  # mm
 HARDEST = 5.0  # N
 _PUSHES = 200  # control steps of an episode, straight or with the tip curled
@@ -40,10 +40,10 @@ def pressed(
     solref: tuple[float, ...] = contact.CONTACT_SOLREF,
     solimp: tuple[float, ...] = contact.CONTACT_SOLIMP,
 ) -> tuple[float, float]:
-    """Presses a mass on a plane with a load, N, by integrator and step of the tasks.
+    """Presses a mass on a plane with a load, N, with integrator and step of the tasks.
 
     Returns:
-        Mean depth, and the largest less the smallest, m.
+        Mean depth, and its peak-to-peak range, m.
     """
     spec = bare()
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
@@ -62,11 +62,11 @@ def pressed(
 
 
 def jam(pair: tuple[str, str]) -> tuple[float, float, float, float]:
-    """Pushes guidewire and catheter into a dead end until their drives give way.
+    """Pushes guidewire and catheter into a dead end until their drives slip.
 
     Returns:
-        Push force at the end, N; 99th percentile of the deepest contact of a physics
-        step, m; least and largest of the largest contact, N.
+        Push force at the end, N; 99th percentile over physics steps of the deepest
+        penetration, m; minimum and maximum of the largest contact force, N.
     """
     environment = in_tube(JAM_TUBE, devices=pair, random=1, observation="tracking")
     task = environment.task
@@ -85,7 +85,7 @@ def jam(pair: tuple[str, str]) -> tuple[float, float, float, float]:
 
 
 def checks(pair: tuple[str, str]) -> Iterator[Check]:
-    """Presses a mass and jams a pair, guidewire and catheter by name."""
+    """Checks of a pressed mass and of a jammed pair, guidewire and catheter by name."""
     depths, ripples = zip(*map(pressed, LOADS), strict=True)
     name = f"device pressed on a wall by {LOADS[0]:g} to {LOADS[-1]:g} N: "
     name += "ripple of the depth"
@@ -98,7 +98,7 @@ def checks(pair: tuple[str, str]) -> Iterator[Check]:
 
 
 def push_checks() -> Iterator[Check]:
-    """Pushes the devices of `TASKS`, their tips straight, then curled."""
+    """Checks of full pushes of the devices of `TASKS`, tips straight and curled."""
     for task in TASKS:
         environment = suite.load(suite.DOMAIN, task, {"random": 0, "goal_radius": 1e-6})
         play = environment.task

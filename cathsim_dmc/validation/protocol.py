@@ -2,8 +2,8 @@
 
 The publication compares force samples of a manual cannulation of the brachiocephalic
 artery with a normal distribution that was fitted to a load cell under a phantom:
-Shapiro–Wilk, Levene, Mann–Whitney, density and cumulative plots. A large p-value of
-these proves no equality, so effect sizes and an equivalence test stand beside them.
+Shapiro–Wilk, Levene, Mann–Whitney, density and cumulative plots. A large p-value does
+not prove equality, so `compare` adds effect sizes and an equivalence test.
 """
 
 from typing import Any
@@ -17,19 +17,19 @@ from cathsim_dmc.recording.episode import Episode
 # The experiment as a draft of the publication gives it; unverified.
 REFERENCE_MEAN = 0.4  # N
 REFERENCE_SD = 0.02  # N
-# Means closer than this count as equal, N: half the width of the range of 0 to 0.2 N
-# in which most forces of navigation lie.
+# Means closer than this count as equal, N: half the width of the range of 0 to 0.2 N of
+# most forces in navigation.
 EQUIVALENCE_MARGIN = 0.1
 SIGNIFICANCE = 0.05
-_SHAPIRO_LIMIT = 5_000  # samples for which its p-value holds
+_SHAPIRO_LIMIT = 5_000  # most samples for which the p-value of Shapiro–Wilk holds
 _LEAST_SAMPLES = 3
 
 
 def load_cell_samples(episode: Episode) -> np.ndarray:
-    """Readings of a load cell under the phantom in an episode, N.
+    """Readings of a load cell under the phantom in an episode.
 
     Returns:
-        (n,) magnitudes of the resultant of all contact forces, in the control steps
+        (n,) N, magnitudes of the resultant of all contact forces, in the control steps
         with contact.
     """
     total = np.zeros((episode.steps, 3))
@@ -38,15 +38,15 @@ def load_cell_samples(episode: Episode) -> np.ndarray:
 
 
 def reference_sample(mean: float, sd: float, count: int) -> np.ndarray:
-    """A sample (count,) of a normal distribution: its quantiles at (i + 1/2)/n."""
+    """Sample (count,) of a normal distribution: its quantiles at (i + 1/2)/count."""
     return stats.norm.ppf((np.arange(count) + 0.5) / count, mean, sd)
 
 
 def effective_count(samples: np.ndarray) -> float:
-    """Number of independent samples that tell as much of the mean as a series (n,).
+    """Effective sample size of a series (n,) for its mean.
 
-    n over the integrated autocorrelation time, summed up to the first lag at which
-    the autocorrelation is not positive.
+    It is n over the integrated autocorrelation time, which is summed up to the first
+    lag without positive autocorrelation.
     """
     n, centred = len(samples), samples - samples.mean()
     if not centred.any():
@@ -59,7 +59,7 @@ def effective_count(samples: np.ndarray) -> float:
 
 
 def _enough(samples: np.ndarray) -> np.ndarray:
-    """Samples (n,) as float64; ValueError if there are too few, or one is NaN."""
+    """Samples (n,) as float64; ValueError if too few, or one is not finite."""
     samples = np.asarray(samples, dtype=np.float64)
     if samples.ndim != 1 or len(samples) < _LEAST_SAMPLES:
         raise ValueError(
@@ -78,7 +78,7 @@ def compare(
     reference_sd: float = REFERENCE_SD,
     margin: float = EQUIVALENCE_MARGIN,
 ) -> dict[str, Any]:
-    """Compares force samples with a reference of as many samples.
+    """Compares force samples with a normal reference of as many samples.
 
     Args:
         samples: (n,) N, in the order of time.
@@ -144,7 +144,7 @@ def figure(samples: np.ndarray, comparison: dict[str, Any]) -> Any:
     """Density and cumulative plot of samples (n,) N beside the normal reference.
 
     Args:
-        comparison: What `compare` returns for them.
+        comparison: Result of `compare` for the samples.
 
     Returns:
         A matplotlib figure, which `style.save` writes.
@@ -156,8 +156,7 @@ def figure(samples: np.ndarray, comparison: dict[str, Any]) -> Any:
 
     mean, sd = comparison["reference_mean"], comparison["reference_sd"]
     normal, ordered = stats.norm(mean, sd), np.sort(samples)
-    # Of values in groups far apart, such as many small ones and a few large, a mirror
-    # keeps the density from leaking below zero.
+    # The kernel density is mirrored at zero, so that none of it lies below.
     width = max(1.06 * samples.std(ddof=1) * len(samples) ** -0.2, 1e-4)
     end = 1.05 * max(float(ordered[-1]), mean + 4 * sd)
     grid = np.union1d(np.linspace(0.0, end, 1_000), normal.ppf([0.001, 0.5, 0.999]))

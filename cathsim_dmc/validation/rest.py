@@ -1,9 +1,9 @@
-"""`cathsim validate rest`: whether devices that stand on the wall stand still.
+"""`cathsim validate rest`: whether devices at rest on the wall do not move.
 
-A device is pushed into a phantom to a depth, stopped, and left alone; and again in
-shorter physics steps from the start: where only the rest is in shorter steps, the first
-of them lets go of the friction that the push has left. All of it is done with the
-tolerance of the solver that tasks have, and with a stricter one.
+A device is pushed into a phantom to a depth, stopped, and left alone. The reference
+does all of it in shorter physics steps: if only the rest were in shorter steps, the
+change of step would release the friction that the push has left. Both use the solver
+tolerance of the tasks, and a stricter one.
 """
 
 import dataclasses
@@ -33,22 +33,22 @@ DEVICES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 )
 ANATOMIES = ("type1", "type2")
 DEPTHS = (0.05, 0.07, 0.09, 0.11, 0.13)  # m, of the push
-# Physics steps, that many times shorter, that the mean force is compared with.
+# Physics steps of the reference are so many times shorter.
 FINER = 4
-SETTLING, WATCHED = 8.0, 4.0  # s; a thin wire swings for some seconds
-STILL = 0.01  # mm, RMS of the head about its mean place
+SETTLING, WATCHED = 8.0, 4.0  # s; a thin wire oscillates for some seconds
+STILL = 0.01  # mm, RMS distance of the head from its mean position
 STEADY = 2.0  # %, standard deviation of the force over its mean
-CONVERGED = 3.0  # %, of the mean force in shorter steps
-# Mean force, N, below which its fluctuation and deviation count as shares of this.
+CONVERGED = 3.0  # %, deviation of the mean force from that of the reference
+# Least denominator, N, of the relative fluctuation and deviation of the force.
 LEAST_FORCE = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class Rest:
-    """Devices at rest, N states.
+    """Motion and force of a device at rest in N states.
 
     Attributes:
-        head: (T, N, 3) m, at the ends of control steps.
+        head: (T, N, 3) m, position of the head at the ends of control steps.
         force: (T, N) N, sum over all contacts at the ends of control steps.
     """
 
@@ -57,7 +57,7 @@ class Rest:
 
     @property
     def wobble(self) -> np.ndarray:
-        """(N,) mm, RMS distance of the head from its mean place."""
+        """(N,) mm, RMS distance of the head from its mean position."""
         away = np.linalg.norm(self.head - self.head.mean(axis=0), axis=-1)
         return 1e3 * np.sqrt((away**2).mean(axis=0))
 
@@ -78,7 +78,8 @@ def pushed(
 
     Args:
         options: Device or devices.
-        depths: m, of the base, or of all bases together.
+        anatomy: Name of a phantom.
+        depths: m, of the base, or of all bases.
         **config: Further options of the task.
     """
     place = {"anatomy": anatomy, "goal": "lcca", "goal_radius": 1e-6}
@@ -96,7 +97,7 @@ def pushed(
 
 
 def watch(batch: BatchSimulation, settling: float, watched: float) -> Rest:
-    """Leaves devices alone and watches them after `settling` for `watched` seconds."""
+    """Records devices without commands for `watched` s, after `settling` s."""
     still, head, force = np.zeros((batch.num_simulations, batch.num_actions)), [], []
     for _ in range(round(settling / CONTROL_TIMESTEP)):
         batch.step(still)
@@ -108,13 +109,13 @@ def watch(batch: BatchSimulation, settling: float, watched: float) -> Rest:
 
 
 class Compared(NamedTuple):
-    """States of a device in all anatomies, arrays (N,).
+    """A device at rest in N states of all anatomies; arrays (N,).
 
     Attributes:
         wobble: mm, see `Rest.wobble`.
         fluctuation: %, see `Rest.fluctuation`.
-        deviation: %, of the mean force from that in shorter steps.
-        moved: mm, from the mean place of the head to that in shorter steps.
+        deviation: %, deviation of the mean force from that of the reference.
+        moved: mm, distance of the mean positions of the head in both.
     """
 
     wobble: np.ndarray
@@ -123,7 +124,7 @@ class Compared(NamedTuple):
     moved: np.ndarray
 
     def checks(self, name: str) -> Iterator[Check]:
-        """Of the worst state of a device with a name."""
+        """Checks of the worst state of the device `name`."""
         name, moved = (
             f"{name} at rest, worst of {len(self.wobble)} states: ",
             self.moved,
@@ -145,7 +146,7 @@ def compared(
     anatomies: Sequence[str] = ANATOMIES,
     depths: Sequence[float] = DEPTHS,
 ) -> Compared:
-    """Watches a device at rest, after a push in usual and in shorter physics steps.
+    """Compares a device at rest in usual and in shorter physics steps.
 
     Args:
         options: Device or devices.

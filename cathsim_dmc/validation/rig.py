@@ -1,4 +1,4 @@
-"""Test rigs: the catheter of the tasks, with their settings, under known loads."""
+"""Test rigs: devices with the settings of the tasks under known loads."""
 
 import dataclasses
 import types
@@ -28,12 +28,12 @@ from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import theory
 
-RESTING_TIME = 0.4  # s
-STRICT = 1e-8  # tolerance of the solver with which devices at rest stand still
+RESTING_TIME = 0.4  # s, over which motion at rest is measured
+STRICT = 1e-8  # solver tolerance with which devices at rest do not move
 
 
 def half_circle(radius: float, start: float, pieces: int) -> np.ndarray:
-    """Half a circle (pieces + 1, 3) m towards +x, that leaves +z at a height, m."""
+    """Half circle (pieces + 1, 3), m, from +z towards +x, from z = `start`, m, on."""
     angle = np.linspace(0.0, np.pi, pieces + 1)
     arc = np.stack([1 - np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
     return radius * arc + (0, 0, start)
@@ -43,9 +43,9 @@ def tube(length: float, radius: float, bend: float = 0.0) -> Anatomy:
     """A vessel "tube" from the origin along +z, closed at its end, with a goal "end".
 
     Args:
-        length: of a straight tube, or of the pieces before and after a bend, m.
-        radius: m.
-        bend: radius of half a circle towards +x, m; 0 for none.
+        length: length of a straight tube, or of the parts before and after a bend, m.
+        radius: radius of the lumen, m.
+        bend: radius of a half circle towards +x, m; 0 for none.
     """
     z = np.linspace(0.0, length, max(3, round(length / 5e-3) + 1))
     points = np.stack([0 * z, 0 * z, z], axis=-1)
@@ -59,7 +59,7 @@ def tube(length: float, radius: float, bend: float = 0.0) -> Anatomy:
 
 
 def in_tube(size: tuple[float, ...], **options: Any):
-    """A composer environment in a tube of these arguments of `tube`, after a reset."""
+    """A composer environment in a `tube(*size)`, after a reset."""
     place = {"anatomy": tube(*size), "goal": "end", "goal_radius": 1e-6, "random": 0}
     environment = suite.load(suite.DOMAIN, "navigate", place | options)
     environment.reset()
@@ -67,9 +67,9 @@ def in_tube(size: tuple[float, ...], **options: Any):
 
 
 def bare(lumen: Any = None, lattice: np.ndarray | None = None, **wall: Any):
-    """MuJoCo's spec without a device, with the options of the tasks but no gravity.
+    """MuJoCo spec without a device, with the options of the tasks but no gravity.
 
-    The field `lumen` is geom 0 with the fields `wall`, moved by `lattice` if given.
+    The field `lumen`, if given, is geom 0 with attributes `wall`; `lattice` moves it.
     """
     spec = mujoco.MjSpec()
     spec.nuser_geom = 4
@@ -85,7 +85,7 @@ def bare(lumen: Any = None, lattice: np.ndarray | None = None, **wall: Any):
 
 
 def slider(spec: mujoco.MjSpec, axes: Any, pos: Any = (0, 0, 0), **geom: Any):
-    """Adds a body that slides along axes (n, 3), with one geom, which is returned."""
+    """Adds a body with slide joints along axes (n, 3); returns its geom."""
     body = spec.worldbody.add_body(pos=pos)
     for axis in np.atleast_2d(axes):
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
@@ -93,14 +93,14 @@ def slider(spec: mujoco.MjSpec, axes: Any, pos: Any = (0, 0, 0), **geom: Any):
 
 
 class Rig:
-    """A device, or coaxial ones, alone in the arena of the tasks, with their settings.
+    """A device, or coaxial devices, in the arena of the tasks, with their settings.
 
-    It lies along +z, its base at insertion 0. Gravity is off.
+    The device lies along +z with its base at insertion 0. Gravity is off.
 
     Attributes:
-        arena: to which a test adds its own fixtures before `compile`.
-        catheter: with `origin` at the middle of link 0.
-        gaps: (K,) m, from the ends of the devices at rest to that of the chain.
+        arena: arena, to which a test adds its fixtures before `compile`.
+        catheter: entity of the device, with `origin` at the middle of link 0.
+        gaps: (K,) m, from the ends of the devices to that of the chain, at rest.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class Rig:
             discretisation: Default of the tasks if None.
             straight: Whether devices lack their pre-shaped tips.
             gaps: (K,) m; 0 if None.
-            **options: Of the entity; by default a stroke of 0.1 m and `FRICTION`.
+            **options: Options of the entity; default: stroke 0.1 m and `FRICTION`.
         """
         single = isinstance(device, str | devices.Device)
         chosen = [devices.get(one) for one in ([device] if single else device)]
@@ -138,10 +138,10 @@ class Rig:
 
     @property
     def sections(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Lengths, EI and GJ (S,) of uniform sections of the free rod from the clamp.
+        """Lengths (m), EI and GJ (N·m²), (S,), of uniform sections from the clamp.
 
-        The carriage holds link 0 by its middle: the first joint stands for the rod
-        from there to the middle of link 1.
+        The clamp is the middle of link 0: the first joint represents the rod from there
+        to the middle of link 1.
         """
         length = float(self.lengths.sum() - self.lengths[0] / 2)
         tips = [device.tip_length for device in self.catheter.devices]
@@ -153,14 +153,15 @@ class Rig:
         return np.diff(places)[::-1], found[0, ::-1], found[1, ::-1]
 
     def add_wall(self, measure: Callable, low, high, friction: float = FRICTION):
-        """Adds a wall that sensors read.
+        """Adds a wall with contact sensors.
 
         Args:
-            measure: Depth behind it between corners `low` and `high` (3,), m, see
-                `Field.sampled`.
+            measure: Depth function of the lumen, see `Field.sampled`.
+            low: (3,) m, lower corner of a box around the lumen.
+            high: (3,) m, upper corner.
             friction: Coulomb coefficient.
         """
-        anatomy = tube(0.04, 1.5e-3)  # whose tree stands for nothing
+        anatomy = tube(0.04, 1.5e-3)  # only its lumen is used
         vars(anatomy)["lumen"] = Field.sampled(measure, np.array(low), np.array(high))
         wall = Phantom(anatomy, friction=friction)
         self.arena.attach(wall)
@@ -175,7 +176,7 @@ class Rig:
         self.add_wall(measure, (-0.05, -0.05, -0.5), (0.05, height, 0.5))
 
     def compile(self, blood: StillBlood | None = None) -> None:
-        """Compiles the model, in blood or in vacuum; fixtures are added before."""
+        """Compiles the model with its fixtures, in blood or in vacuum."""
         if blood is not None:
             size = self.arena.mjcf_model.size
             size.nuserdata = userdata_size([blood], self.catheter)
@@ -211,7 +212,7 @@ class Rig:
         blood.restart(0, Draw(np.zeros(3)), np.random.RandomState(0))
 
     def qpos(self, joint: str) -> float:
-        """Position of a joint of the catheter, by its name in the entity."""
+        """Position (m or rad) of a joint of the catheter, by its name in the entity."""
         return float(self.data.joint(f"{self.name}/{joint}").qpos[0])
 
     def sensor(self, name: str) -> np.ndarray:
@@ -220,25 +221,25 @@ class Rig:
 
     @property
     def joints(self) -> np.ndarray:
-        """Places (n, 3) of the proximal ends of the links, m."""
+        """Positions (n, 3), m, of the proximal ends of the links."""
         last = self.tip_body + 1
         return self.data.xpos[last - len(self.lengths) : last].copy()
 
     @property
     def head_position(self) -> np.ndarray:
-        """Place (3,) of the distal end, m."""
+        """Position (3,), m, of the distal end."""
         return self.data.site_xpos[self.head].copy()
 
     def load_head(self, force=(0.0, 0.0, 0.0), torque=(0.0, 0.0, 0.0)) -> None:
         """Sets the dead load on the distal end, world frame, N and N·m."""
-        # A force on the body, unlike one on the joints, reaches the force sensors.
+        # Force sensors include a force on the body, unlike one on the joints.
         lever = self.head_position - self.data.xipos[self.tip_body]
         load = self.data.xfrc_applied[self.tip_body]
         load[:3] = force
         load[3:] = np.asarray(torque) + np.cross(lever, force)
 
     def step(self, force=None, torque=(0.0, 0.0, 0.0)) -> None:
-        """One time step, under a dead load on the distal end if one is given."""
+        """Does a physics step, under a dead load on the distal end if one is given."""
         if force is not None:
             self.load_head(force, torque)
         mujoco.mj_step(self.model, self.data)
@@ -249,7 +250,7 @@ class Rig:
             self.step(force)
 
     def bend(self, angles: np.ndarray) -> None:
-        """Puts the hinges of the joints to angles (n - 1, 2) about x and y, rad."""
+        """Sets the hinges to angles (n - 1, 2), rad, about x and y."""
         for joint, bends in enumerate(angles.tolist(), start=1):
             for axis, angle in zip("xy", bends, strict=True):
                 self.data.joint(f"{self.name}/bend_{axis}_{joint}").qpos = angle
@@ -263,17 +264,17 @@ class Rig:
         damping: float = RESTING_TIME,
         longest: float = 20.0,
     ) -> None:
-        """Steps, strongly damped, until the device is at rest.
+        """Steps with strong damping until the device is at rest.
 
         Args:
             force: (3,) dead load on the distal end, N; None leaves what is applied.
-            change: At rest no joint moves by more over `RESTING_TIME`, rad and m.
-            damping: Least relaxation time of the hinges until then, s. Damped by its
-                material alone a device swings for minutes.
-            longest: Time until then, s.
+            change: Largest motion of a joint over `RESTING_TIME` at rest, rad or m.
+            damping: Least relaxation time of the hinges while they settle, s. With the
+                damping of its material alone a device oscillates for minutes.
+            longest: Time limit, s.
 
         Raises:
-            RuntimeError: if it is not at rest by then, or the simulation diverges.
+            RuntimeError: if the time limit is reached, or the simulation diverges.
         """
         end, moved = self.data.time + longest, np.inf
         model, before = self.model, self.model.dof_damping.copy()

@@ -17,36 +17,36 @@ from cathsim_dmc.validation.rig import RESTING_TIME, Rig
 CANTILEVER_BOUND = 2.0  # % of the deflection
 BUCKLING_BOUND = 5.0  # % of the load
 TWIST_BOUND = 2.0  # % of the angle
-# How every device of the library settles. The softest, the microcatheter, swings with a
-# period of 7 s (critical damping: 2 over 1.2 rad/s), and its joints never move by less
-# than 5e-6 rad: its head wanders by 0.2 % of the deflection.
+# Criterion of rest for the library. The softest device, the microcatheter, oscillates
+# with a period of 7 s (critical damping: 2 over 1.2 rad/s), and its joints never move
+# by less than 5e-6 rad, which displaces its head by 0.2 % of the deflection.
 LIBRARY_REST: dict[str, Any] = {"change": 1e-5, "damping": 1.5}
 END_ANGLES = (2.0, 15.0, 30.0, 45.0, 60.0)  # degrees
-# Fractions of the load of Euler at which the Southwell plot is taken.
+# Fractions of Euler's load at which the Southwell plot is taken.
 SOUTHWELL_FRACTIONS = np.array([0.5, 0.6, 0.7, 0.8, 0.9])
-# Columns of fewer links, whose load is off by π²/12n² (sliding), π²/3n² (fixed).
+# Columns of few links n, whose load deviates by π²/12n² (sliding), π²/3n² (fixed).
 SHORT_COLUMNS = {"sliding": (4, 6, 9), "fixed": (8, 10, 12)}
 _TURNING = 4.0  # s, until the lag is steady
 TORSION_JOINTS = 4  # default of the tasks with rotation
 TWIST = 0.35  # rad, of the whole device under the end torque; lag of the braked tip
-JAM = 3.0  # N
+JAM = 3.0  # N, load of a drive
 HOLD_BOUND = 0.1  # mm in 10 s
 SPEED_BOUND = 1.0  # % of the command
 SLIP_BOUND = 2.0  # % of the stated force
-_MIDDLE = 0.25  # m, of the stroke
+_MIDDLE = 0.25  # m, middle of the stroke
 
 
 class Cantilever(NamedTuple):
-    """A cantilever under end load, simulated and as elastica."""
+    """A cantilever under end load: simulation and elastica."""
 
     end_angle: float  # of the elastica, rad
-    # (n + 1, 2), axial and transverse places of joints and head from the clamp on, m.
+    # (n + 1, 2), axial and transverse coordinates of joints and head from the clamp, m.
     simulated: np.ndarray
     expected: theory.Elastica
-    deviation: float  # of the displacement of the end, per displacement of the end
+    deviation: float  # relative deviation of the displacement of the end
 
     def check(self, what: str = "") -> Check:
-        """Its deviation from the elastica."""
+        """Check of the deviation from the elastica."""
         angle, end = np.degrees(self.end_angle), 1e3 * self.expected.position[-1, 1]
         name = f"cantilever, {what + ', ' if what else ''}end at {angle:.0f}°"
         note = f"{1e3 * self.expected.force:.3g} mN, deflection {end:.1f} mm"
@@ -62,13 +62,13 @@ def cantilevers(
     gaps: Sequence[float] | None = None,
     **rest: float,
 ) -> list[Cantilever]:
-    """Loads the end of straight devices across and compares it with the elastica.
+    """Loads the end of a straight device laterally and compares it with the elastica.
 
     Args:
         device: see `Rig`, as are `discretisation` and `gaps`.
-        end_angles: of the elastica's end, degrees; they set the forces.
+        end_angles: end angles of the elastica, degrees, which determine the forces.
         plane: direction of the force about the axis, rad; π/4 bends all hinges.
-        **rest: how it settles under each force, see `Rig.settle`.
+        **rest: criterion of rest under each force, see `Rig.settle`.
     """
     rig = Rig(device, discretisation, straight=True, gaps=gaps)
     rig.compile()
@@ -81,7 +81,7 @@ def cantilevers(
         rig.settle(shape.force * across, **rest)
         moved = rig.head_position - unloaded
         expected = shape.position[-1] - (total, 0.0)
-        # What leaves the plane of the load is an error too.
+        # Displacement out of the plane of the load is an error too.
         axes = [0.0, 0.0, 1.0], across, np.cross([0, 0, 1], across)
         error = np.array([moved @ axis for axis in axes])
         error[:2] -= expected
@@ -99,11 +99,11 @@ class Buckling(NamedTuple):
     length: float  # of the column, m
     load: np.ndarray  # (n,), axial loads, N
     deflection: np.ndarray  # (n,), additional deflection under the axial load, m
-    critical: float  # load from the plot, N
-    expected: float  # load of Euler, N
+    critical: float  # critical load from the plot, N
+    expected: float  # Euler's load, N
 
     def check(self, name: str) -> Check:
-        """Its critical load against Euler's."""
+        """Check of the critical load against Euler's."""
         name = f"{name}, clamped - guided, guide {self.end}"
         note = f"{1e3 * self.critical:.2f} mN, Euler {1e3 * self.expected:.2f} mN "
         note += f"over {1e3 * self.length:.0f} mm"
@@ -116,13 +116,13 @@ def buckling(
 ) -> Buckling:
     """Measures the critical load of a clamped-guided chain by a Southwell plot.
 
-    The carriage clamps link 0; a guide that cannot turn holds another link by its
-    middle. A sideways force bends the column a little; under an axial load P the
+    The carriage clamps link 0; a guide that cannot rotate holds another link in its
+    middle. A lateral force bends the column a little. Under an axial load P the
     deflection grows by w, and w/P over w is a line of slope 1/P_cr (Southwell 1932).
 
     Args:
-        end: "sliding" lets the guide move sideways, "fixed" holds it on the axis.
-        joints: between the two links; None for the whole shaft.
+        end: "sliding" lets the guide move laterally, "fixed" holds it on the axis.
+        joints: number of joints between the two links; None for the whole shaft.
         device: see `Rig`.
     """
     rig = Rig(device, straight=True)
@@ -130,7 +130,7 @@ def buckling(
     last = joints or int(np.argmin(rig.lengths > rig.lengths[0] - 1e-9)) - 1
     middles = np.cumsum(rig.lengths) - rig.lengths / 2
     length, stiffness = middles[last] - middles[0], float(rig.sections[1][0])
-    # Euler's load of a column whose end keeps its direction.
+    # Euler's load of a column with a guided end.
     expected = (4 if end == "fixed" else 1) * np.pi**2 * stiffness / length**2
     root = rig.arena.mjcf_model
     place = middles[last] - rig.lengths[last] / 2 - rig.lengths.sum()
@@ -165,10 +165,10 @@ def buckling(
 def twist_under_torque(
     device: str = "steerable_5f", torsion_joints: int = TORSION_JOINTS
 ) -> tuple[float, float]:
-    """Torque (N·m) that GJ turns by `TWIST`, and angle (rad) of the end under it."""
+    """Torque (N·m) for a twist of `TWIST` by theory, and simulated twist (rad)."""
     rig, compliance = _torsion_rig(device, torsion_joints)
     torque = TWIST / compliance
-    # The motor of the base is a speed servo: the base creeps, so wait for a time.
+    # The base creeps on its speed servo, so the rig runs for a fixed time.
     rig.load_head(torque=(0, 0, torque))
     rig.run(12 * RESTING_TIME)
     return torque, _twist(rig)
@@ -190,7 +190,7 @@ class TwistLag(NamedTuple):
 
     @property
     def rises(self) -> tuple[float, float]:
-        """Times (s) at which the lags first meet 1 - 1/e of their final values."""
+        """Rise times (s) to 1 - 1/e of the final lag, simulated and expected."""
         curves, found = (self.base - self.tip, self.expected), []
         for lag, last in zip(curves, self.lags, strict=True):
             level = (1 - np.exp(-1)) * last
@@ -222,14 +222,14 @@ def twist_lag() -> TwistLag:
         rows.append((base, base + _twist(rig)))
     base, tip = np.array(rows).T
     decay = np.exp(-timestep / (brake * compliance + rig.device.relaxation_time))
-    # The motor takes some 20 ms to its speed; the lag is driven by what it does.
+    # The motor needs some 20 ms to its speed, so theory takes the simulated motion.
     final = brake * compliance * np.diff(base) / timestep
     lag = lfilter([1 - decay], [1, -decay], final)
     return TwistLag(timestep * np.arange(len(base)), base, tip, np.append(0.0, lag))
 
 
 def _torsion_rig(device: str, torsion_joints: int) -> tuple[Rig, float]:
-    """A straight device whose base turns, and its compliance Σ(l/GJ), rad/N·m."""
+    """A straight device with rotation, and its compliance Σ(l/GJ), rad/(N·m)."""
     discretisation = devices.Discretisation(torsion_joints=torsion_joints)
     rig = Rig(device, discretisation, straight=True, rotation=True)
     rig.compile()
@@ -238,8 +238,8 @@ def _torsion_rig(device: str, torsion_joints: int) -> tuple[Rig, float]:
 
 
 def _twist(rig: Rig) -> float:
-    """Angle of the tip about the axis against the base, rad."""
-    # A step leaves the poses of its start.
+    """Angle (rad) of the tip about the axis relative to the base."""
+    # After a step, body poses are those of its start.
     mujoco.mj_kinematics(rig.model, rig.data)
     base = rig.data.body(f"{rig.name}/link_0").xmat.reshape(3, 3)
     relative = base.T @ rig.data.xmat[rig.tip_body].reshape(3, 3)
@@ -258,7 +258,7 @@ class Driven:
         self.drives = hold(rig.model, rig.data)
 
     def move(self, duration: float, command: float, force: float) -> float:
-        """Moves the base for a time (s), pushed back by a force (N); its way, m."""
+        """Moves the base for a time (s) against a force (N); returns its travel, m."""
         start = self.rig.qpos("insertion")
         for _ in range(round(duration / CONTROL_TIMESTEP)):
             self.drives.follow(np.array([[command]]))
@@ -269,7 +269,7 @@ class Driven:
 
 
 def slip_force() -> float:
-    """Least force (N) on a base at rest at which its clamp slips, to 0.5 %."""
+    """Least force (N) at which the clamp of a resting base slips, to 0.5 %."""
     for force in chain.MAX_PUSH_FORCE * np.arange(0.9, 1.1, 0.005):
         driven = Driven()
         driven.move(0.4, 0.0, 0.9 * force)
@@ -280,7 +280,7 @@ def slip_force() -> float:
 
 
 def _checks(data: dict[str, Any]) -> Iterator[Check]:
-    """Checks of the rod; measurements for the figure are put into `data`."""
+    """Checks of the rod; measurements for figures are added to `data`."""
     data["cantilevers"] = cantilevers()
     yield from (one.check() for one in data["cantilevers"])
     worst, device = max(

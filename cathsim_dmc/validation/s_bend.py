@@ -1,6 +1,6 @@
-"""Push force of a device that has stopped in an S-bend, and how it creeps away.
+"""Push force of a device that has stopped in an S-bend, and its loss by creep.
 
-The reference is an elastica of its own in the same tube, whose every contact slides.
+The reference is an independent elastica in the same tube with sliding contacts.
 """
 
 import dataclasses
@@ -25,22 +25,22 @@ STOPPED_BOUND = 5.0  # % of the push force
 WALL_BOUND = 5.0  # % of the sum of the forces on the wall
 CREEP_BOUND = 5.0  # % of the push force, in `_HELD`
 BEND, ANGLE, TUBE = 0.04, np.pi / 3, 3e-3  # m, rad, m
-# Longer links push wrongly in a bend without friction (docs/limits.md).
+# Longer links have a wrong push force in a bend without friction (docs/limits.md).
 LINK = 5e-3  # m
-# Ways of the head before the bend, and of the base, after which the head is in the
-# second arc; of the rod behind the bend, m.
+# m: distance of the head before the bend; travel of the base, after which the head is
+# in the second arc; length of rod behind the bend.
 _BEFORE, _PUSH, _BEHIND = 0.01, 0.056, 0.03
-_RESTING, _HELD = 1.0, 1.0  # s
-# Time over whose end a push force at rest is averaged, s: single steps scatter by some
-# %, and a change of the speed by 1e-8 of it takes another of them.
+_RESTING, _HELD = 1.0, 1.0  # s, from the stop to rest, and from there to the end
+# Last part of a rest over which the push force is averaged, s: single steps scatter by
+# some %, and even a change of the speed by 1e-8 of it changes them.
 _READ = 0.4
-_PIECE = 1e-3  # m, of the reference
-# Stiffness of the wall of the reference, N/m for each piece, which it takes in steps.
+_PIECE = 1e-3  # m, length of a piece of the reference
+# Stiffness of the wall of the reference, N/m for each piece, raised in steps.
 _WALLS = (0.5, 5.0, 50.0, 500.0)
 
 
 class _Line:
-    """The axis of an S-bend in the plane of x and z, between straight ends."""
+    """Axis of an S-bend in the plane of x and z, between straight ends."""
 
     def __init__(self, start: float):
         """Begins the bend at z = start, m."""
@@ -50,7 +50,7 @@ class _Line:
         self._centres = self._start + (BEND, 0.0), self._end - (BEND, 0.0)
 
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Offsets (...) to the right of points (..., 2), m, and tangents (..., 2)."""
+        """Offsets (...), m, to the right of points (..., 2), m; tangents (..., 2)."""
         across = points - self._middle
         second = across[..., 0] * np.sin(ANGLE) + across[..., 1] * np.cos(ANGLE) > 0
         straight = np.where(second, self._end[0], 0.0)
@@ -72,11 +72,11 @@ class Stopped(NamedTuple):
     """Forces of a device in an S-bend, N."""
 
     moving: float  # in the last control step of the push
-    stopped: float  # at rest, mean
-    held: float  # some time later, mean
-    expected: float  # push force of the rod whose contacts slide
+    stopped: float  # mean at rest
+    held: float  # mean some time later
+    expected: float  # push force of the reference
     wall: float  # sum over all contacts at rest
-    expected_wall: float  # of that rod
+    expected_wall: float  # the same of the reference
 
 
 def stopped(
@@ -88,10 +88,10 @@ def stopped(
     """Pushes a device into an S-bend, stops it, and waits.
 
     Args:
-        speed: Of the base, m/s.
+        speed: Speed of the base, m/s.
         friction: Coulomb coefficient.
         later: Time from rest to the last reading, s.
-        tolerance: Of the solver.
+        tolerance: Tolerance of the solver.
     """
     uniform = dataclasses.replace(
         devices.STEERABLE_5F,
@@ -117,7 +117,7 @@ def stopped(
     motor = rig.data.actuator(f"{rig.name}/insertion")
 
     def push(command: float, duration: float) -> float:
-        """Push force at the end, at rest its mean over `_READ`, N."""
+        """Push force, N, in the last control step; at rest its mean over `_READ`."""
         found = [0.0]
         for _ in range(round(duration / CONTROL_TIMESTEP)):
             drives.follow(np.array([[command]]))
@@ -136,10 +136,11 @@ def stopped(
 
 
 def _reference(rig: Rig, line: _Line, friction: float) -> tuple[float, float]:
-    """Axial and wall force of a uniform rod that slides on where the device is, N.
+    """Axial and wall force, N, of a uniform rod that slides at the place of the device.
 
-    Pieces of a length h have the angles θ and end at p. With forces f on the ends, the
-    work of EI θ'' h and that of f vanish for each angle, h (cos θ, -sin θ)·Σf.
+    Pieces of length h have angles θ, and forces f act on their distal ends. For each
+    angle the virtual work vanishes: EI θ'' h balances h (cos θ, -sin θ)·Σf, the sum
+    over the ends of this piece and those beyond it.
     """
     lengths, stiffness, _ = rig.sections
     base = rig.lengths[0] / 2 - rig.lengths.sum() + rig.qpos("insertion")
@@ -152,7 +153,7 @@ def _reference(rig: Rig, line: _Line, friction: float) -> tuple[float, float]:
     later = np.maximum.outer(np.arange(count), np.arange(count))
 
     def balance(angles: np.ndarray, wall: float):
-        """Moments (n,), their rates (n, n) on a flat wall, Σf (2,) and Σ|f|."""
+        """Moments (n,), their Jacobian (n, n) on a flat wall, Σf (2,) and Σ|f|."""
         steps = piece * np.stack([np.sin(angles), np.cos(angles)], axis=-1)
         across = steps[:, ::-1] * (1, -1)
         offset, tangent = line.nearest(np.cumsum(steps, axis=0) + (0.0, base))
@@ -189,7 +190,7 @@ def _push(one: Stopped, friction: float, speed: float, solved: str = "") -> Chec
 
 
 def checks() -> Iterator[Check]:
-    """Push forces after a stop, and what is left of the last one."""
+    """Checks of push forces after a stop, and of creep in the last case."""
     for friction, speed in itertools.product(FRICTIONS, SPEEDS):
         strict = stopped(speed, friction, tolerance=STRICT)
         yield _push(strict, friction, speed, ", strict solver")

@@ -1,4 +1,4 @@
-"""What the sheath does to a device: compliance beyond its mouth, force at the base."""
+"""Device in a sheath: compliance beyond the mouth, force at the base."""
 
 from collections.abc import Iterator
 
@@ -18,19 +18,19 @@ from cathsim_dmc.validation.rig import Rig
 FREE = np.arange(0.03, 0.101, 0.01)  # m of the device beyond the mouth
 COMPLIANCE_BOUND = 5.0  # % of the deflection
 SPEEDS = (0.0, 0.01, 0.04)  # m/s
-PULL, ASIDE = 0.1, 2e-3  # N on the head, along the sheath and across
+PULL, ASIDE = 0.1, 2e-3  # N on the head, along the sheath and lateral
 FORCE_BOUND = 2.0  # % of the pull
 _LENGTH, _STROKE = 0.3, 0.13  # m
-_BENT = 0.05  # deflection by free length
-_START, _WAY = 0.04, 0.06  # m beyond the mouth, and from there
+_BENT = 0.05  # deflection relative to the free length
+_START, _WAY = 0.04, 0.06  # m: length beyond the mouth, and travel from there
 _RESTING = 2.0  # s
 
 
 class _Guided:
-    """A device in a straight sheath, from whose mouth it comes out by its insertion."""
+    """A device in a sheath; its length beyond the mouth is the insertion."""
 
     def __init__(self, line: np.ndarray | None):
-        """Holds the device by its hinges, or by a bore along a line (n, 3), m."""
+        """Holds the device by its hinges, or in a bore along a line (n, 3), m."""
         division = devices.Discretisation(_LENGTH)
         self.rig = rig = Rig("steerable_5f", division, stroke=_STROKE, straight=True)
         if line is not None:
@@ -42,7 +42,7 @@ class _Guided:
         self._held, self._line = Held(rig.model, rig.catheter, places, 0.0), line
 
     def put(self, insertion: float) -> None:
-        """Puts the device along the line to an insertion, m."""
+        """Places the device along the line at an insertion, m."""
         self.rig.data.qpos[:] = self.rig.data.qvel[:] = 0.0
         self.rig.data.joint(f"{self.rig.name}/insertion").qpos = insertion
         if self._line is not None:
@@ -61,11 +61,11 @@ class _Guided:
 
 
 def deflection(free: float, bore: np.ndarray | None = None) -> tuple[float, float]:
-    """Deflection of the head under a force across, and that of a clamped rod, m.
+    """Deflection of the head under a lateral force, and that of a clamped rod, m.
 
     Args:
         free: Length of the device beyond the mouth, m.
-        bore: Line of a bore, m; None for a sheath that holds the device.
+        bore: Line (n, 3) of a bore, m; None for a straight sheath that holds hinges.
     """
     guided = _Guided(bore)
     rig = guided.rig
@@ -76,17 +76,17 @@ def deflection(free: float, bore: np.ndarray | None = None) -> tuple[float, floa
     parts = ((free - ends[1:]) ** 3 - (free - ends[:-1]) ** 3) / (3 * stiffness[::-1])
     force = _BENT * free / parts.sum()
     places = []
-    for way in (1.0, -1.0):  # the middle of the play is no deflection
+    for way in (1.0, -1.0):  # both ways, so that the play cancels
         rig.settle((way * force, 0.0, 0.0), change=1e-5, longest=60.0)
         places.append(rig.head_position[0])
     return float(places[0] - places[1]) / 2, _BENT * free
 
 
 def base_force(speed: float, bore: np.ndarray | None = None) -> float:
-    """Force of the base on a device whose head is pulled by `PULL`, bent aside, N.
+    """Axial force at the base, N, while the head is pulled by `PULL` and `ASIDE`.
 
     Args:
-        speed: With which the base is moved on, m/s; 0 for rest.
+        speed: Speed of the base, m/s; 0 for rest.
         bore: See `deflection`; the pull is along its end.
     """
     guided = _Guided(bore)
@@ -109,7 +109,7 @@ def base_force(speed: float, bore: np.ndarray | None = None) -> float:
 
 
 def checks() -> Iterator[Check]:
-    """Compliance beyond the mouth, and force at the base."""
+    """Checks of the compliance beyond the mouth and of the force at the base."""
     for free in FREE:
         found, expected = deflection(free)
         name = f"sheath, {1e3 * free:.0f} mm beyond its mouth: deflection"

@@ -1,4 +1,4 @@
-"""Closed forms for slender rods: elastica, and EI of a device along it."""
+"""Theory of slender rods: elastica, and EI along coaxial devices."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,7 +15,7 @@ class Elastica(NamedTuple):
     """Shape of a clamped rod under a dead transverse force at its free end."""
 
     force: float  # N
-    position: np.ndarray  # (n, 2), axial and transverse, from the clamp on, m
+    position: np.ndarray  # (n, 2), axial and transverse coordinates from the clamp, m
 
 
 def elastica(lengths: ArrayLike, stiffnesses: ArrayLike, end_angle: float) -> Elastica:
@@ -23,16 +23,16 @@ def elastica(lengths: ArrayLike, stiffnesses: ArrayLike, end_angle: float) -> El
 
     The equation is EI θ'' = -F cos θ with θ = 0 at the clamp and θ' = 0 at the end
     (Love, A Treatise on the Mathematical Theory of Elasticity, ch. XIX). It is
-    integrated from the end to the clamp; the force is the one that meets the clamp.
+    integrated from the end to the clamp, and the force is found by shooting.
 
     Args:
-        lengths: (S,) of uniform sections from the clamp to the free end, m.
-        stiffnesses: (S,) EI, N·m².
+        lengths: (S,) lengths of uniform sections from the clamp to the free end, m.
+        stiffnesses: (S,) bending stiffness EI of the sections, N·m².
     """
     lengths, stiffnesses = np.asarray(lengths)[::-1], np.asarray(stiffnesses)[::-1]
 
     def shape(force):
-        # θ, M and the place relative to the end, along t, the way from the end.
+        # θ, M and the position relative to the end, by the arc length t from the end.
         rows = [np.array([end_angle, 0.0, 0.0, 0.0])]
         for length, stiffness in zip(lengths, stiffnesses, strict=True):
 
@@ -56,12 +56,12 @@ def elastica(lengths: ArrayLike, stiffnesses: ArrayLike, end_angle: float) -> El
 def profile(
     devices: Sequence[Device], gaps: ArrayLike, places: np.ndarray
 ) -> np.ndarray:
-    """EI, GJ and curvature (3, K, n) of coaxial devices, 0 beyond their ends.
+    """EI, GJ (N·m²) and curvature (1/m), (3, K, n), of coaxial devices; 0 beyond ends.
 
     Args:
-        devices: K, not turned.
-        gaps: (K,), from the end of each to that of the chain, m.
-        places: (n,), from the end of the chain, m.
+        devices: K devices, which are not rotated.
+        gaps: (K,) distances from their ends to that of the chain, m.
+        places: (n,) distances from the end of the chain, m.
     """
     found = np.zeros((3, len(devices), len(places)))
     for k, (device, gap) in enumerate(zip(devices, np.asarray(gaps), strict=True)):

@@ -1,6 +1,6 @@
-"""Coaxial devices against two rods of one shape, each with its own twist.
+"""Coaxial devices against two rods with a common shape, each with its own twist.
 
-The reference shares no code with the model but the devices' data.
+The reference shares only the data of the devices with the model, no code.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,12 +23,12 @@ from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import Rig, half_circle, in_tube
 
-_FINE = 0.5e-3  # m
-BEND_RADIUS = 0.04  # m, of half a circle in which the pairs are held
-_HELD = 1e6  # kg·m², armature of a hinge that does not move
-_STEP = 1e-3  # m, by which a device slides for the derivative of the energy
+_FINE = 0.5e-3  # m, length of a piece of the reference
+BEND_RADIUS = 0.04  # m, of the half circle in which the pairs are held
+_HELD = 1e6  # kg·m², armature that fixes a hinge
+_STEP = 1e-3  # m, step of the derivative of the energy by sliding
 # Devices from the innermost outwards, distances of their ends from the chain's end (m),
-# rotations of their bases (rad), length beyond the half circle (m), which ends at a
+# rotations of their bases (rad), and length beyond the half circle (m), whose end is a
 # joint.
 CASES = (
     (("wire_035_glide", "berenstein_5f"), (0.10, 0.0), (0.8, -0.5), 0.07),
@@ -38,7 +38,7 @@ CASES = (
 TIP_BOUND = 1.0  # % of the length
 ROTATION_BOUND = 3.0  # °
 WORKING = ("wire_035_glide", "diagnostic_5f_simmons")
-# Free devices, and distances of their ends from the chain's end (m).
+# Unconstrained devices, and distances of their ends from the chain's end (m).
 SLIDES = (
     (("wire_035_glide", "berenstein_5f"), (0.0155, 0.0)),
     (("wire_035_glide", "berenstein_5f"), (0.0, 0.018)),
@@ -47,18 +47,18 @@ SLIDES = (
 )
 SLIDE_TURN = 0.6  # rad, of the base of the outer device
 RESISTANCE_BOUND = 5.0  # %
-WITHDRAWN = 0.02  # m, of the wire, at two speeds (m/s)
-SPEEDS = (1e-3, 5e-4)
+WITHDRAWN = 0.02  # m, by which the wire is withdrawn at each of `SPEEDS`
+SPEEDS = (1e-3, 5e-4)  # m/s
 _WIDE = 0.275, 0.07  # m, length and radius of a tube that nothing touches
 
 
 class Rods(NamedTuple):
-    """Devices in equilibrium."""
+    """Equilibrium of K devices."""
 
-    rotation: np.ndarray  # (K,), of the ends of the devices, rad
-    end: np.ndarray  # (3,), of the chain from its base, m
-    energy: float = np.nan  # of the reference, N·m
-    force: np.ndarray = np.zeros(0)  # (K,), axial, on simulated bases, N
+    rotation: np.ndarray  # (K,), rotations of the ends of the devices, rad
+    end: np.ndarray  # (3,), end of the chain from its base, m
+    energy: float = np.nan  # energy of the reference, J
+    force: np.ndarray = np.zeros(0)  # (K,), axial forces on simulated bases, N
 
 
 def reference(
@@ -71,18 +71,18 @@ def reference(
     """Minimises bending and twist energy of devices that share one shape.
 
     Args:
-        devices: K, from the innermost outwards.
-        gaps: (K,), m.
-        rotation: (K,), of their bases, rad.
-        length: of the chain, m.
-        held: (n,) complex, given curvatures of the first n pieces of `_FINE`, 1/m.
+        devices: K devices, from the innermost outwards.
+        gaps: (K,) distances from their ends to that of the chain, m.
+        rotation: (K,) rotations of their bases, rad.
+        length: Length of the chain, m.
+        held: (n,) complex, prescribed curvatures of the first n pieces, 1/m.
     """
     count = round(length / _FINE)
     places = length - (np.arange(count) + 0.5) * _FINE
     given = np.zeros(0, complex) if held is None else held
     bending, torsion, own = theory.profile(devices, gaps, places)
     free, shape = count - len(given), (len(devices), count)
-    # Unknowns scaled by the roots of the stiffnesses: the energy is well conditioned.
+    # Unknowns are scaled by the roots of the stiffnesses, which conditions the energy.
     scales = np.sqrt(_FINE * np.where(torsion > 0, torsion, 1e-6))
     root = np.sqrt(_FINE * bending.sum(axis=0)[len(given) :])
     base = np.asarray(rotation, float)[:, None]
@@ -114,7 +114,7 @@ def reference(
 
 
 def _end(curvature: np.ndarray) -> np.ndarray:
-    """End (3,) of a curve whose frame does not twist, m."""
+    """End (3,), m, of a curve with complex curvatures (n,), 1/m, without twist."""
     frame, place = Rotation.identity(), np.zeros(3)
     for bend in curvature:
         half = Rotation.from_rotvec(np.array([-bend.imag, bend.real, 0]) * _FINE / 2)
@@ -130,10 +130,11 @@ def simulate(
     beyond: float | None = None,
     duration: float = 12.0,
 ) -> Rods:
-    """Lets a chain come to rest, free or held along half a circle; see `reference`.
+    """Simulates a chain to rest, free or held along a half circle; see `reference`.
 
     Args:
-        beyond: free length of the chain after the half circle, m; None where all is.
+        beyond: Free length of chain after the half circle, m; None for a free chain.
+        duration: Simulated time, s.
     """
     rig = Rig(names, lumen_friction=0.0)
     rig.compile()
@@ -143,12 +144,12 @@ def simulate(
     hinges = rig.data.qpos[places.qpos : places.qpos + 2 * len(stack.spans)]
     fields = chain_fields.fields_of(lambda name: getattr(rig.model, name))
     if beyond is not None:
-        # Straight, half a circle, and straight.
+        # A straight part, a half circle, and a straight part.
         start = stack.nodes[0] - beyond - np.pi * BEND_RADIUS
         line = np.vstack([[[0, 0, 0]], half_circle(BEND_RADIUS, start, 1999)])
         line = np.vstack([line, line[-1:] - (0, 0, 1)])
         rig.bend(posture.joints_along(rig.lengths, line))
-        # Joints before the end of the half circle and at it do not move.
+        # Joints up to the end of the half circle are fixed.
         held = 2 * int((stack.nodes[1:-1] > beyond - 1e-6).sum())
         start = int(rig.model.jnt_dofadr[rig.model.joint(f"{rig.name}/bend_x_1").id])
         rig.model.dof_armature[start : start + held] = _HELD
@@ -172,7 +173,10 @@ def simulate(
 
 
 def work(speed: float) -> tuple[float, float]:
-    """Withdraws a wire (m/s) from a free catheter, without friction and weight.
+    """Withdraws a wire from an unconstrained catheter, without friction and gravity.
+
+    Args:
+        speed: Speed of the wire, m/s.
 
     Returns:
         Work of the drives, and change of the energy by `reference`, J.
@@ -200,7 +204,7 @@ def work(speed: float) -> tuple[float, float]:
 
 
 def in_half_circle(names, gaps, rotation, beyond: float) -> tuple[Rods, Rods, float]:
-    """Devices held in half a circle, as in `simulate`; their reference; length, m."""
+    """Simulation and reference of devices held in a half circle; their length, m."""
     entity = DeviceStack(names)
     length = float(entity.link_lengths.sum())
     held = np.zeros(round((length - beyond) / _FINE), complex)
@@ -210,7 +214,7 @@ def in_half_circle(names, gaps, rotation, beyond: float) -> tuple[Rods, Rods, fl
 
 
 def checks() -> Iterator[Check]:
-    """Pairs held in half a circle, and the axial force of a bend."""
+    """Checks of pairs held in a half circle, and of the axial force of a bend."""
     for case in CASES:
         names, gaps, rotation, beyond = case
         found, expected, length = in_half_circle(names, gaps, rotation, beyond)

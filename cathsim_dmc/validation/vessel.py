@@ -32,16 +32,16 @@ FLOW_BOUND = 2.0  # %
 VOLUME_BOUND = 1e-9  # of the inflow
 PROFILE_BOUND = 1e-6  # of the mean velocity
 CROSS_FLOWS = (0.1, 0.4)  # m/s
-FORCES = (1e-4, 5e-3)  # N
+FORCES = (1e-4, 5e-3)  # N, on a free link
 RADII, MODULI = (4.4e-3, 0.014), (0.45e6, 2e6)  # m, Pa
 SLOPE_BOUND = 5.0  # %
 
 
 def cantilever(speed: float) -> tuple[float, float]:
-    """Deflection of the end of a cantilever in a uniform cross-flow, m, and expected.
+    """Deflection (m) of a cantilever's end in a cross-flow (m/s), and expected one.
 
-    The elastica bears ½ρ d C_d(Re) u² per length across its axis, u the velocity of the
-    blood across it.
+    The expected elastica has the normal load ½ρ d C_d(Re) u² per length, where u is the
+    velocity of the blood normal to its axis.
     """
     blood = StillBlood()
     rig = damping.cantilever(blood)
@@ -52,7 +52,7 @@ def cantilever(speed: float) -> tuple[float, float]:
     bending, diameter = one.shaft.bending_stiffness, 2 * one.outer_radius
 
     def change(s, state):
-        # Angle from the axis at rest, moment / EI, shear and tension, deflection.
+        # State: angle from the axis at rest, moment / EI, shear, tension, deflection.
         angle, curvature, shear, tension, _ = state
         pull = -drag(speed * np.cos(angle), diameter) - tension * curvature
         bend, along = -shear / bending, shear * curvature
@@ -67,7 +67,7 @@ def cantilever(speed: float) -> tuple[float, float]:
 
 
 def terminal_velocity(force: float) -> tuple[float, float]:
-    """Velocity of a free link under a force (N) across its axis, m/s, and expected."""
+    """Velocity (m/s) of a free link under a lateral force (N), and expected one."""
     from cathsim_dmc.physics import adapters, dispatcher
 
     radius = devices.get("steerable_5f").outer_radius
@@ -92,7 +92,7 @@ def terminal_velocity(force: float) -> tuple[float, float]:
 
 
 def volume_defect(anatomy: Anatomy) -> float:
-    """Largest flow lost at a junction at any phase, over the largest inflow."""
+    """Largest flow lost at a junction at any phase, relative to the largest inflow."""
     circulation, tree = anatomy.circulation, anatomy.tree
     beats = np.array([beat(phase) for phase in np.linspace(0.0, 1.0, 101)])
     worst = 0.0
@@ -111,7 +111,7 @@ def volume_defect(anatomy: Anatomy) -> float:
 
 
 def profile() -> tuple[float, float]:
-    """Profile in a straight tube: deviation over the mean, and flow over prescribed."""
+    """Error of the velocity profile in a tube over the mean; flow over the inflow."""
     radius = 0.01
     circulation = tube(0.2, radius).circulation
     places, weights = np.polynomial.legendre.leggauss(64)
@@ -128,7 +128,7 @@ def profile() -> tuple[float, float]:
 def indentation(
     kind: str, radius: float, modulus: float, loads: Sequence[float] | np.ndarray
 ) -> np.ndarray:
-    """Depths (n,), m, to which loads (n,), N, press a "sphere" or a "capsule".
+    """Penetration depths (n,), m, of a "sphere" or "capsule" under loads (n,), N.
 
     It lies along a tube with a radius, m, and a wall of 1.5 mm with a modulus, Pa.
     """
@@ -156,7 +156,7 @@ def indentation(
 
 
 def stiffened(factor: float) -> float:
-    """Change of the joints, rad, in a push against a wall of a stiffer aorta."""
+    """Largest difference of a joint position between a rigid and a stiffened wall."""
     found = []
     for vessel in ("rigid", {"wall": {"modulus": factor * MODULI[0]}}):
         batch = BatchSimulation(suite.make_task("simple1_bca", vessel=vessel), 1)
@@ -187,7 +187,7 @@ def _checks() -> Iterator[Check]:
     yield Check.deviation(
         "flow through a section, integral of the profile", flow, 1.0, 1e-6
     )
-    # A capsule that lies along the tube touches with both ends.
+    # A capsule along the tube has a contact at each end.
     shapes = (("sphere", 1), ("capsule", 2))
     for (kind, ends), radius, modulus in itertools.product(shapes, RADII, MODULI):
         expected = ends * stiffness(radius, Material(modulus, 1.5e-3, 1.0))
@@ -202,5 +202,5 @@ def _checks() -> Iterator[Check]:
 
 
 def validate_vessel() -> Report:
-    """Checks what `vessel` does to blood and wall."""
+    """Runs every check of the option `vessel`: flow, compliant and moving wall."""
     return Report("vessel", list(_checks()))

@@ -1,4 +1,4 @@
-"""`cathsim validate wall`: wall against lumen, friction that acts, convergence."""
+"""`cathsim validate wall`: field against lumen, acting friction, convergence."""
 
 import itertools
 
@@ -16,38 +16,38 @@ from cathsim_dmc.laws.field import BEHIND, FREE
 from cathsim_dmc.validation import convergence, friction, pressed, s_bend
 from cathsim_dmc.validation.checks import Check, Report
 
-# Bounds (mm) on the difference between the field and the distance that it stands for,
-# at the 99th percentile of places within 1 mm of the wall: of a union of tubes, and of
-# a surface, at whose edges the distance has edges too, which a lattice rounds.
+# Bounds (mm) on the error of the field, 99th percentile of points within 1 mm of the
+# wall: for a union of tubes, and for a surface. The distance to a surface has edges at
+# its edges, which a lattice rounds.
 ERROR_TREE, ERROR_SURFACE = 0.02, 0.20
 LARGEST_FIELD = 5.0  # MB
 ARCHES = ("type1", "type2")
 _NEAR_WALL = 1e-3  # m
-_PLACES = 20_000
-# m around an inlet, where a cap or nothing may be the wall.
+_PLACES = 20_000  # sample points
+# m around an inlet that is left out: its wall may be a cap.
 _AT_INLET = 2e-3
-_DEEPEST = -0.5e-3  # m, depth of a place outside of the lumen
-# m, difference, and slope of the clearance, that make a wall another one. The slope of
-# a distance is 1.
+_DEEPEST = -0.5e-3  # m, least depth of the points that are compared
+# Error, m, and slope of the clearance, above which it is that of another wall. The
+# slope of a distance is 1.
 _OFF, _STEEPEST = 0.4e-3, 1.5
 _HOLE = 2e-3  # m, radius of the hole that a sheath leaves in a cap
 
-# Places (n, 3) m at a wall, and their exact depths (n,), m.
+# Points (n, 3) m near a wall, and their exact depths (n,), m.
 Places = tuple[np.ndarray, np.ndarray]
 
 
 def field_error(anatomy: Anatomy, places: Places | None = None) -> np.ndarray:
-    """Difference (n,) between field and exact depth within 1 mm of the wall, m."""
+    """Errors (n,), m, of the field at points within 1 mm of the wall."""
     points, exact = _near_wall(anatomy) if places is None else places
     found = anatomy.lumen(points, free=True)
     return np.abs(found - exact)[found < FREE]
 
 
 def without_wall(anatomy: Anatomy, places: Places | None = None) -> int:
-    """Places at the wall, away from the inlet, where a device meets another one.
+    """Number of points near the wall, away from the inlet, with a wrong wall.
 
-    The clearance is that of the simulation, with a cap that has a hole for the sheath.
-    It differs there from the depth of the lumen, or is steeper than a distance.
+    There the clearance of the simulation, with a cap that has a hole for the sheath,
+    differs from the depth of the lumen or is steeper than a distance.
     """
     points, exact = _near_wall(anatomy) if places is None else places
     looked_at = exact > _DEEPEST
@@ -66,7 +66,7 @@ def without_wall(anatomy: Anatomy, places: Places | None = None) -> int:
 
 
 def _near_wall(anatomy: Anatomy) -> Places:
-    """Places (n, 3) m within 1 mm of the wall, and their exact depths (n,), m."""
+    """Random points (n, 3) m within 1 mm of the wall, and exact depths (n,), m."""
     points, normals = sampled(anatomy.surface, _PLACES)
     away = np.random.default_rng(0).uniform(-1.2e-3, 1.2e-3, (_PLACES, 1))
     points = points + away * normals
@@ -79,11 +79,11 @@ def _near_wall(anatomy: Anatomy) -> Places:
 
 
 def lumen_checks(anatomy: Anatomy) -> list[Check]:
-    """Surface, field, passage and goals of an anatomy, generated or imported."""
+    """Checks of surface, field, passage and goals of an anatomy."""
     places = _near_wall(anatomy)
     error, other = 1e3 * field_error(anatomy, places), without_wall(anatomy, places)
     radius = devices.get("steerable_5f").outer_radius
-    # Places, 0.5 mm apart, on the way to each goal that are too narrow.
+    # Number of points, 0.5 mm apart, on the route to each goal that are too narrow.
     narrow, astray = {}, []
     for goal in anatomy.goals.values():
         route = anatomy.route(goal.name)

@@ -31,13 +31,13 @@ def table(header, rows):
 
 
 def per_branch(found, key, digits=0):
-    """Figures of BCA, LCCA and LSA side by side."""
+    """Text of a measure of BCA, LCCA and LSA."""
     values = [found["branches"][name][key] for name in MAIN]
     return " / ".join(f"{value:.{digits}f}" for value in values)
 
 
 def shapes(anatomies):
-    """What the shipped anatomies are like, a column for each."""
+    """Table of measures of the anatomies, with a column for each."""
     found = {name: measures.measure(one.tree) for name, one in anatomies.items()}
     lines = {
         "type, drop of the BCA in LCCA diameters": lambda m: (
@@ -70,7 +70,7 @@ def shapes(anatomies):
 
 
 def fields(anatomies):
-    """Exactness of the fields."""
+    """Table of the errors of the fields."""
     rows = []
     for name, anatomy in anatomies.items():
         error = 1e3 * wall.field_error(anatomy)
@@ -89,7 +89,7 @@ def fields(anatomies):
 
 
 def against_measured():
-    """Built centrelines and radii against the measured ones."""
+    """Table of errors of built centrelines and radii against the measured ones."""
     rows = []
     for name in phantoms.MEASURED:
         tree = phantoms.load(name).tree
@@ -121,7 +121,7 @@ def against_measured():
 
 
 def distributions():
-    """Sampled sizes of the test arches beside the tables."""
+    """Table of sampled sizes of the test arches beside the published ones."""
     seeds = arch.arch_set("test")
     drawn = [seed.parameters() for seed in seeds]
     found = [measures.measure(arch.arch_tree(one)) for one in drawn]
@@ -168,7 +168,7 @@ def distributions():
 
 
 def necks():
-    """Arteries of neck and arms in the test arches that have them, and their goals."""
+    """Table of the arteries of neck and arms in the test arches, with their goals."""
     seeds, wanted = arch.arch_set("test_neck"), ("rcca", "rsa", "rva", "lva")
     found = {name: [] for name in wanted}
     for seed in seeds:
@@ -193,7 +193,7 @@ def necks():
 
 
 def gallery(seeds, name):
-    """Front and left views of random arches, three in a row."""
+    """Writes a figure of front and left views of random arches, three in a row."""
     rows = -(-len(seeds) // 3)
     figure = Figure(figsize=(15, 2.625 * rows), layout="constrained")
     FigureCanvasAgg(figure)

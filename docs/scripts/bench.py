@@ -2,7 +2,7 @@
 
 ``python docs/scripts/bench.py REPORT``
 
-REPORT is what ``python benchmarks/wires.py DIRECTORY`` prints. Only statistics are
+REPORT is the output of ``python benchmarks/wires.py DIRECTORY``. Only statistics are
 written: the measured data may not be redistributed.
 """
 
@@ -39,7 +39,7 @@ def main(report):
 
 
 def tables(report: Report) -> dict[str, list[list[str]]]:
-    """Rows of text by title, the header first: frames, and sensitivity if measured."""
+    """Tables by title, rows of text with the header first: frames and sensitivity."""
     frames = [["frame", "wire, tip in", "half", *WAYS, *BASELINES]]
     for row in report.findings["frames"]:
         half = "folded" if row["folded"] else row["half"]
@@ -68,7 +68,7 @@ def markdown(rows):
 
 
 def figure(rows):
-    """RMS distance of every frame, by way and baseline."""
+    """Figure of the RMS distance of every frame, by insertion history and baseline."""
     figure = Figure(figsize=(9.2, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
     rows = sorted(rows, key=lambda row: (row["folded"], row["wire"], row["frame"]))

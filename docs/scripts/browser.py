@@ -1,12 +1,12 @@
-"""What the pages under docs/browser/ need beside themselves; `make site` runs it.
+"""Writes the files that the pages under docs/browser/ load; `make site` runs it.
 
     python docs/scripts/browser.py [SITE]
 
 Writes into SITE/browser (build/site/browser): MuJoCo's WebAssembly build and three.js
 from the npm registry, at the versions and checksums of docs/browser/package-lock.json;
-the web viewer of the installed rerun-sdk, which alone reads the recordings of its
-version; the scenes that `cathsim export` writes, with pictures and surfaces of their
-vessels; and recordings of policies that ship. Nothing of it is in the repository.
+the web viewer of the installed rerun-sdk, as only it reads recordings of its version;
+the scenes that `cathsim export` writes, with pictures and surfaces of their vessels;
+and recordings of policies that ship. None of these files is in the repository.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 import rerun_cli
 from PIL import Image
 
-from cathsim_dmc import agents, suite  # agents before anything of dm_control
+from cathsim_dmc import agents, suite  # agents must be imported before dm_control
 from cathsim_dmc.agents.policies import task_and_options
 from cathsim_dmc.anatomy.scan.topology import decimated
 from cathsim_dmc.imaging import materials
@@ -45,7 +45,7 @@ PAGES = ROOT / "docs" / "browser"
 SCENES = ("type1_lcca", "type1_bca", "type2_lcca", "femoral_type1_lcca")
 SEED = 3
 GLASS_HEIGHT = 620  # px
-VESSEL_FACES = 10_000  # of the surface that a headset shows
+VESSEL_FACES = 10_000  # of the surface in a headset
 DEVICE_RADIUS = 0.835e-3  # m, of the published device
 # The blur of the detector, a quarter of a pixel here, is left out.
 FLUOROSCOPY = FluoroscopyOptions(size=480, magnification=1.2, kerma=2e-7, blur=0.0)
@@ -54,14 +54,14 @@ VENDOR = {
     "@mujoco/mujoco": ("mujoco.js", "mujoco.wasm"),
     "three": ("build/three.module.js", "build/three.core.js"),
 }
-# Files that Rerun's own server hands to a browser.
+# Files that Rerun's own server serves to a browser.
 VIEWER = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
 POLICY = (
     '<meta http-equiv="Content-Security-Policy" '
     "content=\"connect-src 'self' blob: data:\" />"
 )
 RECORDINGS = (
-    # name, title, policy, task, seed, steps at most
+    # name, title, policy, task, seed, most steps
     ("type1_bca", "Type I, BCA", "pretrained:type1_bca", None, 1_000_000, None),
     ("type1_lcca", "Type I, LCCA", "pretrained:type1_lcca", None, 1_000_000, None),
     ("type2_lcca", "Type II, LCCA", "pretrained:type2_lcca", None, 1_000_000, None),
@@ -87,11 +87,11 @@ def main() -> None:
 
 
 class ExportedScene:
-    """A scene that `cathsim export` wrote, at the start of its episode.
+    """A scene that `cathsim export` wrote, from the start of its episode on.
 
     Attributes:
-        model, data: MuJoCo's.
-        wall_force: force on the wall of the last control step.
+        model, data: MuJoCo model and data.
+        wall_force: wall force of the last control step.
     """
 
     def __init__(self, folder: Path):
@@ -108,7 +108,7 @@ class ExportedScene:
         self._row = slice(sensor.adr[0], sensor.adr[0] + sensor.dim[0])
 
     def step(self, action: np.ndarray) -> None:
-        """A control step."""
+        """Does a control step with an action (A,) in [-1, 1]."""
         action = np.clip(action, -1.0, 1.0)
         self.data.ctrl[self._order] = action
         self._drives.follow(action[None, self._driven])
@@ -126,7 +126,7 @@ class ExportedScene:
 
 
 def write_vendor(out: Path) -> None:
-    """MuJoCo's WebAssembly build and three.js, as the lock file has them."""
+    """Writes MuJoCo's WebAssembly build and three.js, as in the lock file."""
     modules = install(production=True)
     out.mkdir(parents=True, exist_ok=True)
     for package, files in VENDOR.items():
@@ -138,7 +138,7 @@ def write_vendor(out: Path) -> None:
 
 
 def install(production: bool = False) -> Path:
-    """Folder of the npm packages, installed with their checksums into build/npm."""
+    """Installs the npm packages of the lock file; returns their folder."""
     if shutil.which("npm") is None:
         raise SystemExit("the pages in the browser need Node.js with npm 10 or newer")
     folder = ROOT / "build" / ("npm" if production else "npm-test")
@@ -152,7 +152,7 @@ def install(production: bool = False) -> Path:
 
 
 def write_scene(name: str, out: Path) -> None:
-    """The scene of a task, and what of its pictures does not move."""
+    """Writes the scene of a task, and the static layers of its pictures."""
     shutil.rmtree(out, ignore_errors=True)
     write_mjcf(name, out, seed=SEED)
     surface = suite.make_task(name).scene.anatomy.surface
@@ -184,7 +184,7 @@ def write_scene(name: str, out: Path) -> None:
 
 
 def _vessel(surface, out: Path) -> dict:
-    """The surface of the lumen, simplified: float32 vertices, m, then uint32 faces."""
+    """Writes the decimated lumen: float32 vertices, m, then uint32 faces."""
     vertices, faces = decimated(surface.vertices, surface.faces, VESSEL_FACES)
     with (out / "vessel.bin").open("wb") as file:
         file.write(vertices.astype("<f4").tobytes())
@@ -193,7 +193,7 @@ def _vessel(surface, out: Path) -> dict:
 
 
 def _fluoroscopy(surface, out: Path) -> dict:
-    """Geometry of the AP view, and the signal behind patient and vessel."""
+    """Geometry of the AP view; writes the signal behind patient and vessel."""
     options = FLUOROSCOPY
     plane = Angiograph(surface, options).planes()[0]
     arm = plane.carm
@@ -216,16 +216,16 @@ def _fluoroscopy(surface, out: Path) -> dict:
 
 
 def _window(plane) -> list[float]:
-    """Signals shown as black and white: the contrast of a screen.
+    """Signals that are shown as black and as white.
 
-    Black is a device across the densest part of the vessel.
+    Black is that of a device across the densest part of the vessel.
     """
     device = np.exp(-materials.CATHETER * 2 * DEVICE_RADIUS)
     return [0.97 * float(plane.signal.min() * device), 1.02 * float(plane.signal.max())]
 
 
 def write_recordings(out: Path) -> None:
-    """Recordings of the policies that ship, of the expert and of a failure."""
+    """Writes recordings of policies that ship, of the expert and of a failure."""
     out.mkdir(parents=True, exist_ok=True)
     listed = [write_recording(out, *each) for each in RECORDINGS]
     (out / "recordings.json").write_text(json.dumps(listed, indent=1))
@@ -240,7 +240,7 @@ def write_recording(
     seed: int,
     steps: int | None,
 ) -> dict[str, str]:
-    """A recording for Rerun and for a headset; its entry in the list."""
+    """Writes a recording for Rerun and a headset; returns its entry in the list."""
     path = out / f"{name}.rrd"
     player = agents.load_policy(policy, seed)
     limit = {"max_steps": steps} if steps else {}
@@ -265,10 +265,10 @@ def write_recording(
 
 
 def write_states(episode: Episode, title: str, goal: str, path: Path) -> None:
-    """What a headset shows of an episode, see docs/browser/playback.js.
+    """Writes the episode for a headset as PATH.json and PATH.bin.
 
-    Writes PATH.json and PATH.bin; steps' series begin with a row of zeros for the
-    start, so that all have a row for each state.
+    docs/browser/playback.js reads them. Series of the control steps begin with a zero
+    for the start, so that all series have an entry for each state.
     """
     meta, states = episode.meta, episode.steps + 1
     contacts: list[list] = [[] for _ in range(states)]
@@ -307,14 +307,14 @@ def write_states(episode: Episode, title: str, goal: str, path: Path) -> None:
 
 
 def write_viewer(out: Path, recordings: Path) -> None:
-    """The web viewer of the installed rerun-sdk, from its own server."""
+    """Writes the web viewer of the installed rerun-sdk, taken from its own server."""
     out.mkdir(parents=True, exist_ok=True)
     with socket.socket() as page, socket.socket() as data:
         for each in (page, data):
             each.bind(("127.0.0.1", 0))
         ports = [each.getsockname()[1] for each in (page, data)]
     recording = next(iter(sorted(recordings.glob("*.rrd"))))
-    # The program itself: `python -m rerun_cli` would leave it behind when it ends.
+    # The program itself is started: `python -m rerun_cli` would leave it running.
     program = Path(rerun_cli.__file__).with_name("rerun")
     command = [str(program), str(recording), "--serve-web"]
     command += ["--bind", "127.0.0.1", "--web-viewer-port", str(ports[0])]
@@ -328,8 +328,8 @@ def write_viewer(out: Path, recordings: Path) -> None:
     finally:
         server.terminate()
         server.wait()
-    # Nothing is loaded from or sent to elsewhere: neither fonts (there are others to
-    # fall back on) nor the viewer's usage figures and its look for a later release.
+    # The page must not contact other servers: fonts have a fallback, and the viewer
+    # must not send usage statistics or look for a later release.
     page = (out / "index.html").read_text()
     page = re.sub(r"<link\b[^>]*fonts\.(googleapis|gstatic)\.com[^>]*>", "", page)
     page, count = re.subn(r"(<head>)", rf"\1\n    {POLICY}", page, count=1)
@@ -339,7 +339,7 @@ def write_viewer(out: Path, recordings: Path) -> None:
 
 
 def _fetched(address: str, patience: float = 30.0) -> bytes:
-    """A file of a server that is about to start."""
+    """Content of a file of a server that is starting; waits `patience`, s, for it."""
     until = time.monotonic() + patience
     while True:
         try:
@@ -354,5 +354,5 @@ def _fetched(address: str, patience: float = 30.0) -> bytes:
 
 
 if __name__ == "__main__":
-    assert agents  # imported for its order
+    assert agents  # imported for the order of imports
     main()

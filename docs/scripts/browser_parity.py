@@ -1,9 +1,9 @@
-"""The page in the browser beside Python: the same scene and actions, step by step.
+"""Compares the page in the browser with Python: same scene and actions, step by step.
 
     python docs/scripts/browser_parity.py
 
-Plays episodes of the task, and replays their actions in the scene that `cathsim export`
-exports, in Python and in MuJoCo's WebAssembly build (Node.js); writes
+Plays episodes of the task, and replays their actions in the scene of `cathsim export`,
+in Python and in MuJoCo's WebAssembly build (Node.js); writes
 docs/images/browser_parity.png and docs/data/browser_parity.json, and the table of
 docs/browser/index.md.
 """
@@ -21,7 +21,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import browser  # also torchrl before dm_control
+import browser  # imports torchrl before dm_control
 import figures
 import mujoco
 
@@ -35,7 +35,7 @@ from cathsim_dmc.style import COLOURS, tidy
 
 DOCS = browser.ROOT / "docs"
 TASK, SEED = "type1_lcca", browser.SEED
-# Name, policy and control steps at most.
+# Name, policy and most control steps.
 EPISODES = (
     ("random actions", "random", 150),
     ("scripted expert", "expert", 300),
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def compared(name: str, policy: str, steps: int, module: Path, scene: Path) -> dict:
-    """An episode of the task, and its actions in the exported scene, twice."""
+    """An episode of the task, and its actions replayed in Python and the browser."""
     played = play(policy, steps)
     actions, out = scene.parent / "actions.json", scene.parent / "out.json"
     image = scene.parent / "image.bin"
@@ -110,7 +110,7 @@ def play(policy: str, steps: int) -> dict[str, list]:
 
 
 def replay(scene: Path, actions: list) -> dict[str, np.ndarray]:
-    """Heads, forces and times of the exported scene in Python."""
+    """Heads, forces and step times of the exported scene in Python."""
     exported = browser.ExportedScene(scene)
     kept: dict[str, list] = {"head": [], "peak_max": [], "milliseconds": []}
     for action in np.array(actions):
@@ -123,7 +123,7 @@ def replay(scene: Path, actions: list) -> dict[str, np.ndarray]:
 
 
 def drawn(line: list) -> np.ndarray:
-    """The fluoroscopy of a device by the package, as the page draws it."""
+    """Fluoroscopy (rows, columns) of a device, with the options of the page."""
     surface = suite.make_task(TASK).scene.anatomy.surface
     plane = Angiograph(surface, browser.FLUOROSCOPY).planes()[0]
     shadow = Shadow(np.array(line), browser.DEVICE_RADIUS)
@@ -131,7 +131,7 @@ def drawn(line: list) -> np.ndarray:
 
 
 def row(each: dict) -> dict:
-    """The figures of an episode."""
+    """Comparison of an episode, as JSON values."""
     python, page = each["python"], each["browser"]
     apart = 1e3 * np.linalg.norm(python["head"] - page["head"], axis=1)
     task = 1e3 * np.linalg.norm(each["task"]["head"] - page["head"], axis=1)
@@ -155,7 +155,7 @@ def row(each: dict) -> dict:
 
 
 def draw(measured: list[dict], path: Path) -> None:
-    """Tip path, distance of the tips and force of every episode."""
+    """Draws tip path, distance of the tips and force of every episode."""
     figure = Picture(figsize=(11, 2.5 * len(measured)), layout="constrained", dpi=100)
     axes = figure.subplots(
         len(measured), 3, squeeze=False, width_ratios=[0.8, 1.2, 1.2]
@@ -185,7 +185,7 @@ def draw(measured: list[dict], path: Path) -> None:
 
 
 def write_table(values: dict, page: Path) -> None:
-    """Put the figures into the page, between its two marks."""
+    """Writes the results into the page, between its two markers."""
     lines = [
         f"{figures.since(values)} `{TASK}`, seed "
         f"{SEED}; MuJoCo {values['python']} in Python, {values['webassembly']} in "

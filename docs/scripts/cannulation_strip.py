@@ -1,8 +1,8 @@
-"""A cannulation of the left common carotid artery, as an operator sees it.
+"""Fluoroscopy of a cannulation of the left common carotid artery.
 
 Writes docs/images/cannulation_strip.png: the scripted expert in the task `type1_lcca`
-at six moments, above in AP with the vessel as a roadmap, below in LAO 45 while contrast
-runs; the ring is the goal. Needs no OpenGL.
+at six times, above in AP with the vessel as a roadmap, below in LAO 45 with contrast;
+the ring is the goal. Needs no OpenGL.
 """
 
 from __future__ import annotations

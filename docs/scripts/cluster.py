@@ -24,12 +24,12 @@ def measure():
 
 
 def load(found):
-    """How busy the machine was."""
+    """Lines on the load of the machine."""
     return [f"The load average was {found['load average']:.0f} on two cores."]
 
 
 def speed(costs):
-    """Control steps per second, beside one process."""
+    """Table of control steps per second, absolute and relative to one process."""
     rates = costs["control steps per second"]
     alone = rates["one process"]
     lines = ["| | control steps/s | of one process |", "|---|---|---|"]
@@ -39,7 +39,7 @@ def speed(costs):
 
 
 def costs(found):
-    """What is paid by the batch, the job and the start."""
+    """Tables of the costs of a batch, a job and a start."""
     rows = {f"weights ({name}, {one['kB']:,.0f} kB)": one
             for name, one in found["weights, ms"].items()}  # fmt: skip
     size = found["parts, ms"]["bytes a frame"]

@@ -2,8 +2,8 @@
 
     python docs/scripts/damping.py
 
-The expert's actions with the damping as stated are played again with other damping
-(open loop), and the expert plays with that damping (closed loop).
+The expert's actions with the stated damping are replayed with other damping (open
+loop), and the expert plays with other damping (closed loop).
 """
 
 from pathlib import Path

@@ -3,9 +3,9 @@
     python benchmarks/difficulty.py --out docs/data/difficulty.json
     python docs/scripts/difficulty.py
 
-Further reports, such as of single tasks or policies, are merged into that file when
-they are given: python docs/scripts/difficulty.py REPORT.json ...; where two tell of one
-policy on one task, that with more episodes stays, or else the later.
+Further reports, such as of single tasks or policies, are merged into that file: python
+docs/scripts/difficulty.py REPORT.json ... If several have the same policy and task, the
+one with most episodes is kept, or else the last.
 """
 
 import json
@@ -38,7 +38,7 @@ def main(paths):
 
 
 def merged(reports):
-    """One report of several: the same limits, the union of tasks and policies."""
+    """Merges reports with equal limits: the union of their tasks and policies."""
     limits, found, checks = {}, {}, {}
     for report in reports:
         for key, limit in report["findings"]["limits"].items():
@@ -60,7 +60,7 @@ def merged(reports):
 
 
 def tables(report):
-    """Lines of Markdown."""
+    """The tables as lines of Markdown."""
     names = list(POLICIES)
     lines = [
         "Success, % (95 % interval), and number of episodes:",

@@ -3,14 +3,14 @@
     python docs/scripts/figures.py                          # writes all pages
     python docs/scripts/figures.py NAME COMMAND             # keeps a report, from stdin
 
-A page quotes a figure as `<!-- = NAME -->` VALUE `<!-- -->`; what is between is written
-here. `docs/data/figures.json` holds single figures: value, unit, command, date, machine
-and commit by name. A report of a command (`--json`) is a file of its own there, with
-the last four beside its checks and findings; its figures are called `FILE: CHECK` and
-`FILE: FINDING: …`. `{.1f}` behind a name is the format of its value.
+A page quotes a figure as `<!-- = NAME -->` VALUE `<!-- -->`; this script writes VALUE.
+`docs/data/figures.json` holds single figures: value, unit, command, date, machine and
+commit by name. A report of a command (`--json`) is a separate file there, with the last
+four beside its checks and findings; its figures are called `FILE: CHECK` and `FILE:
+FINDING: …`. `{.1f}` after a name is the format of its value.
 
-Where a page has the marker `report FILE`, the report's own `table` stands, or else its
-checks: a row for all whose names differ in numbers or devices alone, with the worst.
+The marker `report FILE` of a page holds the report's own `table`, or else its checks:
+one row, with the worst value, for checks whose names differ only in numbers or devices.
 """
 
 import datetime
@@ -37,7 +37,7 @@ _VARIED = re.compile(r"\b(?:\w+_\w+|type\d|patient)\b(?: in \w+_\w+)?|\d+(?:\.\d
 
 
 def pages() -> list[Path]:
-    """README and all pages."""
+    """Paths of README and all pages."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
@@ -49,7 +49,7 @@ def between(text: str, name: str, content: str) -> str:
 
 
 def put(page: Path, **blocks: str | list[str]) -> None:
-    """Replaces blocks of a page; `_` in a name stands for a blank."""
+    """Replaces blocks of a page; `_` in a name means a blank."""
     text = page.read_text(encoding="utf-8")
     for name, content in blocks.items():
         lines = content if isinstance(content, str) else "\n".join(content)
@@ -63,10 +63,10 @@ def git(*arguments: str) -> subprocess.CompletedProcess:
 
 
 def origin(command: str) -> dict[str, str]:
-    """Where a figure comes from: the command, today, this machine, the commit.
+    """Origin of a figure: command, date of today, this machine and commit.
 
-    The commit is the newest one of main that is part of what was run, with "+" if the
-    package or its benchmarks differ from it: a commit of a branch may be rebased away.
+    The commit is the newest common one with main, since a commit of a branch may be
+    rebased away; it has a "+" if the package or its benchmarks differ from it.
     """
     model = next(
         line.split(":")[1].strip()
@@ -88,7 +88,7 @@ def keep(name: str, report: dict, command: str) -> None:
 
 
 def since(report: dict) -> str:
-    """A sentence: when, where and by which command a report was measured."""
+    """Sentence on date, machine and command of the measurement of a report."""
     return (
         f"Measured on {report['date']} by `{report['command']}` on {report['machine']} "
         f"(shared), commit {report['commit']}."
@@ -96,7 +96,7 @@ def since(report: dict) -> str:
 
 
 def families(checks: list[dict]) -> dict[str, list[dict]]:
-    """Checks of one unit and bound whose names differ in numbers or devices alone."""
+    """Groups of checks whose names differ only in numbers or devices."""
     found = {}
     for check in checks:
         name = _VARIED.sub("…", check["name"]).removeprefix("…: ")
@@ -108,7 +108,7 @@ def families(checks: list[dict]) -> dict[str, list[dict]]:
 
 
 def table(checks: list[dict]) -> list[str]:
-    """Rows with the worst figure of each family."""
+    """Table with the worst value of each family, as lines of Markdown."""
     rows = ["| check | worst | bound | figures |", "|---|---|---|---|"]
     for (name, unit, bound), group in families(checks).items():
         worst = max if bound.startswith("<=") else min
@@ -169,10 +169,10 @@ def _leaves(name, value):
 
 
 def filled(text: str, known: dict[str, dict]) -> str:
-    """The text with every quoted figure as it is known.
+    """The text with the known value of every quoted figure.
 
     Raises:
-        KeyError: the text quotes a figure that is not known.
+        KeyError: if the text quotes an unknown figure.
     """
 
     def write(match: re.Match) -> str:
@@ -190,7 +190,7 @@ def filled(text: str, known: dict[str, dict]) -> str:
 
 
 def written() -> dict[Path, str]:
-    """Every page as it is to be."""
+    """Texts of all pages with current figures, by path."""
     known, texts = figures(), {}
     for page in pages():
         text = filled(page.read_text(encoding="utf-8"), known)
@@ -200,7 +200,7 @@ def written() -> dict[Path, str]:
             lines = [since(report), "", own or "\n".join(table(report["checks"]))]
             text = between(text, f"report {name}", "\n".join(lines))
         texts[page] = text
-    import freshness  # late: it imports this module
+    import freshness  # imported here, as it imports this module
 
     page = ROOT / "docs" / "figures.md"
     if freshness.has_history():
@@ -215,7 +215,7 @@ def quoted() -> set[str]:
 
 def sources(known: dict[str, dict]) -> str:
     """The table of the figures that some page quotes, with their origin and age."""
-    import freshness  # late: it imports this module
+    import freshness  # imported here, as it imports this module
 
     names = sorted(quoted())
     rows = [

@@ -2,9 +2,9 @@
 
     python docs/scripts/force_protocol.py --out docs/data/force_protocol.json
 
-Steered by the expert and merely pushed, with 1 to 100 times the bending stiffness and
-three frictions, one episode of the same start each; writes the table of docs/forces.md.
-A sample is one contact in the last physics step of a control step, as published.
+Plays the expert and a straight push with 1 to 100 times the bending stiffness and three
+frictions, one episode from the same start each; writes the table of docs/forces.md. A
+sample is one contact in the last physics step of a control step, as published.
 """
 
 import argparse
@@ -21,12 +21,12 @@ from cathsim_dmc.simulation.batch import BatchSimulation
 
 TASK = "type1_bca"
 STIFFNESS = (1.0, 3.0, 10.0, 30.0, 100.0)  # times the device's EI
-FRICTION = (0.02, 0.037, 0.15)  # wet silicone 0.037; the rest is the range randomised
+FRICTION = (0.02, 0.037, 0.15)  # wet silicone 0.037; else the randomised range
 SHOWN = 0.037  # friction of the rows of the page
 POLICIES = {"expert": "steered", "push": "pushed"}
 STEPS = 250
-RESTING = 40  # control steps without progress after which an episode is at its end
-NARROW, WIDE = 0.2, 0.4  # N: most lie below the first, outliers above the second
+RESTING = 40  # control steps without progress after which an episode ends
+NARROW, WIDE = 0.2, 0.4  # N: most forces are below NARROW, outliers above WIDE
 PAGE = Path(__file__).parents[1] / "forces.md"
 
 
@@ -45,12 +45,12 @@ def main():
 
 
 def play(name, threads):
-    """A row of figures for every stiffness and friction."""
+    """Plays a policy; returns a row of statistics for each stiffness and friction."""
     settings = list(itertools.product(STIFFNESS, FRICTION))
     count = len(settings)
     task = suite.make_task(TASK, observation="tracking", effects=[Settings(settings)])
     simulation = BatchSimulation(task, count, num_threads=threads)
-    # The same start for all.
+    # All episodes have the same start.
     simulation.seed([0] * count)
     step = simulation.reset()
     policy = policies.make_policy(name, 0)
@@ -111,7 +111,7 @@ class Settings(RandomisedModel):
 
 
 def statistics(samples, cell, steps):
-    """Of the contact forces (n,) and the load cell's readings (m,), N."""
+    """Statistics of contact forces (n,) and readings of the load cell (m,), N."""
     if not len(samples):
         return {"samples": 0}
     return {
@@ -128,7 +128,7 @@ def statistics(samples, cell, steps):
 
 
 def table(rows):
-    """Lines of Markdown."""
+    """The table as lines of Markdown."""
     lines = [
         "| | EI, times | end, control steps | contacts, steps in contact "
         "| mean / median / p95 / max, mN | up to 0.2 N / above 0.4 N "

@@ -1,10 +1,10 @@
-"""Whether anything that a figure depends on has changed since it was measured.
+"""Lists figures whose dependencies have changed since they were measured.
 
-    python docs/scripts/freshness.py  # lists what has; exits with 1 if there is any
+    python docs/scripts/freshness.py  # exits with 1 if there are any
 
-`docs/data/depends.json` says which files of the package each figure depends on, and
-between which commits a part of them gave the same results although its files changed.
-The files as they are now are compared with those of the commit of the figure.
+`docs/data/depends.json` lists the files of the package that each figure depends on, and
+the commits between which a part of them gave the same results although its files
+changed. The current files are compared with those of the commit of the figure.
 """
 
 import fnmatch
@@ -18,20 +18,20 @@ TABLE = json.loads((figures.DATA / "depends.json").read_text())
 
 
 def parts_of(name: str) -> list[str]:
-    """Parts of the package that a figure depends on; the first pattern counts."""
+    """Parts of the package that a figure depends on, by the first matching pattern."""
     patterns = TABLE["figures"]
     return next(parts for one, parts in patterns if fnmatch.fnmatchcase(name, one))
 
 
 def moved(parts: list[str], commit: str) -> list[str]:
-    """Those parts whose results may differ from those at a commit.
+    """Parts whose results may differ from those at a commit.
 
     Args:
         parts: Names of parts.
-        commit: Of the measurement; with "+" where files differed from it.
+        commit: Commit of the measurement; with "+" if files differed from it.
 
     Returns:
-        All parts where the commit is not in the history.
+        Names of these parts; all parts if the commit is not in the history.
     """
     return [part for part in parts if _has_moved(part, commit.rstrip("+"))]
 
@@ -54,13 +54,13 @@ def _is_before(first: str, last: str) -> bool:
 
 
 def has_history() -> bool:
-    """Whether the commits of the table are here: not in an archive or shallow clone."""
+    """Whether the history has the commits of the table, unlike a shallow clone."""
     ends = {span[key] for span in TABLE["equal"] for key in ("first", "last")}
     return all(_is_before(end, "HEAD") for end in ends)
 
 
 def files() -> dict[str, list[str]]:
-    """Parts that have moved since each file of results was written."""
+    """Parts that have changed since each file of results was written, by file."""
     found = {}
     for pattern, parts in TABLE["files"].items():
         for path in sorted(figures.ROOT.glob(pattern)):
@@ -70,14 +70,14 @@ def files() -> dict[str, list[str]]:
 
 
 def _commit(path) -> str:
-    """Commit that a file names, else the one that brought it."""
+    """Commit that a file names, else the last one that changed it."""
     if path.suffix == ".json" and "commit" in (own := json.loads(path.read_text())):
         return own["commit"]
     return figures.git("log", "-1", "--format=%h", "--", str(path)).stdout.strip()
 
 
 def summary(names: list[str], known: dict[str, dict]) -> list[str]:
-    """What the page of the figures says of their age, by the parts that moved."""
+    """Lines of Markdown on the age of figures and files of results."""
     old = {name: moved(parts_of(name), known[name]["commit"]) for name in names}
     count = sum(map(bool, old.values()))
     lines = [
@@ -106,7 +106,7 @@ def _shown(parts: list[str]) -> str:
 
 
 def main() -> int:
-    """Prints what is older than a change, and returns the exit status."""
+    """Prints what is older than a change of its parts; returns the exit status."""
     old = {
         name: moved(parts_of(name), one["commit"])
         for name, one in figures.figures().items()

@@ -1,9 +1,9 @@
-"""The grid of clips in README and docs/gallery.md, each with the command behind it.
+"""Writes the clips of README and docs/gallery.md, each with its command.
 
     python docs/scripts/gallery.py [NAME …]
 
-Writes docs/images/gallery/NAME.webp, all of them or those that are named, and prints
-the grid of the page; "cannulation" is the film above the README,
+Writes docs/images/gallery/NAME.webp, for all or the given names, and prints the grid of
+the page; "cannulation" is the film at the top of the README,
 docs/images/cannulation.webp. Needs no OpenGL; the same seeds give the same clips.
 """
 
@@ -13,7 +13,7 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from cathsim_dmc.agents import load_policy  # before anything of dm_control
+from cathsim_dmc.agents import load_policy  # must be imported before dm_control
 
 import cathsim_dmc  # isort: skip
 from cathsim_dmc.agents.policies import task_and_options  # isort: skip
@@ -39,7 +39,7 @@ class Clip:
     task: str
     seed: int
     steps: int | None = None
-    own_task: bool = False  # the policy's own, which the command need not name
+    own_task: bool = False  # whether the policy's own task, not in the command
     options: dict[str, object] = dataclasses.field(default_factory=dict)
 
     @property
@@ -56,7 +56,7 @@ def _shipped(task: str, caption: str) -> Clip:
     return Clip(task, caption, f"pretrained:{task}", task, EVALUATION, own_task=True)
 
 
-# A row for each family of tasks: as published, from the groin, any arch, coaxial ones.
+# A row for each family: published tasks, femoral access, any arch, coaxial devices.
 CLIPS = (
     _shipped("type1_bca", "PPO, Type I, brachiocephalic artery"),
     _shipped("type1_lcca", "PPO, Type I, left common carotid"),

@@ -2,10 +2,10 @@
 
     python docs/scripts/image_inputs.py
 
-Collects images of `type1_lcca` under actions at random, and fits the convolutions of
-the preset `tuned_image` to the points along the device ("tracking") by regression. What
-it prints is the share of their variance that the fit explains on episodes that it has
-not seen. The rows of docs/training.md.
+Collects images of `type1_lcca` under random actions, and fits the convolutions of the
+preset `tuned_image` to the points along the device ("tracking") by regression. Prints
+the share of their variance that the fit explains on held-out episodes, for
+docs/training.md.
 """
 
 import argparse
@@ -58,7 +58,7 @@ def collect(config):
 
 
 def fit(config, images, points, subtract):
-    """Steps of Adam, and the share of the variance explained after so many."""
+    """Yields numbers of steps of Adam, and the share of variance explained then."""
     torch.manual_seed(0)
     scaled = ObservationNormaliser(points.shape[-1], 10.0)
     scaled.update(points[HELD_OUT:])

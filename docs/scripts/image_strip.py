@@ -1,11 +1,10 @@
-"""`pretrained:navigator_image` finds a left carotid artery from what two planes show.
+"""`pretrained:navigator_image` reaches a left carotid artery from biplane images.
 
     python docs/scripts/image_strip.py
 
-Writes docs/images/image_strip.png: the live images of both planes at six moments of an
-episode on the phantom `type2`, entered in the descending aorta; dashed the route that
-the policy has from its roadmaps, whose errors it has too; the ring is the goal. Needs
-no OpenGL.
+Writes docs/images/image_strip.png: the live images of both planes at six times of an
+episode on the phantom `type2`, entered in the descending aorta. The dashed line is the
+policy's route, with the errors of its roadmaps; the ring is the goal. Needs no OpenGL.
 """
 
 from __future__ import annotations

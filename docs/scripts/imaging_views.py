@@ -29,9 +29,9 @@ LINK_LENGTH = 7e-3
 
 
 def catheter(tree, goal: str = "lcca", depth: float = 0.03) -> np.ndarray:
-    """Joints (n, 3) of a catheter along the middle of the vessels, base to tip."""
+    """Joints (n, 3), m, of a catheter along the middle of the vessels, base to tip."""
     route = tree.route("aorta", goal, depth).resampled(0.5e-3)
-    # It comes straight from below the inlet; the filter stands for its stiffness.
+    # The catheter is straight before the inlet; the filter models its stiffness.
     first = route.points[1] - route.points[0]
     first /= np.linalg.norm(first)
     outside = route.points[0] - first * np.arange(0.06, 0.0, -0.5e-3)[:, None]

@@ -1,8 +1,8 @@
 """Writes docs/leaderboard.md from the submissions in docs/data/leaderboard.
 
 cathsim submit POLICY --task TASK --out docs/data/leaderboard/NAME.json
-python docs/scripts/leaderboard.py              # plays all episodes again, for an hour
-python docs/scripts/leaderboard.py --no-replay  # believes them, and says so
+python docs/scripts/leaderboard.py              # replays all episodes, for an hour
+python docs/scripts/leaderboard.py --no-replay  # trusts the files, and states it
 """
 
 import argparse
@@ -20,20 +20,20 @@ _PLAIN = re.compile(r"[\w:./+-]([\w:./+, -]{0,58}[\w:./+-])?", re.ASCII)
 
 
 def cell(value):
-    """A text of a submission for a table: code, or without any markup."""
+    """A text of a submission for a table, as code or without markup."""
     text = str(value)
     if _PLAIN.fullmatch(text):
         return f"`{text}`"
     shown = [one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text]
-    # As references, so that neither Markdown nor HTML is read in it.
+    # Character references prevent Markdown and HTML.
     return "".join(one if one.isalnum() else f"&#{ord(one)};" for one in shown[:60])
 
 
 def table(found):
-    """Rows by task and safe success.
+    """The table as lines of Markdown, sorted by task and safe success.
 
     Args:
-        found: (entry, replay) of each submission; None for a replay that there is not.
+        found: (entry, replay) of each submission; the replay may be None.
     """
     rows = [
         f"| task | policy | success, % (95 %) | safe, {SAFE}, % | time, s "
@@ -63,7 +63,7 @@ def table(found):
 
 
 def replayed(again):
-    """What the replay of a row shows."""
+    """Text of a cell on the replay."""
     if again is None:
         return "no"
     return f"{again.source}: {again.equal} of {len(again.result.episodes)} equal"

@@ -3,9 +3,9 @@
 python docs/scripts/measured_phantoms.py [--check]
 
 The measurements are points on the centrelines about 6 mm apart with the radius of the
-inscribed sphere (lattice of 0.5 mm: positions good to 0.5 mm, radii to 0.3 mm). The
-points are kept as they are; the splines of `anatomy.curves` smooth them. The radii
-become those of each vessel's own lumen, see `own_radii`.
+inscribed sphere (lattice of 0.5 mm: error of 0.5 mm in position, 0.3 mm in radius). The
+points are unchanged; the splines of `anatomy.curves` smooth them. The radii become
+those of each vessel's own lumen, see `own_radii`.
 """
 
 import json
@@ -23,11 +23,11 @@ from cathsim_dmc.anatomy.tree_file import FORMAT, FORMAT_VERSION, parse_tree
 
 ROOT = Path(__file__).parents[2]
 MEASUREMENTS = ROOT / "tests/data/measured"
-# A sphere nearer to the parent's lumen than this (mm) sees the parent's, too: the
+# An inscribed sphere nearer to the parent than this (mm) extends into its lumen: the
 # radius of a branch counts from there on.
 SEEN = 3.0
 CAPPED = 10.0  # mm from a free end, where the cap makes the inscribed sphere small
-# Narrower places (mm) are not told from an artefact of the lattice.
+# Least radius (mm) that differs from an artefact of the lattice.
 NARROWEST = 1.5
 NOTE = (
     "Published aortic arch phantom of Type {type}, measured by the authors of this "
@@ -39,8 +39,8 @@ NOTE = (
 def own_radii(points, radii, parent, is_fork):
     """Radii (n,) mm of a vessel's own lumen from those of the inscribed sphere.
 
-    A branch keeps its first own radius down to its parent. The last own radius goes
-    on to a free end. Nothing is narrower than `NARROWEST`.
+    The first own radius of a branch extends back to its parent, the last one to a free
+    end. No radius is smaller than `NARROWEST`.
     """
     line = Centreline(points, radii)
     s = line.arc_length
@@ -52,7 +52,7 @@ def own_radii(points, radii, parent, is_fork):
         fine = np.arange(0.0, s[-1], 0.1)
         near = parent.project(line.at(fine).position)
         ostium = fine[np.flatnonzero(near.distance < near.radius)[-1]]
-        # At a fork the sphere sees both daughters alike, and no more of the parent.
+        # At a fork the sphere fits both daughters alike, and not the parent.
         first = 1 if is_fork else int((s >= ostium + SEEN).argmax())
         radii[:first] = radii[first]
     return np.maximum(radii, NARROWEST)
@@ -104,7 +104,7 @@ def tree_file(name):
 
 
 def text(content):
-    """JSON with one point a line."""
+    """JSON text with one point on each line."""
     lines = json.dumps(content, indent=1, ensure_ascii=False)
     lines = lines.replace("[\n     ", "[").replace("\n    ]", "]")
     return lines.replace(",\n     ", ", ") + "\n"

@@ -1,7 +1,7 @@
 """Run the tutorials and write their outputs into them.
 
 `python docs/scripts/notebooks.py [NAME …]` runs all, or those whose file names contain
-a name. Cells run in an empty folder; nothing of this machine gets into the outputs.
+a name. Cells run in an empty folder, so that outputs do not depend on the machine.
 
 `python docs/scripts/notebooks.py --repository OWNER/NAME` runs nothing: it writes the
 address of the public repository into the cells for Colab, with a badge that opens the
@@ -47,14 +47,14 @@ def notebooks() -> list[Path]:
 
 
 def executed(path: Path) -> nbformat.NotebookNode:
-    """The notebook with the outputs of a fresh kernel; raises what a cell raises."""
+    """The notebook with the outputs of a fresh kernel; raises errors of its cells."""
     notebook = nbformat.read(path, as_version=4)
     with tempfile.TemporaryDirectory() as folder:
         NotebookClient(
             notebook,
             timeout=TIMEOUT,
             record_timing=False,
-            # Else how lines are grouped differs from run to run.
+            # Otherwise the grouping of lines differs from run to run.
             coalesce_streams=True,
             resources={"metadata": {"path": folder}},
         ).execute()
@@ -68,11 +68,11 @@ def executed(path: Path) -> nbformat.NotebookNode:
 
 
 def for_colab(notebook: nbformat.NotebookNode, name: str, repository: str) -> None:
-    """Puts the cell that installs in Colab, and the badge, behind the title.
+    """Inserts the installing cell for Colab, and the badge, after the title.
 
     Args:
         name: File name of the notebook.
-        repository: OWNER/NAME of the public repository, empty where there is none.
+        repository: OWNER/NAME of the public repository; empty for none.
     """
     notebook.cells = [one for one in notebook.cells if one.id != COLAB]
     title = notebook.cells[0]
@@ -87,7 +87,7 @@ def for_colab(notebook: nbformat.NotebookNode, name: str, repository: str) -> No
 
 
 def _processor_seconds() -> float:
-    """Of the kernels that have ended: a busy machine does not count."""
+    """Processor time, s, of all kernels that have ended."""
     times = os.times()
     return times.children_user + times.children_system
 

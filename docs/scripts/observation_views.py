@@ -1,4 +1,4 @@
-"""What the image observations of a task show, option by option.
+"""Draws the image observations of a task for several options.
 
 Writes docs/images/observation_views.png and endoluminal.png.
 """
@@ -19,7 +19,7 @@ from cathsim_dmc.imaging import endoluminal as views
 
 IMAGES = Path(__file__).parents[1] / "images"
 TASK, SEED, STEPS = "type1_bca", 1, 60
-# Title -> options of the fluoroscopy, and the observation that is shown.
+# Options of the fluoroscopy and the shown observation, by title.
 PANELS = {
     "AP": ({}, "image"),
     "LAO45": ({"view": "LAO45"}, "image"),
@@ -80,7 +80,7 @@ def fluoroscopy() -> Path:
 
 
 def endoluminal() -> Path:
-    """From places along the way to the LCCA of `type3`, looking ahead."""
+    """Draws endoluminal views along the route to the LCCA of `type3`, looking ahead."""
     anatomy = phantoms.load("type3")
     way = anatomy.route("lcca")
     figure, axes = plt.subplots(2, 4, figsize=(10, 5.2), layout="constrained")

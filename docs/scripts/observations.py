@@ -1,6 +1,6 @@
 """Writes docs/observations.md from the specs of the task `type1_bca`.
 
-`python docs/scripts/observations.py` writes; the tests compare.
+`python docs/scripts/observations.py` writes the page; the tests compare it.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ _OTHERS = (
 
 
 def other_table(task: str, *names: str, **options: Any) -> str:
-    """Entries of observations that other tasks have, from the specs."""
+    """Table of the entries of observations of other tasks, from the specs."""
     specs = suite.make_task(task, observation=names, **options).observation_specs
     rows = [_row("entry", "shape", "unit", "meaning"), _row(*["---"] * 4)]
     known = observations.entries(["route"])
@@ -207,7 +207,7 @@ def other_table(task: str, *names: str, **options: Any) -> str:
 
 
 def entries_table() -> str:
-    """Every entry of every observation, from the specs."""
+    """Table of all entries of all observations, from the specs."""
     kinds = {
         n: k for n, k in observations.OBSERVATIONS.items() if k.needs not in _OTHERS
     }
@@ -260,7 +260,7 @@ def _attributes(kind: type) -> dict[str, str]:
 
 
 def options_table(kind: type, values: object, title: str) -> str:
-    """Fields of a dataclass of options with their values and meanings."""
+    """Table of the fields of a dataclass of options, with values and meanings."""
     rows = [_row("option", title, "meaning"), _row("---", "---", "---")]
     for name, meaning in _attributes(kind).items():
         value = getattr(values, name)
@@ -275,7 +275,7 @@ def options_table(kind: type, values: object, title: str) -> str:
 
 
 def page() -> str:
-    """The whole page."""
+    """Text of the page."""
     parts = [INTRODUCTION, entries_table() + "\n"]
     coaxial = COAXIAL.replace("{table}", other_table(PAIR_TASK, "drives", "devices"))
     relative = ("route_coaxial", "route_retry", "route_turns")

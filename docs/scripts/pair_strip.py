@@ -1,11 +1,11 @@
-"""Two devices at work: a Simmons catheter reforms, and a pair cannulates a carotid.
+"""Pictures of coaxial devices: a Simmons catheter reforms, a pair cannulates a carotid.
 
     python docs/scripts/pair_strip.py [SCAN]
 
-Writes docs/images/pair_simmons.png and docs/images/pair_cannulation.png; with the
-directory of an imported scan docs/images/pair_vertebral.png alone, where the learned
-policy goes into its left vertebral artery. Needs no OpenGL; the same seeds give the
-same pictures.
+Writes docs/images/pair_simmons.png and docs/images/pair_cannulation.png. With the
+directory of an imported scan it writes only docs/images/pair_vertebral.png, in which
+the learnt policy enters the left vertebral artery. Needs no OpenGL; the same seeds give
+the same pictures.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from cathsim_dmc.pictures.moment import Moment
 
 IMAGES = Path(__file__).parents[1] / "images"
 DPI, HEIGHT = 130, 3.2
-BELOW = 0.18  # share of the picture below which nothing happens
+BELOW = 0.18  # lower share of the picture that is left out
 SIMMONS = ("wire_035_amplatz", "diagnostic_5f_simmons")
 
 
 def simmons() -> list[Moment]:
-    """A stiff wire straightens a Simmons catheter in the arch; then it is withdrawn."""
+    """Moments in which a stiff wire straightens a Simmons catheter and is withdrawn."""
     env = suite.load(
         "cathsim",
         "type1_lcca_pair",
@@ -56,7 +56,7 @@ def simmons() -> list[Moment]:
 def cannulation(
     task: str = "femoral_type1_lcca_pair", policy: str = "expert", **options: Any
 ) -> list[Moment]:
-    """A policy drives both devices from the groin into a branch."""
+    """Moments of an episode of a policy that drives both devices into a branch."""
     player = load_policy(policy)
     options = {"random": 0, "observation": player.observation, **options}
     env = suite.load("cathsim", task, options)
@@ -75,7 +75,7 @@ def cannulation(
 
 
 def _titled(env, words: str) -> Moment:
-    """The present state without contact forces, which would hide the small shapes."""
+    """The current state without contact forces, which would hide small shapes."""
     nothing = np.zeros((0, 3))
     return dataclasses.replace(
         Moment.of(env), title=words, position=nothing, force=nothing
@@ -83,7 +83,7 @@ def _titled(env, words: str) -> Moment:
 
 
 def last(seen: Sequence[Moment], way: float = 1.0, moments: int = 6) -> list[Moment]:
-    """Moments in which the head is within a way, m, of its last place."""
+    """Moments in which the head is within `way`, m, of its last position."""
     heads = np.array([one.device[-1] for one in seen])
     far = np.linalg.norm(heads - heads[-1], axis=1) > way
     first = np.flatnonzero(far)[-1] + 1 if far.any() else 0
@@ -94,7 +94,7 @@ def last(seen: Sequence[Moment], way: float = 1.0, moments: int = 6) -> list[Mom
 def strip(
     snapshots: Sequence[Moment], path: Path, view: str = "front", around: float = 0.0
 ) -> None:
-    """Draws snapshots of one anatomy side by side, `around` m before the last head."""
+    """Draws snapshots side by side; `around`, m, crops them around the last head."""
     size = 3600 if around else 700
     projection, picture = background(snapshots[0].surface, view, size)
     left, right, low, high = projection.extent_mm

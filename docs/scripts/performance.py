@@ -13,7 +13,7 @@ import figures
 
 PAGE = figures.ROOT / "docs" / "performance.md"
 DATA = figures.DATA / "speed.json"
-# Rows of the page by the name of the figure; the file has all.
+# Rows of the page: names in the file, which has more, by label.
 BATCHED = {
     "random, 1 thread": "1 thread",
     "random, 2 threads": "2 threads",
@@ -29,7 +29,7 @@ def measure():
 
 
 def factors(report):
-    """Real-time factors by anatomy and policy."""
+    """Table of real-time factors by anatomy and policy."""
     lines = ["| task | policy | real-time factor | calibrated, µs | at least |"]
     lines.append("|---|---|---|---|---|")
     bars = {check["name"]: check for check in report["checks"]}
@@ -44,7 +44,7 @@ def factors(report):
 
 
 def others(report):
-    """What is not a calibrated speed."""
+    """Table of the checks other than calibrated speeds."""
     lines = ["| figure | measured | bound | |", "|---|---|---|---|"]
     for check in report["checks"]:
         if not check["name"].startswith("calibrated"):

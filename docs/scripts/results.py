@@ -1,11 +1,11 @@
 """Writes docs/results.md and results_detail.md from the files of finished cells.
 
-    python benchmarks/trainings.py     # trains what is missing, into results/
+    python benchmarks/trainings.py     # trains missing cells, into results/
     python docs/scripts/results.py
 
-Nothing else is read but the published figures (docs/data/published_results.json), the
-expert's (docs/data/difficulty.json, test_arches.jsonl) and the grid, which says what is
-missing.
+Further inputs are the published results (docs/data/published_results.json), those of
+the expert (docs/data/difficulty.json, test_arches.jsonl) and the grid, for missing
+cells.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import os
 import sys
 from pathlib import Path
 
-# torchrl goes before dm_control.
+# torchrl must be imported before dm_control.
 from cathsim_dmc import agents  # isort: skip  # noqa: F401
 
 import numpy as np
@@ -32,7 +32,7 @@ DIFFICULTY = DOCS / "data/difficulty.json"
 TEST_ARCHES = DOCS / "data/test_arches.jsonl"
 PAGE, DETAIL_PAGE = "results.md", "results_detail.md"
 PUBLISHED_TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
-# Where learning with and without demonstrations is compared, and who needs them.
+# Task of the comparison with and without demonstrations; algorithms that need them.
 DEMONSTRATED, TAUGHT = "type1_lcca", ("bc", "dagger")
 NAMES = {"internal": "Internal", "image": "Image", "sequential": "Sequential"}
 
@@ -102,7 +102,7 @@ HEADER = (
     "| agent | seeds | success | worst | reward | steps | mean | contact | largest |",
     "|---|---|---|---|---|---|---|---|---|",
 )
-# Places of the columns of `HEADER` on the page of results.
+# Indices of the columns of `HEADER` on the page of results.
 FORCE_COLUMNS = (0, 5, 6, 7, 8)
 
 
@@ -123,7 +123,7 @@ def main(arguments=None):
 
 
 def read_all(directory):
-    """All results of a directory by their names, and a line for each broken one."""
+    """All results of a directory by name, and a line for each damaged file."""
     results, broken = {}, []
     for path in sorted(directory.glob("*.json")):
         try:
@@ -148,7 +148,7 @@ def pages(results, broken, cells, directory):
 
 
 def arranged(results, cells):
-    """{task: {label: [results by seed]}}, tasks and agents in the order of the grid."""
+    """Results as {task: {label: [by seed]}}, in the order of the grid."""
     order = {cell.name: index for index, cell in enumerate(cells)}
     found = sorted(
         results.values(), key=lambda r: (order.get(r.path.stem, len(order)), r.path)
@@ -162,12 +162,12 @@ def arranged(results, cells):
 
 
 def in_grid(cells):
-    """Labels of the grid's agents with their tasks."""
+    """Pairs (label, task) of the cells of the grid."""
     return {(cell.label, cell.task) for cell in cells}
 
 
 def standing(results, broken, cells):
-    """What is missing of the grid, and of the publication."""
+    """Section on missing cells of the grid and missing published agents."""
     missing = [cell for cell in cells if cell.name not in results]
     lines = [
         "## What is missing",
@@ -198,7 +198,7 @@ def standing(results, broken, cells):
 
 
 def published_label(result):
-    """Name of the published agent that a cell repeats, or None."""
+    """Name of the published agent that a cell reproduces, or None."""
     if taught(result):
         return None
     observation = result.cell["observation"]
@@ -213,12 +213,12 @@ def taught(result):
 
 
 def published_agents():
-    """Published figures, {agent: {task: figures}}."""
+    """Published results, {agent: {task: values}}."""
     return json.loads(PUBLISHED.read_text())["agents"]
 
 
 def failures(table):
-    """What falls short: episodes off the goal, forces above the published ones."""
+    """Section on failures: missed goals, and forces above the published ones."""
     rows, louder = [], []
     for task, label, found in ((t, a, r) for t in table for a, r in table[t].items()):
         rate, count = rate_of(found)
@@ -255,7 +255,7 @@ def failures(table):
 
 
 def successes(table):
-    """Success on the published tasks: a row for each agent, ours or published."""
+    """Section on success on the published tasks, with a row for each agent."""
     published, repeated = published_agents(), set()
     header = ["agent", "seeds", *(f"`{task}`" for task in PUBLISHED_TASKS), "mean"]
     lines = [SUCCESS, f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
@@ -290,7 +290,7 @@ def success_row(label, count, of_task, theirs):
 
 
 def force_tables(table):
-    """Steps and forces on each published task, of the agents that are trained."""
+    """Section on steps and forces of the trained agents on each published task."""
     published, lines = published_agents(), [FORCE]
     for task in PUBLISHED_TASKS:
         if task not in table:
@@ -304,13 +304,13 @@ def force_tables(table):
 
 
 def line_of(line):
-    """The columns of a line of a full table that the page of results has."""
+    """A line of a full table with the columns of the page of results only."""
     cells = line.strip("|").split("|")
     return f"|{'|'.join(cells[place] for place in FORCE_COLUMNS)}|"
 
 
 def full_tables(table, cells):
-    """One table with all columns for each task."""
+    """Tables with all columns, one for each task."""
     published, lines = published_agents(), []
     planned = in_grid(cells)
     for task in dict.fromkeys((*PUBLISHED_TASKS, *table)):
@@ -330,7 +330,7 @@ def full_tables(table, cells):
 
 
 def other_tasks(table):
-    """One table for all tasks that were not published, with the expert's figures."""
+    """Section with a table of the unpublished tasks, with results of the expert."""
     experts, lines = expert_rates(), []
     for task, agents_ in table.items():
         if task in PUBLISHED_TASKS:
@@ -358,7 +358,7 @@ def other_tasks(table):
 
 
 def expert_rates():
-    """Success of the scripted expert, task: rate, as far as it was measured."""
+    """Success rate of the scripted expert by task, where it was measured."""
     rates = {}
     if DIFFICULTY.exists():
         tasks = json.loads(DIFFICULTY.read_text())["findings"]["tasks"]
@@ -375,7 +375,7 @@ def expert_rates():
 
 
 def row(label, found, theirs):
-    """A line of a table: ours, and the published figures of the same agent."""
+    """A line of a table: our results and the published ones of the same agent."""
     cells = [label, *(figures_of(found) if found else ["–"] * 8)]
     if theirs is not None:
         for place, text in published_figures(theirs).items():
@@ -384,13 +384,13 @@ def row(label, found, theirs):
 
 
 def marked(text, found):
-    """The text, marked if a result is of the physics before version 0.3."""
+    """The text, with a mark if a result is from the physics before version 0.3."""
     forces = (result.evaluation["summary"]["forces"] for result in found)
     return text + " †" * any("mean_sum" not in one for one in forces)
 
 
 def rate_of(found):
-    """Success over the episodes of all seeds, and their number."""
+    """Success rate over the episodes of all seeds, and the number of episodes."""
     counts = [result.evaluation["summary"]["episodes"] for result in found]
     rates = [result.success for result in found]
     reached = sum(round(r * n) for r, n in zip(rates, counts, strict=True))
@@ -417,7 +417,7 @@ def figures_of(found):
 
 
 def published_figures(theirs):
-    """Published figures by the column of ours."""
+    """Published values as text, by the index of our column."""
     return {
         2: percent(theirs["success"]),
         4: "{:.0f} ± {:.0f}".format(*theirs["reward"]),
@@ -427,18 +427,18 @@ def published_figures(theirs):
 
 
 def values_of(found, name):
-    """What is known of a quantity in the episodes of all seeds."""
+    """Values of a quantity in the episodes of all seeds, without missing ones."""
     return [v for r in found for v in r.evaluation["episodes"][name] if v is not None]
 
 
 def mean_of(found, name):
-    """Mean over the episodes of all seeds, or None."""
+    """Mean of a quantity over the episodes of all seeds; None without values."""
     values = values_of(found, name)
     return np.mean(values) if values else None
 
 
 def spread(found, name, scale, digits):
-    """Mean ± deviation over the episodes of all seeds."""
+    """Text of mean ± deviation of a quantity over the episodes of all seeds."""
     values = values_of(found, name)
     if not values:
         return "–"
@@ -451,7 +451,7 @@ def percent(rate):
 
 
 def clock(seconds):
-    """Hours, minutes and seconds."""
+    """Text of a time in seconds as hours, minutes and seconds."""
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
 
@@ -459,10 +459,10 @@ def clock(seconds):
 def mean_over_seeds(scores, resamples=10_000, seed=0):
     """Mean over the runs of all tasks, with its 95 % interval over seeds.
 
-    The runs of every task are resampled on their own (stratified bootstrap, percentile
+    The runs of each task are resampled separately (stratified bootstrap, percentile
     interval; Agarwal et al. 2021, "Deep reinforcement learning at the edge of the
-    statistical precipice"). It is not their interquartile mean, which of four tasks
-    leaves out one that fails.
+    statistical precipice"). Their interquartile mean is not used, because it would
+    leave out one failing task of four.
 
     Args:
         scores: Scores of the runs (seeds) of each task; their numbers may differ.
@@ -470,10 +470,10 @@ def mean_over_seeds(scores, resamples=10_000, seed=0):
         seed: Seed of the bootstrap.
 
     Returns:
-        The mean, in which every task counts alike, and its interval.
+        The mean, with equal weights of the tasks, and its interval.
 
     Raises:
-        ValueError: there is no task, or one with less than two runs.
+        ValueError: if there is no task, or a task has fewer than two runs.
     """
     tasks = [np.asarray(runs, dtype=np.float64) for runs in scores]
     if not tasks or min(map(len, tasks)) < 2:
@@ -488,7 +488,7 @@ def mean_over_seeds(scores, resamples=10_000, seed=0):
 
 
 def cost(table):
-    """Frames and time of the trainings of each agent."""
+    """Section on frames and time of the trainings of each agent."""
     lines = [
         "## Frames and time",
         "",
@@ -517,7 +517,7 @@ def cost(table):
 
 
 def drawn(table, directory):
-    """The parts of both pages that show figures, which are drawn beside them."""
+    """Draws the figures beside the pages; returns the parts of both that show them."""
     published = published_agents()
     reference = {task: {} for task in PUBLISHED_TASKS}
     for task, of_task in reference.items():
@@ -530,7 +530,7 @@ def drawn(table, directory):
 
 
 def demonstrated(table):
-    """Agents to compare on one task, if one of them has learnt from demonstrations."""
+    """Agents to compare on `DEMONSTRATED`; empty if none learnt from demonstrations."""
     agents_ = table.get(DEMONSTRATED, {}).items()
     compared = {k: v for k, v in agents_ if v[0].cell["observation"] == "internal"}
     if any(taught(result) for found in compared.values() for result in found):

@@ -1,4 +1,4 @@
-"""Figures of docs/results.md: learning curves, box plots, maps of the force."""
+"""Figures of docs/results.md: learning curves, box plots, force maps."""
 
 import math
 
@@ -21,7 +21,7 @@ POINTS = 200
 
 
 class Looks:
-    """One colour and line style for each agent, the same in every figure."""
+    """Colour and line style of each agent, the same in every figure."""
 
     def __init__(self, labels):
         self._order = {label: index for index, label in enumerate(labels)}
@@ -33,7 +33,7 @@ class Looks:
 
 
 def learning_curves(by_task, looks, path):
-    """Success in training over frames: mean over seeds, band from least to most.
+    """Draws success in training over frames: mean over seeds, band from least to most.
 
     Args:
         by_task: Results of each task by the label of the agent: {task: {label: [...]}}.
@@ -77,7 +77,7 @@ def learning_curves(by_task, looks, path):
 
 
 def with_demonstrations(agents, looks, path):
-    """Success of agents on one task over the frames that their training took.
+    """Draws success of agents on one task over the frames of their training.
 
     Args:
         agents: Results of the task by label: {label: [...]}.
@@ -113,17 +113,17 @@ def with_demonstrations(agents, looks, path):
     return _save(figure, path)
 
 
-# Episodes after which a mean over the last of them is shown.
+# Episodes after which the running mean of success is shown.
 _FIRST_EPISODES = 100
 
 
 def _common(results):
-    """Frames (P,) that all seeds have seen, and success (seeds, P) there."""
+    """Frames (P,) in the range of all seeds, and success (seeds, P) at them."""
     curves = []
     for result in results:
         curve = result.training["curve"]
         columns = (curve.get(name, ()) for name in ("frames", "success", "episodes"))
-        # Successful episodes end first: a mean over the first few says nothing.
+        # Successful episodes end first, so a mean over the first few is biased.
         known = [
             (frames, success)
             for frames, success, episodes in zip(*columns, strict=True)
@@ -140,10 +140,10 @@ def _common(results):
 
 
 def force_boxes(by_task, looks, published, path):
-    """Largest contact force of every evaluation episode, one box for each agent.
+    """Draws largest contact forces of evaluation episodes, with a box for each agent.
 
     Args:
-        by_task: As for `learning_curves`.
+        by_task: Results, as in `learning_curves`.
         looks: Looks of the agents.
         published: Published (mean, deviation) in N by task and label, drawn as bars.
         path: Path of the PNG.
@@ -187,7 +187,7 @@ def force_boxes(by_task, looks, published, path):
 
 
 def force_maps(chosen, path):
-    """Mean contact force over the vessel for one agent of each task.
+    """Draws maps of the mean contact force for one agent of each task.
 
     Args:
         chosen: Results of all seeds of one agent for each task, {task: [...]}.
@@ -219,7 +219,7 @@ def _draw_map(figure, axes, field, task):
     definition = suite.TASKS[task]
     surface = suite.load_anatomy(definition.anatomy, definition.access).surface
     triangles = 1e3 * np.asarray(surface.vertices)[:, AP_AXES][surface.faces]
-    # Dark and wide below light: a rim around the silhouette.
+    # Dark and wide below light, which leaves a rim around the silhouette.
     for colour, rim in (("0.5", 1.8), ("0.92", 0.5)):
         axes.add_collection(
             PolyCollection(
@@ -228,7 +228,7 @@ def _draw_map(figure, axes, field, task):
             )
         )  # fmt: skip
     touched = field.mean[field.count > 0]
-    # A single hard knock must not make everything else pale.
+    # A percentile limits the effect of single large forces on the colour scale.
     limit = 1e3 * float(np.percentile(touched, 98)) if len(touched) else 1.0
     image = axes.pcolormesh(
         1e3 * field.x_edges,
@@ -251,7 +251,7 @@ def _draw_map(figure, axes, field, task):
 
 
 def _merged(maps):
-    """One map of several of the same vessel, contacts counting alike."""
+    """Merges maps of the same vessel, with equal weights of all contacts."""
     first = maps[0]
     total = sum(np.nan_to_num(one.mean) * one.count for one in maps)
     count = sum(one.count for one in maps)
@@ -292,7 +292,7 @@ def drawn(table, reference, compared, images):
         images: Folder of the figures.
 
     Returns:
-        The parts that show those of the published tasks, and those of all others.
+        Markdown parts with the figures of the published tasks, and of all others.
     """
     looks = Looks(dict.fromkeys(label for one in table.values() for label in one))
     main = {task: table[task] for task in reference if task in table}

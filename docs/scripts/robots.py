@@ -2,8 +2,8 @@
 
     python docs/scripts/robots.py
 
-Serves a task in one process and drives it in another with a policy that ships, by the
-commands that a user types, in real time, and writes the table into the page.
+Serves a task in one process and drives it in another with a policy that ships, in real
+time and with the commands of the user, and writes the table into the page.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ HEAD = (
 
 
 def measure(policy: str, task: str) -> list[str]:
-    """A row of the table."""
+    """Plays a case; returns its row of the table."""
     count = ["--episodes", str(EPISODES), "--json"]
     patient = ["--watchdog", "2"]
     device = subprocess.Popen(
@@ -61,7 +61,7 @@ def measure(policy: str, task: str) -> list[str]:
 
 
 def worst(episodes: list[dict], name: str) -> str:
-    """Percentiles, each that of the episode in which it is largest."""
+    """Text of percentiles, the largest over the episodes of each."""
     each = [one[name] for one in episodes]
     return " / ".join(f"{max(one[k] for one in each):.1f}" for k in each[0])
 

@@ -1,11 +1,11 @@
 """The tables of docs/robustness.md and robustness_pair.md.
 
-Their lines are those that benchmarks/robust.py writes.
+The input is the files of benchmarks/robust.py.
 
     python docs/scripts/robust.py RUN.jsonl … [--keep]
 
-`--keep` puts the lines into docs/data/robust.jsonl first, in place of those that count
-the same; without files, the tables are made from what is there.
+`--keep` first writes the lines into docs/data/robust.jsonl, where they replace those of
+the same cells; without files, the tables are made from that file.
 """
 
 import argparse
@@ -34,14 +34,14 @@ def read(path):
 
 
 def rate(successes, episodes):
-    """Success with its interval over distinct conditions, in percent."""
+    """Text of success with its interval over distinct conditions, in percent."""
     low, high = success_interval(successes, episodes)
     share = 100 * successes / episodes
     return f"{share:.0f} ({100 * low:.0f}–{100 * high:.0f}), {episodes}"
 
 
 def figures(rows):
-    """Cells of the columns of `_FIGURES` for rows that count together."""
+    """Cells of the columns of `_FIGURES` for rows that are pooled."""
     count = sum(row["episodes"] for row in rows)
     mean = {
         name: sum(row[name] * row["episodes"] for row in rows) / count
@@ -61,7 +61,7 @@ def pooled(rows):
 
 
 def arches(rows):
-    """Held-out arches: a row for each policy, branch and access."""
+    """Table of held-out arches with a row for each policy, branch and access."""
     lines = [
         f"| policy | branch | access | success, % (95 %), arches {_FIGURES}",
         "|---" * 8 + "|",
@@ -78,7 +78,7 @@ def arches(rows):
 
 
 def shares(rows, column, field, shown):
-    """Success by what `field` of the rows counts apart, for each policy."""
+    """Table of success by the groups of `field` of the rows, for each policy."""
     lines = [f"| policy | {column} | success, % (95 %), episodes |", "|---|---|---|"]
     for policy in sorted({row["policy"] for row in rows}):
         counts = {}
@@ -93,19 +93,19 @@ def shares(rows, column, field, shown):
 
 
 def devices(rows):
-    """Success by device, over all cells of a policy."""
+    """Table of success by device, over all cells of a policy."""
     return shares(rows, "device", "by_device", "`{}`".format)
 
 
 def kinds(rows):
-    """Success by kind of arch, over the held-out arches of a policy."""
+    """Table of success by kind of arch, over the held-out arches of a policy."""
     return shares(
         rows, "kind", "by_kind", lambda n: n.replace("_", " ").removesuffix(" normal")
     )
 
 
 def anatomies(rows):
-    """Phantoms and scans: a row for each policy and anatomy, over branch and access."""
+    """Table of phantoms and scans, with a row for each policy and anatomy."""
     lines = [
         f"| policy | anatomy | branches × accesses | success, % (95 %), episodes "
         f"{_FIGURES}",
@@ -120,7 +120,7 @@ def anatomies(rows):
 
 
 def weakest(rows):
-    """Cells of the phantoms where fewer than nine of ten episodes succeed."""
+    """Table of cells of the phantoms with success below 90 %."""
     cells = {(r["policy"], r["anatomy"], r["goal"], r["access"]): r for r in rows}
     lines = ["| policy | anatomy | branch | access | success | `expert` |"]
     lines.append("|---" * 6 + "|")
@@ -137,7 +137,7 @@ def weakest(rows):
 
 
 def pairs(rows):
-    """A guidewire in a catheter: a row for each cell, those that fail most first."""
+    """Table of a guidewire in a catheter, with a row for each cell, worst first."""
     lines = [
         f"| policy | anatomy | branch | success, % (95 %), episodes {_FIGURES}",
         "|---" * 8 + "|",
@@ -154,7 +154,7 @@ def pairs(rows):
 
 
 def changes(rows):
-    """One change at a time: success of each policy."""
+    """Table of the success of each policy with one change at a time."""
     names = list(dict.fromkeys(row["policy"] for row in rows))
     lines = [
         f"| change | {' | '.join(f'`{name}`' for name in names)} |",
@@ -171,7 +171,7 @@ def changes(rows):
 
 
 def narrow(rows):
-    """Branches that are too narrow: what became of the episodes, for each radius."""
+    """Table of branches that are too narrow, with results for each radius."""
     lines = [
         "| policy | radius, mm | arches | episodes | reached | ended by giving up "
         "| steps | largest sum, N |",

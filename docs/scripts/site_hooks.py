@@ -1,8 +1,8 @@
-"""What the documentation site shows beside the pages under docs/.
+"""Hooks of the documentation site, which add pages to those under docs/.
 
 `CONTRIBUTING.md` and `CHANGELOG.md` of the repository become pages, the examples one
-page with their code, notebooks pages with their outputs, formulas MathML. Links that
-lead out of docs/ in the repository lead to those pages on the site.
+page with their code, notebooks pages with their outputs, formulas MathML. Links out of
+docs/ in the repository point to those pages on the site.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from nbconvert import MarkdownExporter
 
 ROOT = Path(__file__).parents[2]
 OF_THE_REPOSITORY = ("CONTRIBUTING.md", "CHANGELOG.md")
-# Pages that not every state of the repository has.
+# Pages that may be missing.
 OPTIONAL = ("results.md", "results_detail.md", "reliability.md", "imitation.md")
-# A table with this many columns takes the room of the page's table of contents.
+# A table with this many columns replaces the page's table of contents.
 _WIDE = 5
-# Characters of a word of code that is not broken.
+# Most characters of a word of code that is kept on one line.
 _WHOLE = 26
-# A link out of docs/ and where it leads on the site.
+# A link out of docs/ to a page of the site.
 _LINK = re.compile(r"\]\((?:\.\./)*(docs/|examples/)?([\w./-]*)(#[\w-]*)?\)")
-# Formulas in TeX, as GitHub draws them: on their own lines, and in a sentence.
+# Formulas in TeX, as on GitHub: on separate lines, and inline.
 _DISPLAYED = re.compile(r"(?ms)^```math\n(.*?)\n```$")
 _INLINE = re.compile(r"\$`([^`\n]+)`\$")
-# Blanks in a table that a line may not end at; code in a sentence.
+# Blanks in a table at which a line may not break; inline code.
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|°|[µmk]?[mNs]|M?B)(?![\w/·]))|(?<=[±≤≥]) | (?=±)")
 _CODE = re.compile(r"<pre.*?</pre>|<code>([^<]+)</code>", re.DOTALL)
 
 
 def on_config(config):
-    """Leaves pages out of the menu that are not there."""
+    """Removes missing pages from the menu."""
     config.nav = _present(config.nav, Path(config.docs_dir))
     return config
 
@@ -53,7 +53,7 @@ def _present(entries, folder):
 
 
 def on_files(files, config):
-    """Adds the pages that are written here."""
+    """Adds the generated pages."""
     for name in OF_THE_REPOSITORY:
         text = (ROOT / name).read_text()
         files.append(File.generated(config, name, content=text))
@@ -68,7 +68,7 @@ def on_files(files, config):
 
 
 def _as_pages(entries):
-    """The menu, with the page of each notebook in its place."""
+    """The menu with the page of each notebook instead of the notebook."""
     if isinstance(entries, list):
         return [_as_pages(entry) for entry in entries]
     if isinstance(entries, dict):
@@ -77,7 +77,7 @@ def _as_pages(entries):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Leads links out of docs/ to pages of the site; gives wide tables room."""
+    """Points links out of docs/ to pages of the site; hides the menu at wide tables."""
     del config, files
     rows = re.findall(r"^\|[-|: ]+\|$", markdown, re.MULTILINE)
     if any(row.count("|") - 1 >= _WIDE for row in rows):
@@ -100,7 +100,7 @@ def on_page_markdown(markdown, page, config, files):
 
 
 def _formulas(markdown: str) -> str:
-    """Formulas as MathML, which browsers draw without a script."""
+    """Replaces formulas by MathML, which browsers draw without a script."""
     shown = r'<div class="formula">{}</div>'
     markdown = _DISPLAYED.sub(
         lambda tex: shown.format(convert(tex[1], display="block")), markdown
@@ -109,8 +109,8 @@ def _formulas(markdown: str) -> str:
 
 
 def _row(line: str) -> str:
-    """A row of a table in which no figure is parted from its unit."""
-    parts = line.split("`")  # code stays as it is: it is copied
+    """A row of a table without line breaks between a value and its unit."""
+    parts = line.split("`")  # code stays unchanged, as readers copy it
     for i in range(0, len(parts), 2):
         text = parts[i].replace("<= ", "≤ ").replace(">= ", "≥ ")
         text = _UNIT.sub("\N{NO-BREAK SPACE}", text)
@@ -121,7 +121,7 @@ def _row(line: str) -> str:
 
 
 def on_page_content(html, page, config, files):
-    """Keeps words of code in a sentence whole, such as options and names of tasks."""
+    """Keeps words of inline code, such as options and task names, on one line."""
     del page, config, files
 
     def whole(code: re.Match) -> str:
@@ -137,7 +137,7 @@ def on_page_content(html, page, config, files):
 
 
 def _examples() -> str:
-    """The examples with their code."""
+    """Page of the examples with their code."""
     parts = ["# Examples", "", "Files under `examples/` of the repository.", ""]
     for path in sorted((ROOT / "examples").glob("*.py")):
         anchor = path.stem.replace("_", "-")
@@ -147,14 +147,14 @@ def _examples() -> str:
 
 
 def _notebook(path: Path) -> dict[str, str | bytes]:
-    """The page of a notebook and its pictures, by their place on the site."""
+    """The page of a notebook and its pictures, by path on the site."""
     notebook = nbformat.read(path, as_version=4)
-    # What installs in Colab tells a reader nothing.
+    # The cell that installs in Colab is left out.
     notebook.cells = [cell for cell in notebook.cells if cell.get("id") != "colab"]
     exporter = MarkdownExporter()
     text, resources = exporter.from_notebook_node(notebook)
     text = re.sub(r"<style.*?</style>", "", text, flags=re.DOTALL)
-    # Between two outputs of a cell, which Markdown would take for one with a gap in it.
+    # A comment separates two outputs of a cell, which Markdown would merge.
     text = re.sub(r"(?m)(^    .*\n)\n{3,}(?=    )", r"\1\n<!-- -->\n\n", text)
     pages: dict[str, str | bytes] = {}
     for name, content in resources.get("outputs", {}).items():

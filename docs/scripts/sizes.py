@@ -1,10 +1,10 @@
-"""What each extra installs, for docs/install.md: packages and MB beside the base.
+"""Packages and MB that each extra adds to the base, for docs/install.md.
 
     python docs/scripts/sizes.py
 
-Counts files of the environment that runs it, and of those whose site-packages stand in
-PYTHONPATH; a package that is installed in none of them is named. Writes the table
-between the markers of the page.
+Counts files of the current environment, and of those whose site-packages are in
+PYTHONPATH; the table names packages that are installed in none of them. Writes the
+table between the markers of the page.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ HEAD = "| extra | brings | packages | MB | largest |", "|---" * 5 + "|"
 
 
 def needed(requirements: list[str], found: dict[str, set[str]]) -> dict[str, set[str]]:
-    """Packages that requirements bring with all of theirs: name -> extras."""
+    """Packages of requirements and of their dependencies, as sets of extras by name."""
     for text in requirements:
         one = Requirement(text)
         name = canonicalize_name(one.name)
@@ -49,7 +49,7 @@ def needed(requirements: list[str], found: dict[str, set[str]]) -> dict[str, set
 
 
 def size(name: str) -> float | None:
-    """MB of an installed package; None if it is not installed."""
+    """Size of an installed package, MB; None if it is not installed."""
     try:
         files = metadata.files(name) or []
     except metadata.PackageNotFoundError:
@@ -59,7 +59,7 @@ def size(name: str) -> float | None:
 
 
 def row(label: str, brings: str, names: set[str]) -> str:
-    """A row of the table."""
+    """A row of the table for an extra and the packages that it adds."""
     sizes = {name: size(name) for name in names}
     known = {name: one for name, one in sizes.items() if one is not None}
     missing = sorted(name for name, one in sizes.items() if one is None)

@@ -3,8 +3,8 @@
     python docs/scripts/test_arches.py --out runs/test_arches.jsonl
     python docs/scripts/test_arches.py --out runs/test_arches.jsonl --write
 
-Every episode is a line of the file as soon as it has ended; the same command goes on
-with those that are missing. `--write` puts the table into docs/difficulty.md.
+Every episode becomes a line of the file when it ends; the same command continues with
+the missing episodes. `--write` writes the table into docs/difficulty.md.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.simulation.batch import BatchSimulation
 
-# Before this folder, which has a difficulty.py, too.
+# Placed before this folder, which has a difficulty.py too.
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import difficulty
 
@@ -42,7 +42,7 @@ def main():
         return
     files.require_file(options.out)
     done = {(row["task"], row["arch"]) for row in read(options.out)}
-    # Both goals of an arch in turn: it is built once.
+    # The goals of an arch follow each other, so that it is built once.
     for number, seed in enumerate(arch.arch_set(options.arches)):
         for task in options.task or TASKS:
             if (task, seed.name) in done:
@@ -54,7 +54,7 @@ def main():
 
 
 def episode(task, arches, number, policy):
-    """One episode on one arch."""
+    """Plays one episode on one arch; returns its end, steps and forces."""
     where = {"arches": arches, "pool": 1, "first": number}
     made = suite.make_task(task, observation="tracking", **where)
     limit = difficulty.LIMITS.get(policy)
@@ -75,7 +75,7 @@ def read(path):
 
 
 def table(rows):
-    """Lines of Markdown: a row for each task and type of arch."""
+    """The table as lines of Markdown, with a row for each task and type of arch."""
     lines = [
         "| task | type | success, % (95 % interval), arches | steps | mean force, mN "
         "| largest contact, mN: mean / largest |",

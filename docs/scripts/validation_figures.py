@@ -13,7 +13,7 @@ COLOURS = (SIMULATED, THEORY, *style.COLOURS[2:5])
 
 
 def draw(name, report, path):
-    """Draws the measurements behind a report, by its name, into a PNG."""
+    """Draws the measurements behind a report into a PNG; `name` is a key of `DRAWN`."""
     figure = DRAWN[name](**report.data)
     style.save(figure, path)
 
@@ -72,7 +72,7 @@ def _cantilevers(ax, bent):
 def _southwell(ax, columns):
     for colour, one in zip(COLOURS, columns, strict=False):
         w = 1e3 * one.deflection
-        # Scaled by Euler's load, so that its line has slope 1.
+        # Scaled by Euler's load, for which the line has slope 1.
         y = w / (one.load / one.expected)
         ax.plot(w, y, "o", color=colour, markersize=5, label=f"guide {one.end}")
         line = np.array([0.0, w.max()])

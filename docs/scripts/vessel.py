@@ -15,7 +15,7 @@ import sys
 import time
 from pathlib import Path
 
-# torchrl goes before dm_control.
+# torchrl must be imported before dm_control.
 from cathsim_dmc.agents.evaluation import evaluate  # isort: skip
 
 import figures
@@ -57,9 +57,9 @@ SAFE = 1.0  # N
 
 
 def costs(rounds: int = 3, episodes: int = 3) -> dict:
-    """Rates of control steps over the rigid vessel's, measured in alternation.
+    """Rates of control steps relative to the rigid vessel's, measured in alternation.
 
-    Rounds repeat the same episodes; of each control step the least time counts.
+    Rounds repeat the same episodes; the least time of each control step counts.
     """
     batches = {
         case: BatchSimulation(
@@ -93,7 +93,7 @@ def costs(rounds: int = 3, episodes: int = 3) -> dict:
 
 
 def soak(episodes: int = 52, steps: int = LONGEST, together: int = 13) -> dict:
-    """Random and pushing actions in living vessels with drawn options, past success."""
+    """Warnings, errors and largest force (N) of long episodes in living vessels."""
     found = {"episodes": 0, "steps": steps, "warnings": 0, "errors": 0, "force": 0.0}
     for number in range(episodes // together):
         task = SOAKED[number % len(SOAKED)]
@@ -124,7 +124,7 @@ def soak(episodes: int = 52, steps: int = LONGEST, together: int = 13) -> dict:
 
 
 def judged(policy: str, task: str, case: str, episodes: int) -> dict:
-    """Success, safe success, largest force and steps of a policy in a vessel."""
+    """Row of success, safe success, largest force (N) and steps of a policy."""
     options = {"vessel": CASES[case], "max_steps": LONGEST}
     result = evaluate(policy, task, episodes, task_kwargs=options)
     return {
@@ -141,7 +141,7 @@ def judged(policy: str, task: str, case: str, episodes: int) -> dict:
 
 
 def table(data: dict) -> str:
-    """All policies in all vessels."""
+    """Table of all policies in all vessels, as Markdown."""
     known = {(row["policy"], row["task"], row["case"]): row for row in data["policies"]}
     rows = ["| policy | task | " + " | ".join(CASES) + " |"]
     rows.append("|---" * (2 + len(CASES)) + "|")
@@ -164,7 +164,7 @@ def _cell(row: dict | None) -> str:
 
 
 def draw(data: dict) -> None:
-    """Success of each policy in each vessel, as a picture."""
+    """Draws a picture of the success of each policy in each vessel."""
     rows = {(policy, task): {} for policy in TASKS for task in TASKS[policy]}
     for row in data["policies"]:
         share = 100 * row["successes"] / row["episodes"]
@@ -185,7 +185,7 @@ def draw(data: dict) -> None:
 
 
 def main():
-    """Measures the parts that are named, then writes page and picture."""
+    """Measures the named parts, then writes page and picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", help="cost, soak, policies")
     parser.add_argument("--episodes", type=int, default=10)
@@ -221,7 +221,7 @@ def main():
 
 
 def _keep(row: dict | None = None, **parts: dict) -> None:
-    """Puts a row in the place of that of the same policy, task and vessel, or parts."""
+    """Writes a row, in place of that of the same policy, task and vessel, or parts."""
     data: dict = json.loads(DATA.read_text())
     for name, part in parts.items():
         data[name] = {**part}

@@ -32,8 +32,8 @@ def build_arch(
 ) -> Anatomy:
     """Anatomy of an arch: tree, wall, surface, inlet and goals.
 
-    Takes less than half a second. The last results are kept in memory, so equal
-    parameters give the same object.
+    Takes less than half a second. The last 32 results are cached: equal parameters
+    give the same object.
 
     Args:
         access: end of the aorta that is open for the device, "ascending" or
@@ -107,8 +107,8 @@ def _bent(
 # Arches that curve in space, as the sampler's do: sizes are the same anatomical means,
 # the limb turns by the sampler's mean, branches lean and bend as far as those of the
 # measured phantoms, and root and BCA are 62.6 and 66 mm apart (mean 62.6 ± 11.4). The
-# LCCA stands one standard deviation steeper than the mean: leaning upstream by 26
-# degrees it lies in the way of a device that slides over the top of the arch.
+# LCCA is one standard deviation steeper than the mean: at the mean of 26 degrees
+# upstream it obstructs a device that slides over the top of the arch.
 TYPE_III = replace(
     TYPE_II,
     bca=_bent(TYPE_II.bca, 8.0, 45e-3, 0.6),
@@ -145,7 +145,7 @@ class ArchSeed:
     """One arch of a set: kind and seed.
 
     Attributes:
-        seed: of the `RandomState` that draws it.
+        seed: seed of the `RandomState` that draws the arch.
         arch_type: "I", "II" or "III".
         variant: one of `VARIANTS`.
         neck: whether it has the arteries of neck and arms.
@@ -158,13 +158,13 @@ class ArchSeed:
 
     @property
     def name(self) -> str:
-        """Such as "arch-II-2000049"."""
+        """Name of the arch, such as "arch-II-2000049"."""
         variant = "" if self.variant == "normal" else f"-{self.variant}"
         kind = "neck" if self.neck else "arch"
         return f"{kind}-{self.arch_type}{variant}-{self.seed}"
 
     def parameters(self) -> ArchParameters:
-        """The arch; the same one at every call."""
+        """Parameters of the arch; the same at every call."""
         random_state = np.random.RandomState(self.seed)
         return sample(
             random_state, self.arch_type, variant=self.variant, neck=self.neck

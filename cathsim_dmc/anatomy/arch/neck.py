@@ -13,9 +13,9 @@ from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.curves import check_septa, ostium_of
 
 _STEP = 2e-3  # m, between points of a centreline
-_TURNS = 11  # steps in which a course turns into its next heading
+_TURNS = 11  # steps over which a course turns into its next heading
 _RIGHT, _BACK, _UP = -np.eye(3)[0], np.eye(3)[1], np.eye(3)[2]
-_SHAKE = 0.15  # deviation of each heading in each coordinate
+_SHAKE = 0.15  # standard deviation of each coordinate of a unit heading
 # Lumen radii, m, mean and deviation: of the common carotid away from its origin (the
 # mean is that of the sampler's LCCA), of the subclavian artery past the vertebral one,
 # and of the vertebral arteries. They are assumptions within the usual ranges, as all
@@ -26,17 +26,17 @@ _THINNEST = 1.3e-3  # m
 
 @dataclass(frozen=True)
 class Course:
-    """The way of one artery.
+    """The course of a new artery, or the extension of an existing one.
 
     Attributes:
-        name: of the artery.
-        parent: it leaves; None for more of an artery that is there.
-        place: arc length on the parent at which it leaves, m.
-        first: heading (3,) at its start; None for that of the artery it goes on with.
-        ways: headings (3,), of any length, into which it turns one after the other, and
-            the length in m of each.
-        radii: of the lumen at equal distances from its start to its end, m. What goes
-            on starts with the radius that is there, which they leave out.
+        name: name of the artery.
+        parent: vessel that the artery leaves; None to extend the artery `name`.
+        place: arc length on the parent at which the artery starts, m.
+        first: heading (3,) at the start; None for an extension.
+        ways: sections, each a heading (3,), of any norm, and a length, m. Along a
+            section the artery turns from the heading before into this one.
+        radii: lumen radii, m, equally spaced from start to end. An extension leaves
+            out the first, which is the radius at the end of the artery.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Course:
 
 
 def with_courses(tree: VesselTree, courses: tuple[Course, ...]) -> VesselTree:
-    """The tree with more arteries, one after the other."""
+    """The tree with the arteries of `courses` added in their order."""
     vessels = dict(tree.vessels)
     for course in courses:
         if course.parent is None:
@@ -75,7 +75,7 @@ def _going_on(line: Centreline, course: Course) -> Centreline:
 def _line(
     start: Array, heading: Array, course: Course, radii: tuple[float, ...]
 ) -> Centreline:
-    """Centreline from a place on that turns into each heading of a course."""
+    """Centreline from `start` (3,), m, that turns into each heading of a course."""
     points = [start]
     for way, length in course.ways:
         target = np.array(way) / np.linalg.norm(way)
@@ -93,15 +93,15 @@ def _line(
 def sample_neck(
     random_state: Random, tree: VesselTree, attempts: int = 20
 ) -> tuple[Course, ...]:
-    """Random arteries of neck and arms for an arch, the same for the same state.
+    """Random arteries of neck and arms for an arch; equal states give equal arteries.
 
-    The BCA parts into the right carotid (`rcca`) and the right subclavian artery
+    The BCA divides into the right carotid (`rcca`) and the right subclavian artery
     (`rsa`), from which the right vertebral artery (`rva`) leaves; the LCCA and the LSA
-    go on, and the left vertebral artery (`lva`) leaves the LSA.
+    are extended, and the left vertebral artery (`lva`) leaves the LSA.
 
     Raises:
-        ValueError: if the arch has no BCA, or the arteries run into each other in each
-            attempt, or one never leaves its parent far enough for its goal.
+        ValueError: if the arch lacks BCA, LCCA or LSA, or if in every attempt arteries
+            intersect or a branch is too short past its ostium for its goal.
     """
     if not {"bca", "lcca", "lsa"} <= tree.vessels.keys():
         raise ValueError(
@@ -123,7 +123,7 @@ def sample_neck(
 
 
 def _check_depths(tree: VesselTree) -> None:
-    """ValueError if a branch runs beside its parent so long that no goal is in it."""
+    """Raises ValueError if a branch is too short past its ostium for its goal."""
     for name, vessel in tree.vessels.items():
         past = vessel.centreline.length - vessel.ostium
         if vessel.parent is not None and past < GOAL_DEPTH:
@@ -131,7 +131,7 @@ def _check_depths(tree: VesselTree) -> None:
 
 
 def _drawn(source: Random, tree: VesselTree) -> tuple[Course, ...]:
-    """Arteries at random.
+    """Draws the arteries.
 
     The right subclavian artery rises over the lung and falls to the arm; the vertebral
     arteries leave the backs and tops of both subclavian arteries and climb.
@@ -150,7 +150,7 @@ def _drawn(source: Random, tree: VesselTree) -> tuple[Course, ...]:
     carotid, arm = min(radius(_CAROTID), 0.8 * wide), min(radius(_ARM), 0.75 * wide)
     rise = source.uniform(0.3, 1.2)
     steep, climb = _RIGHT + rise * _UP, _UP + source.uniform(0.0, 0.3) * _RIGHT
-    # The first cross-sections of both, at most 0.8 as wide, lie inside the BCA.
+    # The first cross-sections of both, of at most 0.8 of its radius, lie in the BCA.
     leans = [
         np.linalg.norm(np.cross(end, x)) / np.linalg.norm(x) for x in (steep, climb)
     ]

@@ -7,12 +7,12 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.arch.neck import Course
 
 MINIMUM_SEPTUM = 1e-3  # m of wall between two lumens side by side
-# Tube in front of the ascending aorta, m: the device starts with its steerable tip
-# (70 mm) free of the introducer sheath and its head in the ascending aorta.
+# Tube proximal to the ascending aorta, m: the device starts with its steerable tip
+# (70 mm) out of the introducer sheath and its head in the ascending aorta.
 INLET_TUBE = 70e-3
 
 LEVELS = ("ascending", "bca_level", "lcca_level", "lsa_level", "descending")
-# Least and largest value of each figure, and its unit.
+# Minimum, maximum and unit of each parameter.
 _ANGLE, _TURN = (-1.3, 1.3, "rad"), (-2.0 * math.pi, 2.0 * math.pi, "rad")
 _OF_BRANCH = {
     "radius": (1.5e-3, 12e-3, "m"),
@@ -53,10 +53,10 @@ class BranchParameters:
         bend_azimuth: direction of the bend: 0 downstream in the plane of the arch,
             pi upstream, pi/2 out of the plane to the patient's right and back.
         lean: angle of the first part out of the plane of the arch, positive to the
-            patient's right and back; the ostium lies as far round the aorta.
+            patient's right and back; the ostium turns around the aorta by the same.
         second_bend_radius: radius of curvature of the distal half, after the first
-            bend; None to go on with the first bend.
-        second_bend_azimuth: direction of that bend, as `bend_azimuth`.
+            bend; None to continue the first bend.
+        second_bend_azimuth: direction of the second bend, as `bend_azimuth`.
     """
 
     radius: float
@@ -100,16 +100,19 @@ class ArchParameters:
         bovine: the LCCA leaves the BCA, `bca_lcca_spacing` above the BCA's ostium
             along the BCA, instead of leaving the arch; `lcca_lsa_spacing` is then
             from the BCA to the LSA.
-        ascending_bend: angle by which the ascending limb turns, evenly, before the
-            arch: its root leans away from the descending limb by as much.
-        descending_bend: angle by which the descending limb turns on after the arch.
+        ascending_bend: angle by which the ascending limb turns, at constant
+            curvature, before the arch; its first heading leans away from the
+            descending limb by this angle.
+        descending_bend: angle by which the descending limb turns after the arch, in
+            the same direction.
         plane_tilt: angle of the plane of the arch from the vertical, positive with
             its top to the patient's right and back.
-        bow, sway: amplitudes of half a wave and of a whole one by which the aorta's
-            centreline leaves the plane, positive to the right and back at first.
+        bow, sway: amplitudes of the half-wave and the full-wave sinusoid that displace
+            the aorta's centreline out of the plane, at first to the right and back.
         aberrant: right subclavian artery that leaves the aorta last ("rsa"); the
-            first branch is then the right carotid ("rcca") with the figures of `bca`.
-        lsa_aberrant_spacing: between their ostium centres, as the other spacings.
+            first branch is then the right carotid ("rcca") with the values of `bca`.
+        lsa_aberrant_spacing: between the ostium centres of LSA and aberrant artery,
+            along the outer curve of the arch.
         neck: arteries beyond the branches of the arch, see `neck.sample_neck`.
     """
 
@@ -172,7 +175,7 @@ class ArchParameters:
                 )
 
     def _check_spacings(self) -> None:
-        # Leave the ostium before branching, and keep the branch on the trunk.
+        # A bovine LCCA leaves the BCA beyond its ostium and within its length.
         before_lsa, low, high = self.bca, self.lcca.radius + 2e-3, 25e-3
         if not self.bovine:
             before_lsa, high = self.lcca, 80e-3

@@ -43,10 +43,10 @@ TAKE_OFFS = {"bca": (44.9, 15.9), "lcca": (25.7, 15.5), "lsa": (-28.8, 14.5)}
 # the sagittal plane, degrees (BCA-LSA line).
 ASCENDING_LENGTH = (62.6e-3, 11.4e-3)
 PLANE_ROTATION = (50.3, 13.8)
-# Spacing of the ostia BCA-LCCA and LCCA-LSA, m; the wall between two flared ones.
+# Spacing of the ostia BCA-LCCA and LCCA-LSA, m; least wall between flared ostia, m.
 SPACINGS = (21.8e-3, 14.3e-3)
 _WALL = 2e-3
-# What no table gives is spread around the two measured phantoms.
+# Assumed, as no table gives them: spread around the two measured phantoms.
 ASCENDING_BEND = (30.0, 12.0)  # degrees
 _PLANE_TILT = (0.0, 6.0)  # degrees
 _SWAY = (4e-3, 3e-3)  # m
@@ -60,7 +60,7 @@ _ARCH_ASPECT = (0.9, 1.15)
 _DESCENDING_LENGTH = (105e-3, 125e-3)  # m, below the arch
 _AORTA_CORRELATION = 0.8  # of the levels of one aorta; an assumption
 _ATTEMPTS = 1000
-_CORRECTIONS = 5  # of drop and ascending length towards what was drawn, at most
+_CORRECTIONS = 5  # at most, of drop and ascending length towards the drawn values
 _LENGTH_TOLERANCE, _DROP_TOLERANCE = 2e-3, 0.05  # m; LCCA diameters
 _SHORTEST_LIMB = 6e-3  # m
 _LIMB_BEND = 1.4  # least radius of a limb's bend, in widest radii of the lumen
@@ -73,7 +73,7 @@ def sample(
     variant: str = "normal",
     neck: bool = False,
 ) -> ArchParameters:
-    """Random arch from the anatomical distributions, measured to be of the type drawn.
+    """Random arch from the anatomical distributions whose measured type is `arch_type`.
 
     The same random state gives the same arch.
 
@@ -81,17 +81,18 @@ def sample(
         random_state: Source of all draws.
         arch_type: "I", "II" or "III".
         variant: One of `VARIANTS`.
-        neck: Whether the arteries of neck and arms are drawn, too; not of an aberrant.
+        neck: Whether to draw the arteries of neck and arms; not with "aberrant".
 
     Raises:
-        ValueError: if there is no such type or variant, or neck with an aberrant.
+        ValueError: if there is no such type or variant, or neck with "aberrant".
+        RuntimeError: if no attempt gives a valid arch.
     """
     if neck and variant == "aberrant":
         raise ValueError("an aberrant arch has no neck; leave out one of the two")
     bounds.choice("arch_type", arch_type, DROP_RANGES)
     bounds.choice("variant", variant, VARIANTS)
     for _ in range(_ATTEMPTS):
-        # Independent draws now and then give branches that cross: draw again.
+        # Independent draws occasionally give branches that intersect: draw again.
         drop = uniform(random_state, DROP_RANGES[arch_type])
         try:
             params = _draw(random_state, drop, variant)
@@ -106,7 +107,7 @@ def sample(
 
 
 def kind_at(share: float) -> str:
-    """Type of arch at a share (0 to 1) of all by prevalence."""
+    """Type of arch at a quantile (0 to 1) of the cohort, ordered by type."""
     place = np.searchsorted(np.cumsum(_PREVALENCE), share)
     return list(DROP_RANGES)[min(int(place), 2)]
 
@@ -114,10 +115,14 @@ def kind_at(share: float) -> str:
 def _corrected(
     params: ArchParameters, drop: float, ascending: float
 ) -> tuple[ArchParameters, VesselTree]:
-    """The arch whose measured drop and ascending length are those drawn, and its tree.
+    """Corrects an arch until its measured drop and ascending length are those drawn.
+
+    Returns:
+        The corrected parameters and their tree.
 
     Raises:
-        ValueError: if there is none, or it is of another type.
+        ValueError: if the corrections do not converge, or the arch is measured as
+            another type.
     """
     bend = params.ascending_bend
     for _ in range(_CORRECTIONS):
@@ -158,7 +163,7 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
         branches["bca"] = replace(
             branches["bca"], radius=radius, end_radius=min(radius, 3.15e-3)
         )
-        # It leaves the back of the arch, to the right and up.
+        # The aberrant artery leaves the back of the arch, to the right and up.
         aberrant = replace(
             _branch(source, "lsa"),
             take_off=math.radians(source.uniform(-10.0, 20.0)),
@@ -170,8 +175,8 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
         "lcca_lsa_spacing": max(SPACINGS[1], radii["lcca"] + radii["lsa"] + _WALL),
     }
     if variant.startswith("bovine"):
-        # The LSA stays where it would be. The LCCA leaves right above the ostium of a
-        # common trunk, or 10 to 18 mm up the BCA (both lengths are assumptions).
+        # The LSA keeps its place. The LCCA leaves just above the ostium of a common
+        # trunk, or 10 to 18 mm up the BCA (both lengths are assumptions).
         least = radii["lcca"] + 2.2e-3
         along = least + source.uniform(0.0, 2e-3)
         if variant == "bovine_branch":
@@ -203,9 +208,9 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
 
 def _branch(source: Random, name: str) -> BranchParameters:
     radius = 0.5 * normal(source, BRANCH_DIAMETERS[name])
-    # Taper: the LCCA narrows to a mid common carotid of 6.3 mm, others by a tenth.
+    # Taper: the LCCA narrows to the 6.3 mm of a mid common carotid, others by a tenth.
     end = min(radius, 3.15e-3) if name == "lcca" else 0.9 * radius
-    # Downstream at first for those that lean upstream, and back for the LSA.
+    # BCA and LCCA lean upstream and first bend downstream; the LSA does the opposite.
     towards = math.pi if name == "lsa" else 0.0
     turn = source.uniform(-math.pi / 2, math.pi / 2)
     bends = (_TIGHTEST_BRANCH_BEND * radius, _WIDEST_BRANCH_BEND)

@@ -1,4 +1,4 @@
-"""Geometry of parametric aortic arches: from their figures to a vessel tree."""
+"""Geometry of parametric aortic arches: from parameters to a vessel tree."""
 
 import math
 
@@ -23,17 +23,17 @@ from cathsim_dmc.anatomy.curves import check_septa, flare_begin
 
 # Polyline steps, m: the chord of 2 mm on a 34 mm arch departs 0.015 mm from it.
 _STRAIGHT_STEP, _CURVED_STEP, _FLARE_STEP = 5e-3, 2e-3, 0.5e-3
-_FILLET = 2.5e-3  # m, by which a radius grows at its ostium, at most
-# An ostium more oblique than this from the wall's normal, or farther from the parent's
-# axis in radii, is a slit.
+_FILLET = 2.5e-3  # m, largest increase of a branch radius at its ostium
+# Largest angle of a branch from the wall's normal, and largest distance of its ostium
+# from the parent's centreline in parent radii; beyond them the ostium is a slit.
 _MOST_OBLIQUE, _LONGEST_EXIT = math.radians(60.0), 2.2
-_BLEND = 8e-3  # m, in which the second bend takes over
+_BLEND = 8e-3  # m, over which the first bend changes into the second
 _INTEGRATION_STEP = 0.5e-3  # m
 _UPRIGHT = np.array([0.0, 0.0, 1.0])
 
 
 class Plane:
-    """The plane of the arch: `along` it, `up`, and `normal`, to the right and back."""
+    """Plane of the arch: unit vectors `along`, `up`, and `normal` (right and back)."""
 
     def __init__(self, rotation: float, tilt: float):
         self.along = np.array([math.sin(rotation), math.cos(rotation), 0.0])
@@ -42,7 +42,7 @@ class Plane:
         self.normal = np.cross(self.up, self.along)
 
     def to_world(self, flat: Array) -> Array:
-        """World coordinates (..., 3) of in-plane ones (..., 2)."""
+        """World coordinates (..., 3) of in-plane coordinates (..., 2), along and up."""
         return flat[..., :1] * self.along + flat[..., 1:] * self.up
 
 
@@ -56,7 +56,7 @@ def _smooth_interpolation(s: Array, stations: Array, values: Array) -> Array:
 
 
 def _limb(length: float, bend: float, heading: float) -> Array:
-    """Points (n, 2) m of a limb from 0 on that turns to the right by `bend`, rad."""
+    """Points (n, 2), m, of a limb from the origin that turns right by `bend`, rad."""
     step = _STRAIGHT_STEP if abs(bend) < 1e-9 else _CURVED_STEP
     s = np.linspace(0.0, length, max(1, round(length / step)) + 1)
     if abs(bend) < 1e-9:
@@ -94,7 +94,7 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, list[float]]:
     levels = [top - 15e-3, top, top + 12e-3]
     arch_end = float(s[-1] - p.descending_length)
     radii_of = np.array([getattr(p, f"{level}_radius") for level in LEVELS])
-    # Levels depend on the outer curve, that on the radii, and these on the levels.
+    # Iterates: levels depend on the outer curve, the curve on radii, radii on levels.
     for _ in range(8):
         stations = np.array([0.5 * p.ascending_length, *levels[:3], arch_end])
         if np.any(np.diff(stations) <= 1e-3):
@@ -119,7 +119,7 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, list[float]]:
 
 
 def arch_tree(params: ArchParameters) -> VesselTree:
-    """Vessels of an arch; ValueError if branches do not fit or meet each other."""
+    """Vessels of an arch; ValueError if branches do not fit or intersect."""
     plane = Plane(params.plane_rotation, params.plane_tilt)
     points, radii, outer, levels = _outer_curve(params)
     s = arc_lengths(points)
@@ -159,7 +159,7 @@ def arch_tree(params: ArchParameters) -> VesselTree:
 def _ostium(
     points: Array, outer: Array, level: float, aorta: Vessel, plane: Plane, lean: float
 ) -> Array:
-    """Point (3,) on the aorta's surface, `lean` round it from its outer curve."""
+    """Ostium (3,), m, on the aorta's surface at `lean`, rad, from its outer curve."""
     flat, numbers = arc_lengths(points), np.arange(len(points))
     index = float(np.interp(level, flat, numbers))
     # The curve in space is a little longer than the one in the plane.
@@ -175,11 +175,11 @@ def _ostium(
 
 
 def _septa(params: ArchParameters) -> list[float]:
-    """Wall (m) between the ostium of each branch, without flare, and the nearest."""
+    """Wall (m) between each ostium, without flare, and the nearest other ostium."""
     radii = [branch.radius for branch in params.branches.values()]
     before, last = math.inf, math.inf
     after = params.lcca_lsa_spacing - radii[0 if params.bovine else 1] - radii[2]
-    if not params.bovine:  # whose LCCA is on the BCA
+    if not params.bovine:  # a bovine LCCA leaves the BCA
         before = params.bca_lcca_spacing - radii[0] - radii[1]
     if params.aberrant is not None:
         last = params.lsa_aberrant_spacing - radii[2] - radii[3]
@@ -196,9 +196,9 @@ def _branch_vessel(
     plane: Plane,
     fillet: float,
 ) -> Vessel:
-    """Branch with its first direction (3,) and fillet (m), from an ostium (3,) m."""
-    # Start where the axis, followed back into the parent, is nearest to the
-    # parent's centreline; then aim from there at the ostium.
+    """Branch through an ostium (3,), m, with its direction (3,) and fillet (m)."""
+    # The branch starts where its axis, extended back into the parent, is nearest to the
+    # parent's centreline, and its direction is from there to the ostium.
     line = parent.centreline
     back = np.linspace(0.0, 4.0, 400)[:, None] * float(line.project(ostium).radius)
     crossing = line.project(ostium - back * direction)
@@ -235,7 +235,7 @@ def _branch_vessel(
     s = np.unique(np.concatenate(parts))
     points = place.position + _path(p, s, direction, plane, flare_end + 6e-3, length)
     progress = np.clip((s - exit_length) / p.length, 0.0, 1.0)
-    # Quadratic from the full fillet where the ring is inside the parent to none.
+    # The fillet falls quadratically from where the cross-section is in the parent.
     u = np.clip((s - flare_start) / (flare_end - flare_start), 0.0, 1.0)
     radii = p.radius + (p.end_radius - p.radius) * progress + fillet * (1.0 - u) ** 2
     return Vessel(name, Centreline(points, radii), parent.name, exit_length)
@@ -245,7 +245,7 @@ def _path(
     p: BranchParameters, s: Array, direction: Array, plane: Plane,
     bend_start: float, length: float,
 ) -> Array:  # fmt: skip
-    """Points (n, 3) at arc lengths `s` of a branch that starts at the origin."""
+    """Points (n, 3), m, at arc lengths `s` of a branch that starts at the origin."""
     in_plane = np.cross(plane.normal, direction)
     in_plane /= np.linalg.norm(in_plane)
     if in_plane @ plane.along < 0.0:
@@ -258,7 +258,7 @@ def _path(
         along = np.minimum(s, bend_start) + p.bend_radius * np.sin(turn)
         aside = p.bend_radius * (1.0 - np.cos(turn))
         return along[:, None] * direction + aside[:, None] * bend
-    # Curvature in a frame that does not twist, integrated in small steps.
+    # Integrates the curvature in a twist-free frame.
     count = max(2, math.ceil(length / _INTEGRATION_STEP))
     fine = np.linspace(0.0, length, count)
     middle = 0.5 * (bend_start + length)

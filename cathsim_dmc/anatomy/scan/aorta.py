@@ -15,46 +15,47 @@ from cathsim_dmc.anatomy.scan.units import mm, shown
 from cathsim_dmc.anatomy.scan.ways import Ways
 
 RADIUS = 3e-3  # m, least median radius of an aorta, a newborn's
-THIN = 0.25  # of the widest end: ends that are no wider are no end of the aorta
+THIN = 0.25  # least width of an end of the aorta, relative to the widest end
 WIDEST = 4  # ends from which the aorta may start
-SMOOTH = 6e-3  # m, standard deviation along the way, which steps from node to node
-ARM = 60e-3  # m to both sides of a place, over which the bend there is taken
+SMOOTH = 6e-3  # m, standard deviation of the smoothing along a path of nodes
+ARM = 60e-3  # m to both sides of a point, over which its bend is measured
 TURN = np.radians(75.0)  # least bend of an arch
 ADULT = 6.0  # mm, least median radius of an aorta that may be cut off at its branches
-LOOP = np.radians(140.0)  # least bend of an arch of which one branch is seen
-# Of the aorta's width: a branch at the bend that is wider is a limb; and the same where
-# an end of the aorta is narrower than the last number.
+LOOP = np.radians(140.0)  # least bend of an arch with a single visible branch
+# A branch at the bend that is wider than THIRD of the aorta's width is a limb of it;
+# THIRD_OF_TAPERED holds if an end of the aorta is narrower than TAPERED of its width.
 THIRD, THIRD_OF_TAPERED, TAPERED = 0.85, 0.65, 0.7
-TURN_OF_STUMP = np.radians(60.0)  # the same of one that is cut off past its branches
-LEG = 80e-3  # m of each leg that are compared, from 10 mm past the branches on
-# m of a limb from the bend on, at most half, that has no direction yet; its length from
-# which on its direction counts, and what more makes that as sure as the branches'.
+TURN_OF_STUMP = np.radians(60.0)  # least bend of an arch cut off past its branches
+LEG = 80e-3  # m, compared length of each leg, from 10 mm past the branches
+# Limbs of the bend, m: the part next to the apex that is left out of the direction (at
+# most half), the length from which the direction counts, and the further length that
+# gives it the full weight.
 LIMB, COUNTS, FULL = 50e-3, 40e-3, 60e-3
 CHORD = 60e-3  # m of a branch over which its direction is taken
-UPRIGHT = 0.9  # cosine between the limbs of the aorta and +z of a scan that stands
-DOWN = -0.5  # cosine from which on a bend points to the feet, in a scan that stands
-# Longest usual ascending aorta, m, and what more makes it e times less likely.
+UPRIGHT = 0.9  # least cosine between the arch and +z of an upright scan
+DOWN = -0.5  # largest cosine to +z of a bend that points to the feet
+# Longest usual ascending aorta, m, and the excess that divides its odds by e.
 ASCENDING, LONGER = 70e-3, 18e-3
-# Way from the middle of the arch's branches to the top, m: the more, the steeper the
-# type of the arch (`arch.sampler`: 0, 13 and 21 mm for types I to III, each +- 8).
+# Arc length from the middle of the arch's branches to the top, m: mean and standard
+# deviation (`arch.sampler`: 0, 13 and 21 mm for types I to III, each +- 8).
 BEFORE, BEFORE_SPREAD = 10e-3, 11e-3
-# Azimuth of the way from ascending to descending leg, from back to left, in a body
-# that stands upright: 50 degrees, standard deviation 14 (`arch.sampler`), here 25 for
-# what was cut; the range that is accepted; and how often a scan is not as it seems.
+# Azimuth from the ascending to the descending leg, from back to left, in an upright
+# body: 50 degrees, standard deviation 14 (`arch.sampler`), here 25 to allow for cut
+# scans. TURNED is the share of misoriented scans, AZIMUTH the accepted range.
 FACING, FACING_SPREAD, TURNED = np.radians(50.0), np.radians(25.0), 0.02
 AZIMUTH = (np.radians(-5.0), np.radians(97.0))
-# What is wrong with a scan whose sides are not the patient's.
+# Message about a scan whose sides are not the patient's.
 MISPLACED = "the scan is mirrored, turned, or in another frame (--frame, --axes)"
 
 
 def find_aorta(
     ways: Ways, ends: Sequence[FreeEnd], turn: float = TURN
 ) -> tuple[tuple[int, int] | None, str]:
-    """The two ends (rows) between which an aorta bends by a ``turn`` (rad), or None.
+    """Indices of the two ends of the aorta; or None, and the reason.
 
-    Also says why there is none.
-    It is the way between two free ends with the largest sum of fourth powers of the
-    depth: a wide stump counts more than a long branch.
+    The aorta is the path between two free ends with the largest sum of fourth powers of
+    the depth: a wide stump counts more than a long branch. It must bend by more than
+    ``turn`` (rad).
     """
     width = np.array([end.radius for end in ends])
     order = [int(k) for k in np.argsort(-width) if width[k] > THIN * width.max()]
@@ -91,14 +92,14 @@ class Bend:
     """The bend of an aorta; directions are unit vectors (3,)."""
 
     line: np.ndarray  # (n, 3) m, smoothed, 1 mm apart
-    apex: int  # row of the line at which it bends most
-    turn: float  # rad, bend between 60 mm before and after the apex
-    up: np.ndarray  # mean direction of both limbs to the bend and of the branches
+    apex: int  # row of the line that is farthest from the chord of its two arms
+    turn: float  # rad, largest bend between 60 mm before and after a point
+    up: np.ndarray  # mean direction of the limbs towards the bend and of the branches
     along: np.ndarray  # from the leg before the apex to the one after it
 
     @classmethod
     def of(cls, way: np.ndarray, branches: Sequence[np.ndarray] = ()) -> Self:
-        """The bend of a way (n, 3) m, with branches (m_i, 3) m that leave it."""
+        """The bend of a path (n, 3), m, with branches (m_i, 3), m, that leave it."""
         line = resample(way)
         width = min(SMOOTH / 1e-3, len(line) / 6)
         line = gaussian_filter1d(line, width, axis=0, mode="nearest")
@@ -108,7 +109,7 @@ class Bend:
         first = np.maximum(rows - reach, 0)
         last = np.minimum(rows + reach, len(line) - 1)
         cosine = np.vecdot(tangent[first], tangent[last])
-        # Of the places that see both arms, the one farthest above them.
+        # The apex is the point with both arms that is farthest from their chord.
         rise = line - 0.5 * (line[first] + line[last])
         height = np.linalg.norm(rise, axis=1) - 1e-3 * cosine
         height[: reach // 2] = height[len(line) - reach // 2 :] = -np.inf
@@ -140,10 +141,10 @@ class Bend:
         return int((self.line @ self.head).argmax())
 
     def azimuth(self, heart_last: bool) -> float | None:
-        """Angle from back to left of the way from heart to descending aorta, rad.
+        """Azimuth (rad), from back to left, from the ascending to the descending leg.
 
         Both legs are taken at the height of the higher end, or 60 mm below the top.
-        None if the scan does not stand upright or the legs are not told apart.
+        None if the scan is not upright or the legs are less than 10 mm apart.
         """
         height, top = self.line @ self.head, self.top
         off = np.abs(height - max(height[0], height[-1], height[top] - ARM))
@@ -155,7 +156,7 @@ class Bend:
 
 
 def bend_of(tree: VesselTree) -> Bend | None:
-    """The bend of the aorta at which a tree begins; None if it begins otherwise."""
+    """The bend of the aorta at the root of a tree; None if the root is no aorta."""
     line = tree.root.centreline
     bend = Bend.of(line.points)
     if np.median(line.radii) < RADIUS or bend.turn < TURN_OF_STUMP:
@@ -170,7 +171,10 @@ def bend_of(tree: VesselTree) -> Bend | None:
 
 
 def unproven(tree: VesselTree, turn: np.ndarray | None) -> str | None:
-    """What is not known about the sides of a scan that was turned (3, 3), or None."""
+    """Warning that left and right of a scan were not checked, or None.
+
+    ``turn`` (3, 3) is the rotation that the import applied; None for none.
+    """
     bend = bend_of(tree)
     if bend is not None and bend.upright:
         return None
@@ -189,7 +193,7 @@ def unproven(tree: VesselTree, turn: np.ndarray | None) -> str | None:
 
 
 def mirrored(azimuth: float | None) -> str | None:
-    """What is wrong with the side to which an arch leads, or None."""
+    """Message about an unusual side to which an arch leads from the heart, or None."""
     if azimuth is None or AZIMUTH[0] <= azimuth <= AZIMUTH[1]:
         return None
     side = "left" if azimuth > 0 else "right"
@@ -210,7 +214,11 @@ def right_sided(azimuth: float) -> bool:
 
 
 def heart_odds(bend: Bend, depth: np.ndarray, places: Sequence[float]) -> float:
-    """Log odds that the heart is at the last point of an aorta with depths (n,) m."""
+    """Log odds that the heart is at the last point of an aorta.
+
+    ``depth`` (n,), m, is that of the bend's line, ``places`` the arc lengths, m, of the
+    branches.
+    """
     first, last = min(places), max(places)
     s = 1e-3 * np.arange(len(bend.line))
     legs = [
@@ -222,7 +230,7 @@ def heart_odds(bend: Bend, depth: np.ndarray, places: Sequence[float]) -> float:
         before, after = (float(np.median(depth[leg])) for leg in legs)
         # Diameters 29.5 and 23.9 mm; their ratio has a standard deviation of 15 %.
         total += np.clip(18.0 * np.log(after / before), -4.0, 4.0)
-    # The ascending aorta is 63 (11) mm long up to its branches, or cut off.
+    # The ascending aorta is 63 ± 11 mm long up to its branches, or cut off.
     longer = [max(leg - ASCENDING, 0.0) / LONGER for leg in (first, s[-1] - last)]
     total += min(longer[0], 5.0) - min(longer[1], 5.0)
     # The branches leave before the top.
@@ -244,9 +252,9 @@ def _facing(azimuth: float) -> float:
 
 
 def is_upright(anatomy: Anatomy) -> bool:
-    """Whether +x is the patient's left and +z the head, as far as can be told.
+    """Whether +x is known to be the patient's left and +z the head.
 
-    So it is for phantoms, and for scans whose arch is seen to stand upright.
+    This holds for phantoms, and for scans whose arch stands upright.
     """
     if anatomy.scan is None:
         return True
@@ -255,7 +263,7 @@ def is_upright(anatomy: Anatomy) -> bool:
 
 
 def chord(row: np.ndarray) -> np.ndarray:
-    """Direction (3,), unit, of what a row (n, 3) m of points first leads to."""
+    """Unit direction (3,) of the first 60 mm of a polyline (n, 3), m."""
     return _unit(row[arc_lengths(row) <= CHORD][-1] - row[0])
 
 

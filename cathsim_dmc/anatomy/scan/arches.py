@@ -1,4 +1,4 @@
-"""The arch of a lumen without drawn centrelines: its heart, its entry and its names."""
+"""Recognition of an aortic arch in a lumen: its heart, its entry and its names."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,23 +21,23 @@ from cathsim_dmc.anatomy.scan.offshoots import (
 from cathsim_dmc.anatomy.scan.units import mm, shown
 from cathsim_dmc.anatomy.scan.ways import Ways
 
-LIKE_NONE = 0.85  # probability of no pattern from which on a bend is no arch
+LIKE_NONE = 0.85  # probability of no known pattern, above which a bend is no arch
 
 
 @dataclass(frozen=True)
 class Arch:
-    """An aorta that turns back, seen from the end that is not at the heart."""
+    """An aortic arch, with its paths from the end that is not at the heart."""
 
     ways: Ways
-    ends: tuple[FreeEnd, FreeEnd]  # that at the heart last
-    entry: LumenEntry  # at the first of them; at the last if the first is a stump
-    found: list[np.ndarray]  # `centrelines` from there on
-    bend: Bend  # of the aorta, from there on
+    ends: tuple[FreeEnd, FreeEnd]  # the end at the heart last
+    entry: LumenEntry  # at the first end; at the last if the first is a stump
+    found: list[np.ndarray]  # `centrelines` from the entry
+    bend: Bend  # of the aorta, from the first end
     width: np.ndarray  # (n,) m, depth along the bend's line
     branches: list[Offshoot]  # of the arch
     heart: float  # probability that the heart is at the last end
-    right: bool = False  # whether it is known to be a right-sided arch
-    given: bool = False  # whether the user says that it is an arch, by its heart
+    right: bool = False  # whether the arch is known to be right-sided
+    given: bool = False  # whether the user gave the heart
 
     @classmethod
     def of(
@@ -45,8 +45,8 @@ class Arch:
     ) -> Self | str:
         """The arch of a lumen with free ends, or why it has none.
 
-        The `heart` (3,) m is near the end at the heart, or None to find it; ValueError
-        if it is near no end of an aorta.
+        `heart` (3,), m, is a point near the end at the heart, or None to find that end.
+        ValueError if it is near no end of an aorta.
         """
         (pair, why), cut = aorta.find_aorta(ways, ends), None
         if pair is None and (cut := stump(ways, ends)) is not None:
@@ -59,7 +59,7 @@ class Arch:
                     f"give the inlet instead of the heart. Its ends are {listed(ends)}."
                 )
             return why
-        # The wider end is more often at the heart; then all is computed once.
+        # The wider end is tried first as the heart: it usually is.
         first, last = sorted((ends[k] for k in pair), key=lambda end: end.radius)
         if heart is not None:
             gaps = [np.linalg.norm(end.position - heart) for end in (first, last)]
@@ -82,7 +82,7 @@ class Arch:
         first, last = arch.ends
         if first is not cut:
             return arch
-        # Too short for a device that enters there.
+        # The stump is too short for a device, which enters at the heart instead.
         entry = LumenEntry(last.position, True, first.position)
         return replace(arch, entry=entry, found=extract.centrelines(ways, ends, entry))
 
@@ -97,7 +97,7 @@ class Arch:
         return cls(ways, (first, last), entry, found, bend, width, branches, heart)
 
     def _unlike(self) -> str:
-        """Why the bend is no aortic arch, or nothing."""
+        """Reason why the bend is no aortic arch; empty if it is one."""
         bend, width = self.bend, self.width
         limb = third_limb(self.ways, bend, width, self.found)
         if limb is not None:
@@ -111,7 +111,7 @@ class Arch:
         count = len(self.branches)
         cut = bend.turn < aorta.TURN and mm(float(np.median(width))) > aorta.ADULT
         if count and cut:
-            # Cut off past its branches, where it would turn.
+            # The aorta is cut off past its branches, where it would turn.
             count = len(list(departures(bend, width, self.found)))
         if not count or (count == 1 and bend.turn < aorta.LOOP):
             count = "one branch leaves" if count else "no branch leaves"
@@ -122,7 +122,7 @@ class Arch:
         return ""
 
     def _unlisted(self) -> str:
-        """Why its branches are those of no arch, or nothing."""
+        """Reason why the branches are those of no arch; empty if they are."""
         if not self.branches:
             return ""
         share = _shares(self.bend, self.width, self.branches)
@@ -135,9 +135,10 @@ class Arch:
         return ""
 
     def on_its_side(self, certain: bool) -> Self:
-        """The arch, right-sided if it leads to the right; ValueError if it may not.
+        """The arch, marked as right-sided if it leads to the right.
 
-        It may if the user says where its heart is and how it stands, both: `certain`.
+        `certain` is whether the user gave both heart and axes. Without them an arch
+        that leads to an unusual side raises ValueError.
         """
         azimuth = self.bend.azimuth(heart_last=True)
         wrong = aorta.mirrored(azimuth)
@@ -148,9 +149,10 @@ class Arch:
         return replace(self, right=True)
 
     def entered(self, inlet: np.ndarray | None, planned: LumenEntry) -> LumenEntry:
-        """Where the device enters: by default at the end that is not at the heart.
+        """Entry of the device: by default the end that is not at the heart.
 
-        A given inlet (3,) m means the `planned` entry; the aorta leads on from there.
+        With a given inlet (3,), m, it is the `planned` entry, with the root along the
+        aorta.
         """
         if inlet is None:
             return self.entry
@@ -164,15 +166,15 @@ class Arch:
         return planned
 
     def named(self, curves: Sequence[np.ndarray], root: np.ndarray | None) -> Naming:
-        """Names of curves (m_i, 3) m that leave a root, which leads to (3,) m.
+        """Names of curves (m_i, 3), m, that leave a root with the far end (3,), m.
 
-        A root that leads to no end of the aorta is seen towards the farther end.
+        If that is no end of the aorta, the root is taken to lead to the farther end.
         """
         names, notes, right = self._named(curves, root)
         return Naming(names, [*notes, *self._young()], right)
 
     def _young(self) -> list[str]:
-        """What to ask of an arch that is as narrow as a child's."""
+        """Question about an arch that is as narrow as a child's; else empty."""
         wide = mm(2.0 * float(np.median(self.width)))
         if self.given or wide >= 2.0 * aorta.ADULT:
             return []
@@ -223,19 +225,19 @@ def _shares(
 
 
 def _scale(width: np.ndarray) -> float:
-    """Median radius (m) of an aorta by that of a usual one, within limits."""
+    """Median radius of an aorta relative to the usual one, within 0.5 to 1.5."""
     return float(np.clip(np.median(width) / naming.AORTA, 0.5, 1.5))
 
 
 def _branches(
     ways: Ways, start: np.ndarray, far: np.ndarray, curves: Sequence[np.ndarray]
 ) -> tuple[Bend, np.ndarray, list[Offshoot]]:
-    """Bend of the aorta between places, depth along it, and branches of the arch."""
+    """Bend of the aorta between two points, depth along it, and its branches."""
     way = ways.trace(ways.deepest_from(ways.node(start)), ways.node(far))
     points = ways.points[way]
     bend = Bend.of(points)
     width = ways.depth[way][cdist(bend.line, points).argmin(axis=1)]
     found = offshoots(ways, bend, width, curves) if curves else []
-    # Where a limb is short its branches say better where the head is.
+    # The branches give the direction to the head where a limb is short.
     rows = [max(one.rows, key=len) for one in found if one.rows]
     return Bend.of(points, rows), width, found

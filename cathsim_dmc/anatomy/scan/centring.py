@@ -11,10 +11,10 @@ SMOOTH = 0.6  # radii, standard deviation of the smoothing along a centreline
 REACH = 0.5e-3  # m, to both sides of a curve, at which the depth is compared
 NARROW = 1.5e-3  # m, radius below which smoothing would cut bends
 ROUNDS = 32  # of centring; together they move a curve by up to 5 mm
-RAYS = 24  # across a vessel, by which its radius is measured
-# m of depth up to which a radius is that of the ball, and from which of the section.
+RAYS = 24  # across a vessel, for the radius of its section
+# Depths, m, up to which a radius is that of the ball, and from which of the section.
 BALL, SECTION = 1.5e-3, 3e-3
-SLIT = 1.25  # of the ball's radius: a section's radius is no larger
+SLIT = 1.25  # largest radius of a section, in radii of the ball
 
 
 def resample(points: np.ndarray) -> np.ndarray:
@@ -29,9 +29,10 @@ def resample(points: np.ndarray) -> np.ndarray:
 def centred(
     field: SurfaceDepth, curve: np.ndarray, *, fixed_start: bool = False
 ) -> np.ndarray:
-    """Move a curve (n, 3) sideways towards the middle of the lumen.
+    """Move a curve (n, 3), m, sideways towards the middle of the lumen.
 
-    Every round steps up the depth across the curve, by less and less, and smooths.
+    Each round steps along the gradient of the depth across the curve, by decreasing
+    steps, and smooths.
     """
     points = curve.copy()
     for turn in range(ROUNDS):
@@ -69,16 +70,16 @@ def _across(points: np.ndarray) -> np.ndarray:
 def section_radii(field: SurfaceDepth, points: np.ndarray) -> np.ndarray:
     """Radii (n,) m of the lumen along a curve (n, 3) in its middle.
 
-    Of a wide vessel it is the median distance of the wall over `RAYS` directions
-    across the curve, so that neither an ostium in the wall nor a curve that is off
-    the middle changes it; of a narrow one the radius of the largest ball.
+    For a wide vessel it is the median distance to the wall over `RAYS` directions
+    across the curve, which neither an ostium in the wall nor an eccentric curve
+    changes; for a narrow vessel it is the radius of the largest ball.
     """
     ball = field(points)
     angle = 2.0 * np.pi * np.arange(RAYS) / RAYS
     turn = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rays = np.einsum("rs,nsd->nrd", turn, _across(points))
     reach = np.repeat(ball[:, None], RAYS, axis=1)
-    # A ball of the lumen's depth holds no wall: step on by it. An ostium never ends.
+    # A ball with the radius of the depth holds no wall. SLIT bounds rays into ostia.
     for _ in range(4):
         depth = field(points[:, None] + reach[..., None] * rays)
         reach = np.minimum(reach + np.maximum(depth, 0.0), SLIT * ball[:, None])
@@ -89,7 +90,7 @@ def section_radii(field: SurfaceDepth, points: np.ndarray) -> np.ndarray:
 def _smoothed(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Smooth a curve over about half the lumen's radius, its ends kept.
 
-    The middle of a wide vessel is flat, and a curve would wander about on it.
+    The depth is flat near the middle of a wide vessel and does not fix the curve there.
     """
     width = np.clip(SMOOTH * (depth - NARROW) / STEP, 0.0, 12.0)
     pad = min(len(points) - 1, 40)

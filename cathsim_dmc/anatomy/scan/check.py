@@ -23,33 +23,33 @@ from cathsim_dmc.anatomy.tree_depth import on_walls, rings_of
 
 SLACK = 0.3e-3  # m, by which a triangulated surface may cut into a tube
 STEP = 0.5e-3  # m, between the places of a centreline that are tested
-FREE = 12e-3  # m, of lumen beyond the end of a vessel, or this many radii:
+FREE = 12e-3  # m, allowed length of lumen beyond the end of a vessel, or radii:
 FREE_RADII = 4.0
-NARROW_END = 1.35  # of `TAIL_RADIUS`: a vessel that ends no wider was cut off there
+NARROW_END = 1.35  # in `TAIL_RADIUS`; the thin tail of a narrower end was cut off
 JOINS = 15e-3  # m of lumen between the end of a vessel and another that it joins
-PASSABLE = 0.6e-3  # m, depth of a lumen that counts as going on
-BESIDE = 15e-3  # m that two vessels may run in one lumen beyond their parting
+PASSABLE = 0.6e-3  # m, least depth of a lumen that counts as continuing
+BESIDE = 15e-3  # m that two vessels may run in one lumen beyond their fork
 VOLUME = (0.02e-6, 2e-3)  # m^3 of a lumen
-WIDE = 90.0  # percentile of the radii of a tree that is the width of its wide part
+WIDE = 90.0  # percentile of the radii of a tree for its wide vessels
 RADII = (0.3e-3, 30e-3)  # m, allowed median of a vessel: arteriole, aneurysm
 WIDEST = 45e-3  # m
 RIM_SLACK = 0.05e-3  # m, by which the first cross-section of a branch may lie outside
-ARMS = 60e-3  # m across between the ends of the subclavian arteries that say sides
-LEFT = 0.5  # least cosine between the way from the right to the left of them and +x
-ONE_OSTIUM = 3e-3  # m of the aorta between ostia that are one
+ARMS = 60e-3  # m, horizontal distance of the arteries of the arms that shows sides
+LEFT = 0.5  # least cosine between +x and the direction from right to left arm
+ONE_OSTIUM = 3e-3  # m along the aorta; nearer ostia count as one
 
 
 def check_tree(anatomy: Anatomy) -> dict[str, str]:
-    """Proves the tree of an anatomy against its closed surface; see docs/scans.md.
+    """Checks the tree of an anatomy against its closed surface; see docs/scans.md.
 
-    Says what is wrong and where, by what was looked at; nothing where all is right.
+    Returns what is wrong and where, by the name of the check; empty where it passes.
     """
     surface = anatomy.surface
     radii = [vessel.centreline.radii for vessel in anatomy.tree.vessels.values()]
     wide = float(np.percentile(np.concatenate(radii), WIDE))
     scale = enlargement(wide, surface.volume)
     found = {name: "; ".join(look(anatomy)) for name, look in _UNSCALED.items()}
-    # A small tree is looked at enlarged, as it was imported: the limits suit it then.
+    # A small tree is checked enlarged, as it was imported, so that the limits suit it.
     with enlarged(scale):
         large = _enlarged(anatomy, scale)
         measure = SurfaceDepth(large.surface)
@@ -58,7 +58,7 @@ def check_tree(anatomy: Anatomy) -> dict[str, str]:
 
 
 def _enlarged(anatomy: Anatomy, scale: float) -> Anatomy:
-    """The anatomy `scale` times as large."""
+    """The anatomy scaled by `scale`; without its ends if it is scaled."""
     if scale == 1.0:
         return anatomy
     tree, inlet, surface = resized(anatomy.tree, anatomy.inlet, anatomy.surface, scale)
@@ -72,10 +72,10 @@ def _enlarged(anatomy: Anatomy, scale: float) -> Anatomy:
 def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
     for key, vessel in anatomy.tree.vessels.items():
         line = vessel.centreline
-        # At the very ends a flat cap is as near as one likes.
+        # At the ends of the line the flat cap is arbitrarily near.
         margin = min(0.5 * float(line.radii[-1]), 0.2 * line.length)
         first = margin if vessel.parent is None else 0.0
-        # Densely, so that no stretch between two points leaves the lumen either.
+        # The points are dense, so that no part between them leaves the lumen.
         s = np.arange(first, line.length - margin, STEP)
         place = line.at(s)
         depth = measure(place.position)
@@ -126,7 +126,7 @@ def _parents(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
 
 
 def _sides(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
-    """Whether the arch leads from right and front to left and back, as named."""
+    """Errors in the order of the arch's branches, and in the side it leads to."""
     tree = anatomy.tree
     root = tree.root
     vessels = [tree.vessels[key] for key in ARCH_BRANCHES if key in tree.vessels]
@@ -135,7 +135,7 @@ def _sides(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
         return
     ostia = [vessel.mouth.position for vessel in vessels]
     along = np.diff(root.centreline.project(np.array(ostia)).arc_length)
-    # What leaves in one lumen, as in a bovine arch, has no order.
+    # Branches with one ostium, as in a bovine arch, have no order.
     apart = along[np.abs(along) > ONE_OSTIUM]
     if (apart > 0).any() and (apart < 0).any():
         names = ", ".join(vessel.name for vessel in vessels)
@@ -150,9 +150,9 @@ def _sides(anatomy: Anatomy, _: SurfaceDepth) -> Iterator[str]:
 
 
 def _arms(anatomy: Anatomy) -> Iterator[str]:
-    """Whether the subclavian arteries of an upright scan lead to their sides.
+    """Error if the subclavian arteries of an upright scan lead to the wrong sides.
 
-    Where two axes are exchanged the arch still leads to the back and left.
+    This finds exchanged axes, with which the arch still leads to the back and left.
     """
     arms = [anatomy.tree.vessels.get(key) for key in ("rsa", "lsa")]
     ends = [arm.centreline.points[-1] for arm in arms if arm is not None]
@@ -187,19 +187,19 @@ def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
         line = vessel.centreline
         branches = [name for name, other in vessels.items() if other.parent == key]
         if any(anatomy.tree.origin(name) > line.length - 2e-3 for name in branches):
-            continue  # goes on in its branches
+            continue  # the vessel ends in its branches
         end = line.at(line.length)
         tail = line.radii[line.arc_length > line.length - 30e-3]
         wide = float(max(tail.max(), end.radius))
         ahead = _lumen_beyond(measure, end, wide)
         gap = np.linalg.norm(ahead - end.position, axis=1)
         beyond = float(gap.max(initial=0.0))
-        # What no device can follow was cut off, and is not missing.
+        # A tail that no device can follow was cut off, and is not missing.
         thin = end.radius < NARROW_END * TAIL_RADIUS * units.enlargement()
         cut = TAIL + END_TRIM if thin else 0.0
         if beyond <= max(FREE, FREE_RADII * wide, cut):
             continue
-        # Or it ends in another vessel, where a ring of vessels closes.
+        # A vessel may also end in another one, where a ring of vessels closes.
         near = ahead[gap < JOINS + wide]
         others = [v.centreline for v in vessels.values() if v is not vessel]
         places = [other.project(near) for other in others]
@@ -219,7 +219,7 @@ def _lumen_beyond(
     spacing = float(np.clip(max(narrow, reach / 40.0), 0.5e-3, 2.0e-3))
     shape = np.full(3, 2 * round(max(24 * spacing, reach) / spacing) + 1)
     low = end.position - 0.5 * (shape - 1) * spacing
-    # Lattice points lie beside the middle. Tails are cut off at `TAIL_RADIUS`.
+    # Lattice points lie off the middle, and tails are cut off at `TAIL_RADIUS`.
     scale = units.enlargement()
     deep = max(PASSABLE * scale, TAIL_RADIUS * scale - 0.5 * spacing)
     ijk, _ = geodesic.inside(depth, low, shape, spacing, deep)
@@ -283,7 +283,7 @@ def _inlet(anatomy: Anatomy, measure: SurfaceDepth) -> Iterator[str]:
 
 
 def _beginnings(anatomy: Anatomy) -> Iterator[str]:
-    """Whether branches begin inside other vessels; the lumen of a scan has no tubes."""
+    """Errors of branches that do not begin inside another vessel; none for scans."""
     vessels = {} if anatomy.scan else anatomy.tree.vessels
     for key, vessel in vessels.items():
         if vessel.parent is None:

@@ -24,9 +24,9 @@ def read_curves(
 ) -> dict[str, np.ndarray]:
     """Points (n, 3) m, LPS, of drawn centrelines, by the names of their vessels.
 
-    Files are read as by `read_curve`, VTK's with all their lines, numbered; see
-    `units.upright` for `axes`. ValueError if a file holds no centreline, or two give
-    one name, or that of a root.
+    `read_file` reads the files; several lines of one file are numbered. `axes` are
+    those of `units.upright`. ValueError if a file holds no centreline, or if a name
+    occurs twice or is that of a root.
     """
     listed = isinstance(paths, Sequence) and not isinstance(paths, str | bytes)
     if not listed or not all(isinstance(path, str | Path) for path in paths):
@@ -55,7 +55,7 @@ def read_curves(
 
 
 def read_file(path: str | Path, units: str, frame: str) -> list[np.ndarray]:
-    """The centrelines (n_i, 3) m, LPS, of a file: several of VTK's, else one."""
+    """Centrelines (n_i, 3) m, LPS, of a file: all lines of a VTK file, else one."""
     path = Path(path)
     if path.suffix.lower() not in (".vtp", ".vtk"):
         return [read_curve(path, units, frame)]
@@ -72,7 +72,7 @@ def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> np.nd
     """Points (n, 3) m, LPS, of a 3D Slicer markup (.json) or a table (.csv, .txt).
 
     A table holds x, y, z per line, in ``units`` and ``frame``, and may hold the radius,
-    which is not used. FileNotFoundError without a file, ValueError without a curve.
+    which is ignored. FileNotFoundError without a file, ValueError without a curve.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -96,7 +96,7 @@ def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> np.nd
 
 
 def _distinct(path: Path, points: np.ndarray) -> np.ndarray:
-    """Points (n, 3) of a file without repetitions; ValueError if they are no curve."""
+    """Points (n, 3) without consecutive repetitions; ValueError if no curve is left."""
     apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-9
     keep = np.concatenate([[True], apart])
     if keep.sum() < 2 or not np.isfinite(points).all():
@@ -115,7 +115,7 @@ def vessel_name(path: str | Path) -> str:
 
 
 def inside_part(name: str, curve: np.ndarray, measure: SurfaceDepth) -> np.ndarray:
-    """The points (k, 3) m of a curve (n, 3) m, LPS, in the lumen, wider end first."""
+    """Points (k, 3) m of a curve (n, 3) m, LPS, inside the lumen, wider end first."""
     depth = measure(curve)
     inside = depth > 0.0
     if inside.mean() < INSIDE:
@@ -188,9 +188,9 @@ _HEADINGS = {
 
 
 def _columns(names: str, count: int, frame: str) -> tuple[list[int], str]:
-    """Columns of x, y and z of `count`, by their headings, if any, and their frame.
+    """Indices of the columns x, y and z among `count`, and their frame.
 
-    The headings R, A, S and L, P, S say the frame.
+    The headings, if any, name the columns; R, A, S or L, P, S also give the frame.
     """
     if not names:
         if count not in (3, 4):

@@ -11,21 +11,22 @@ from cathsim_dmc.anatomy.scan.rings import COVER, Cover
 from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.ways import Ways, common, in_reach
 
-END_SEARCH = 15e-3  # m from a blind end in which its width is looked for
-STUB = 3e-3  # m, shortest own vessel beyond that
-# Of the width where a blind end and the branches beside it part: its least length from
-# there, and greatest width of these; and by how much it is wider than every other end.
+END_SEARCH = 15e-3  # m from a blind end, within which its width is measured
+STUB = 3e-3  # m, least length of the own part of a vessel
+# A blind end hidden by branches beside it: its least length past their fork and largest
+# width of the branches, in widths at the fork; its least width in that of other ends.
 BLIND, BESIDE, WIDER = 1.3, 0.5, 1.2
-STUMP = 500  # lattice points beyond that, least of a wide vessel that is cut off
-# A sac is about as long as wide: every way out of it is so much narrower than its
-# widest place, so many radii of that from its end.
+STUMP = 500  # least number of lattice points of a wide vessel that is cut off
+# A sac is about as long as wide: every path out of it narrows to NECK of its largest
+# radius within SAC_LENGTH of these radii from its end.
 NECK, SAC_LENGTH = 0.5, 3.2
 
 
 class FreeEnd(NamedTuple):
     """A blind end of the lumen: place (3,) and radius near it, m.
 
-    The `bottleneck` is the largest radius of a sphere that reaches the widest part, m.
+    `bottleneck` is the radius, m, of the largest sphere that passes from the end to the
+    widest part.
     """
 
     position: np.ndarray
@@ -34,18 +35,18 @@ class FreeEnd(NamedTuple):
 
 
 def free_ends(ways: Ways) -> list[FreeEnd]:
-    """Blind ends of the lumen, bulges left out."""
+    """Blind ends of the lumen, without bulges."""
     nodes = ways.nodes
     centre = int(nodes[ways.depth[nodes].argmax()])
     before = ways.deepest_from(centre)
-    # Seen from one blind end, every other one is farther than all around it.
+    # Every other blind end is a local maximum of the distance from this one.
     first = int(nodes[ways.lengths_from(centre)[nodes].argmax()])
     reach = ways.lengths_from(first)
-    # Own vessels are told on the ways to that end: the widest place may be one, too.
+    # Own parts are those of paths to that end: the widest point may be an end, too.
     back = ways.deepest_from(first)
     taken = np.zeros(len(ways.points), dtype=bool)
     cover, ends = Cover(ways), []
-    # Nodes of the largest piece from which no neighbour is farther.
+    # Nodes of the largest component without a farther neighbour.
     rows, cols = ways.links.T
     top = ways.main.copy()
     top[rows[reach[cols] > reach[rows]]] = False
@@ -66,9 +67,9 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
             path = ways.trace(back, node)[::-1]
             own = cover.own_part(path)
             if ways.length(own) < max(STUB, float(np.median(ways.depth[own]))):
-                continue  # a bulge of a vessel that is known
+                continue  # a bulge of a known vessel
             cover.add(path)
-        # The depth falls to nothing at the very end, which is no bottleneck.
+        # The depth falls to zero at the end itself, which is no bottleneck.
         inner = along > 2.0 * local
         narrow = float(depth[inner].min()) if inner.any() else local
         part = (along > 0.5 * local) & (along < END_SEARCH)
@@ -81,10 +82,10 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
 def _blind_end(
     ways: Ways, ends: Sequence[FreeEnd], tips: np.ndarray, back: np.ndarray
 ) -> FreeEnd | None:
-    """The end of the widest vessel, if thin branches that leave beside it cover it.
+    """The end of the widest vessel, if thin branches beside it hide it.
 
-    So is the root of the aorta by the coronary arteries. `tips` (n,) are nodes, `back`
-    (m,) those before each on the deepest ways from the first of the ends.
+    The coronary arteries hide the root of the aorta in this way. `tips` (n,) are nodes,
+    `back` (m,) the predecessors of all nodes on deepest paths from the first end.
     """
     traces = [ways.trace(back, ways.node(end.position)) for end in ends[1:]]
     known = np.array([end.position for end in ends])
@@ -99,8 +100,8 @@ def _blind_end(
             continue
         if np.linalg.norm(known - ways.points[tip], axis=1).min() < 2.0 * wide:
             continue
-        # It is wide to its end, the ways to other ends leave it for thin branches, and
-        # it is no aneurysm: another end is joined to it by a wide lumen.
+        # The end is wide up to its tip, the paths to other ends leave it by thin
+        # branches, and unlike an aneurysm it is joined to another end by a wide lumen.
         if (ways.depth[path[at:]] < BESIDE * np.minimum(wide, away)).any():
             continue
         beside = [
@@ -115,13 +116,13 @@ def _blind_end(
 
 
 def _leaves_thin(ways: Ways, way: np.ndarray, place: np.ndarray, wide: float) -> bool:
-    """Whether a way goes on, far from a wide place (3,) m, in a thin branch only."""
+    """Whether a path continues, far from a wide place (3,) m, only in a thin branch."""
     far = np.linalg.norm(ways.points[way] - place, axis=1) > 2.0 * wide
     return bool(far.any() and (ways.depth[way[far]] < BESIDE * wide).all())
 
 
 def _joined(ways: Ways, before: np.ndarray, end: FreeEnd, wide: float) -> bool:
-    """Whether the deepest way to an end is about as wide as what it comes from (m)."""
+    """Whether the deepest path to an end stays wider than `BESIDE` of `wide` (m)."""
     way = ways.trace(before, ways.node(end.position))
     inner = arc_lengths(ways.points[way])
     inner = np.minimum(inner, inner[-1] - inner) > wide
@@ -131,7 +132,7 @@ def _joined(ways: Ways, before: np.ndarray, end: FreeEnd, wide: float) -> bool:
 def stump(ways: Ways, ends: Sequence[FreeEnd]) -> FreeEnd | None:
     """The end of a wide vessel that is cut off less than its width past a branch.
 
-    It is the largest piece of lumen that no way between the free ends comes near.
+    It is the largest part of the lumen away from all paths between the free ends.
     """
     wide = ways.node(max(ends, key=lambda end: end.bottleneck).position)
     before = ways.deepest_from(wide)
@@ -150,9 +151,9 @@ def stump(ways: Ways, ends: Sequence[FreeEnd]) -> FreeEnd | None:
 
 
 def is_sac(ways: Ways, nodes: Sequence[int], row: int) -> bool:
-    """Whether the end in a row of the nodes of all ends is an aneurysm's, no vessel's.
+    """Whether the end `nodes[row]` is that of an aneurysm, not of a vessel.
 
-    A blind end of a vessel leads on as wide for longer.
+    `nodes` are those of all free ends. A vessel keeps its width for longer than a sac.
     """
     before = ways.deepest_from(nodes[row])
     for node in [*nodes[:row], *nodes[row + 1 :]]:

@@ -1,4 +1,4 @@
-"""Inlet of a lumen, and centrelines computed between its free ends."""
+"""Inlet of a lumen, and centrelines between its free ends."""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -13,24 +13,24 @@ from cathsim_dmc.anatomy.scan.rings import Cover, rings, round_ring
 from cathsim_dmc.anatomy.scan.units import enlargement, mm, shown
 from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common
 
-WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
-ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
+WIDE = 0.4  # of the widest free end: least width of a default inlet
+ROOT_WIDTH = 0.5  # of the inlet: least width of the far end of the root
 STARTS = 30e-3  # m along the lumen; curves that start nearer to an end start there
-# m, passable length of a branch worth a name beyond what is covered; or from the wall
-# of the main vessel on, if it is also so many times as long as wide.
+# Least passable length, m, of a branch beyond the vessels already found; or, if it is
+# also WIDTHS times as long as wide, beyond the wall of the main vessel.
 BRANCH, WIDTHS = 15e-3, 1.5
-EVEN = 0.6  # of the wider one's width: two branches of a fork that share its trunk
+EVEN = 0.6  # least ratio of the widths of two branches at whose fork a trunk ends
 INLET_CUT = 1.8  # radii of the trunk, about what is cut off at its inlet
-EVEN_PART = (1.5, 4.0)  # radii of the trunk past the fork, between which they compare
+EVEN_PART = (1.5, 4.0)  # radii of the trunk past the fork, where widths are compared
 TRUNK_LENGTH = 3.0  # of its radii, least
-FITS = 0.5  # of the length of the vessels, that a device must pass to be the default
+FITS = 0.5  # of the length of the vessels, which the default device must pass
 
 
 class LumenEntry(NamedTuple):
     """Place (3,) m where the device enters, and `far` end (3,) m of the root, or None.
 
-    It is a free end (`at_end`), or a place where the lumen is cut. `sacs` are wider
-    ends that are no vessel's.
+    The place is a free end if `at_end`; else the lumen is cut there. `sacs` are the
+    wider ends that belong to aneurysms.
     """
 
     position: np.ndarray
@@ -47,11 +47,10 @@ def plan_inlet(
 ) -> LumenEntry:
     """Choose where the device enters and where the root vessel leads.
 
-    It enters by the free end near the `inlet` (3,) m, or where that lies in a vessel,
-    which is cut there. None chooses the end at which drawn curves (n_i, 3) m start,
-    else the wide end farthest from their starts, and without curves the widest that is
-    no sac.
-    ValueError lists the ends if none can be chosen.
+    The device enters at the free end near `inlet` (3,) m; without a near end the vessel
+    is cut at `inlet`. None chooses the end at which drawn curves (n_i, 3) m start, else
+    the wide end farthest from their starts; without curves it chooses the widest end
+    that is no sac. ValueError lists the ends if none can be chosen.
     """
     nodes = [ways.node(end.position) for end in ends]
     width = np.array([end.bottleneck for end in ends])
@@ -66,8 +65,7 @@ def plan_inlet(
     if inlet is not None:
         gap = np.array([np.linalg.norm(end.position - inlet) for end in ends])
         chosen = int(gap.argmin())
-        # Beyond the last place where the vessel has its width, there is nothing to
-        # cut off but the end itself.
+        # Near a free end the inlet is that end: only its tip would be cut off.
         cut = bool(gap[chosen] > 2.5 * ends[chosen].radius)
     elif curves:
         chosen = _chosen_by_curves(ways, ends, nodes, width, free, curves)
@@ -86,7 +84,7 @@ def plan_inlet(
         lasts = [ways.node(curve[-1]) for curve in curves]
         floor = max(floor, 1.2 * float(np.median(ways.depth[lasts])))
         if cut:
-            # Ends behind it are nearer to the inlet than to where the curves end.
+            # Ends behind the inlet are farther from the end of the curve than it is.
             others &= ways.lengths_from(lasts[0])[nodes] < reach[lasts[0]]
     others &= width > floor
     for row in np.argsort(-np.where(others, width, -np.inf), kind="stable"):
@@ -96,7 +94,7 @@ def plan_inlet(
 
 
 def _chosen_by_curves(ways, ends, nodes, width, free, curves) -> int:
-    """The end at which the curves start, else a wide one far from their starts."""
+    """Index of the end at which the curves start, else of a wide one far from there."""
     reach = np.stack([ways.lengths_from(ways.node(c[0]))[nodes] for c in curves])
     # A curve leads away from the end at which it starts.
     last = np.stack([ways.lengths_from(ways.node(c[-1]))[nodes] for c in curves])
@@ -114,7 +112,7 @@ def _chosen_by_curves(ways, ends, nodes, width, free, curves) -> int:
 
 
 def listed(ends: Sequence[FreeEnd]) -> str:
-    """Ends with their places and widths, widest first, for a message."""
+    """Places and widths of up to eight ends, widest first, for a message."""
     ordered = sorted(ends, key=lambda end: -end.radius)
     return ", ".join(
         f"{shown(end.position)}, {mm(2.0 * end.radius):.1f} mm wide"
@@ -125,11 +123,11 @@ def listed(ends: Sequence[FreeEnd]) -> str:
 def centrelines(
     ways: Ways, ends: Sequence[FreeEnd], entry: LumenEntry, *, rooted: bool = True
 ) -> list[np.ndarray]:
-    """Deepest ways from the inlet to every branch that the device can enter.
+    """Deepest paths (n_i, 3) m from the inlet to all branches that the device enters.
 
-    Branches have a free end, or close a ring (such as the two vertebral arteries,
-    which meet in the basilar). They are given as (n_i, 3) m, from the inlet on, the
-    bulkiest first, without the way to the far end of the entry if that is a root.
+    A branch has a free end, or closes a ring (such as the two vertebral arteries, which
+    meet in the basilar). Paths are sorted by the sum of their depths, rings last. If
+    `rooted`, the path to the far end of the entry is left out.
     """
     before = ways.deepest_from(ways.node(entry.position))
     cover, known, toward, main = Cover(ways), [entry.position], None, None
@@ -150,7 +148,7 @@ def centrelines(
         if entry.at_end or toward is None or _ahead(ways, way, toward):
             todo.append(way)
     todo.sort(key=lambda way: -float(ways.depth[way].sum()))
-    # Rings last: what they share with a branch that has an end is that branch's.
+    # Rings last: parts that they share with a branch with an end belong to that branch.
     closed = (round_ring(cover, one, other) for one, other in rings(ways, before))
     found = []
     for way in chain(todo, closed):
@@ -162,7 +160,7 @@ def centrelines(
             continue
         length = ways.length(passable)
         width = 2.0 * float(np.median(ways.depth[passable]) + CELL)
-        if length < BRANCH:  # of a wide main vessel much is covered, too
+        if length < BRANCH:  # a wide main vessel covers much of a branch
             length += _mouth(ways, main, way, own)
             length = 0.0 if length < WIDTHS * width else length
         if length >= BRANCH:
@@ -173,16 +171,16 @@ def centrelines(
 
 
 def _mouth(ways: Ways, main: Cover | None, way: np.ndarray, own: np.ndarray) -> float:
-    """Length (m) of a way from the wall of the main vessel to its own part, or 0."""
+    """Length (m) of a path from the wall of the main vessel to its own part, or 0."""
     if main is None or len(main.own_part(way[::-1])) > len(own):
-        return 0.0  # it leaves another vessel
+        return 0.0  # the path leaves another vessel
     whole = main.own_part(way[::-1], wall=True)[::-1]
     return ways.length(whole) - ways.length(own)
 
 
 def _passed(ways: Ways, way: np.ndarray, *, from_inlet: bool) -> np.ndarray:
-    """The beginning of a way (n,) of nodes that the device passes."""
-    if from_inlet:  # at whose very end the lattice has no depth
+    """The first part of a path (n,) of nodes, up to where the device does not pass."""
+    if from_inlet:  # the lattice has no depth at the inlet itself
         way = way[int((ways.depth[way] >= ways.device).argmax()) :]
     narrow = np.flatnonzero(ways.depth[way] + CELL < ways.device)
     return way[: narrow[0]] if len(narrow) else way
@@ -202,9 +200,9 @@ def trunk(
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """End (3,) m of the trunk of a tree's curves (n_i, 3) m, and those that leave it.
 
-    The trunk is the beginning of the bulkiest curve up to the first fork at which
-    another one goes on that is about as wide, and that a device which enters can turn
-    into; the whole curve if there is none.
+    The trunk is the first part of the first curve, up to the first fork into branches
+    of similar width that is far enough from the inlet for a device to enter them; the
+    whole curve without such a fork.
     """
     main, others = curves[0], list(curves[1:])
     depth = ways.depth[[ways.node(point) for point in main]]
@@ -232,7 +230,7 @@ def _ahead_of_inlet(radius: float) -> float:
 
 
 def _width(past: np.ndarray, depth: np.ndarray, radius: float) -> float:
-    """Median depth of a curve over a part past a fork of a trunk of some radius."""
+    """Median depth (m) of a curve in `EVEN_PART` past a fork of a trunk of `radius`."""
     part = (past > EVEN_PART[0] * radius) & (past < EVEN_PART[1] * radius)
     return float(np.median(depth[part])) if part.any() else 0.0
 
@@ -243,23 +241,23 @@ def continued(
     curves: dict[str, np.ndarray],
     entry: LumenEntry,
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Given centrelines (n, 3) m by name, each drawn on to the end of its vessel.
+    """Drawn centrelines (n, 3) m by name, each continued to the end of its vessel.
 
-    A curve that stops half way says which vessel is meant, not where that ends. Also
-    returns the lengths (m) by which curves were continued.
+    A drawn curve names a vessel and may stop before its end. Also returns the lengths
+    (m), by name, by which curves were continued.
     """
     before = ways.deepest_from(ways.node(entry.position))
     paths = [ways.trace(before, ways.node(end.position)) for end in ends]
     added: dict[str, float] = {}
     out = dict(curves)
-    # Of two that end in one another the wider one goes on.
+    # Of two curves that end in each other the wider one is continued.
     order = sorted(
         curves, key=lambda key: -ways.depth[[ways.node(p) for p in curves[key]]].sum()
     )
     for name in order:
         last = ways.node(curves[name][-1])
         here, depth = ways.points[last], float(ways.depth[last])
-        # It may end in a vessel that goes on, as one vertebral artery in the other's.
+        # A curve may end in a continued vessel, as one vertebral artery in the other.
         others = [out[key] for key in added] + [end.position[None] for end in ends]
         gaps = [np.linalg.norm(other - here, axis=1).min() for other in others]
         if min(gaps) < max(3.0 * depth, 6e-3):
@@ -278,7 +276,7 @@ def continued(
 
 
 def _ahead(ways: Ways, way: np.ndarray, toward: np.ndarray) -> bool:
-    """Whether two ways from one place leave it towards the same side."""
+    """Whether two paths from one node start towards the same side."""
     step = min(10, len(way) - 1, len(toward) - 1)
     here = ways.points[way[0]]
     one, other = (ways.points[each[step]] - here for each in (way, toward))

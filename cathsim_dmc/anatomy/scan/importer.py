@@ -1,4 +1,4 @@
-"""A patient's lumen, from a segmented scan to an anatomy ready for simulation."""
+"""Import of a patient's lumen: from a segmented scan to an anatomy."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -40,16 +40,16 @@ NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
 
 
 class Calibre(Protocol):
-    """A device as an import sees it, such as an `entities.device.Device`."""
+    """What an import needs of a device, such as an `entities.device.Device`."""
 
     @property
     def name(self) -> str:
-        """What to call it."""
+        """Name of the device, for messages."""
         ...
 
     @property
     def outer_radius(self) -> float:
-        """Radius, m."""
+        """Outer radius, m."""
         ...
 
 
@@ -59,7 +59,7 @@ class _Bore(NamedTuple):
 
 
 USUAL = _Bore("5 Fr catheter", DEVICE_RADIUS)
-# The thinnest of the library (`entities.devices`), where the usual one does not pass.
+# Thinnest device of the library (`entities.devices`), where USUAL does not pass.
 THINNEST = _Bore("0.014 inch wire (wire_014_micro)", 0.1778e-3)
 
 
@@ -94,7 +94,7 @@ def import_scan(
             what the mesh's file says (3D Slicer's do), else LPS.
         axes: how that frame is turned in the patient, if the scan does not stand
             upright, such as "ILA", or nine numbers; see ``units.upright``.
-        labels: of a label map, the values that are the lumen.
+        labels: values of a label map that are the lumen.
         name: of the anatomy, by default the mesh file's.
         inlet: (x, y, z) where the device enters: a free end if one is near, else the
             lumen is cut there. By default the end at which the centrelines start,
@@ -102,11 +102,11 @@ def import_scan(
         heart: (x, y, z) near the end of the aorta that is at the heart; None finds it
             by width and length of both legs, their sides and their branches.
         rename: new names of vessels by their computed names.
-        device: what is to pass, such as one of `entities.devices.DEVICES`; decides
-            which vessels are in the tree. None for a 5 Fr catheter, or the thinnest
-            device of the library where that does not pass most vessels.
+        device: device that must pass, such as one of `entities.devices.DEVICES`; it
+            decides which vessels are in the tree. None for a 5 Fr catheter, or the
+            thinnest device of the library where that does not pass most vessels.
         progress: called with a line for every step: its name or "note", then text.
-        notes: list to which what was guessed, mended and left out is added.
+        notes: list to which notes on guesses, repairs and omissions are added.
 
     Returns:
         The anatomy, in metres, LPS. Radii are those of the lumen's sections
@@ -114,13 +114,13 @@ def import_scan(
 
     Raises:
         FileNotFoundError: if a file is missing.
-        ValueError: if a file or an option is not as stated, or the tree that results
-            does not agree with the surface; says how to mend it.
+        ValueError: if a file or an option is not as stated, or the resulting tree does
+            not agree with the surface; says how to mend it.
     """
     started = time.monotonic()
     told = _Told([] if notes is None else notes, progress or (lambda text: None))
     given, changes = _checked(inlet, heart, rename, device)
-    # Refused before the long steps; read again when the unit is known.
+    # Invalid curves are refused before the long steps, and read again with the unit.
     first = "LPS" if mesh_frame is None else mesh_frame
     read_curves(centreline_paths, units or "mm", first, axes)
     lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, told.say)
@@ -138,19 +138,19 @@ def import_scan(
 
 
 class _Told(NamedTuple):
-    """Where an import says what it does and guesses."""
+    """Receiver of the progress and the notes of an import."""
 
     notes: list[str]
     say: Callable[[str], None]
 
     def note(self, text: str) -> None:
-        """Says and keeps what was guessed, mended or left out."""
+        """Reports a note on a guess, a repair or an omission, and keeps it."""
         self.notes.append(text)
         self.say(f"note: {text}")
 
 
 class _Wishes(NamedTuple):
-    """What the user gives: places and curves in the file's frame, names, device."""
+    """Input of the user: places in the file's frame, curves, names, device, axes."""
 
     places: dict[str, np.ndarray]
     curves: dict[str, np.ndarray]
@@ -175,7 +175,7 @@ def _checked(
     rename: Mapping[str, str] | None,
     device: Calibre | None,
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Places (3,) that are given, and new names, or ValueError."""
+    """The given places (3,) and new names, checked; ValueError if one is invalid."""
     given = {
         key: np.array(bounds.vector(key, place, 3))
         for key, place in {"inlet": inlet, "heart": heart}.items()
@@ -193,7 +193,7 @@ def _grown(
     lumen: Lumen, frame: FileFrame, wishes: _Wishes, told: _Told
 ) -> tuple[_Parts, Calibre]:
     """The tree of a lumen, cut open, and the device that passes it."""
-    # Enlarged if it is small, so that every length of the import suits it.
+    # A small lumen is enlarged, so that the lengths of the import suit it.
     scale, surface, matrix = lumen.scale, lumen.surface, frame.to_lps
     if scale != 1.0:
         surface = Surface(scale * surface.vertices, surface.faces)
@@ -218,7 +218,7 @@ def _grown(
 
 
 def _anatomy(name: str, parts: _Parts, bore: Calibre, told: _Told) -> Anatomy:
-    """The anatomy of a tree, proved against its surface; notes goals left out."""
+    """Anatomy of a tree, checked against its surface; notes goals left out."""
     with file_frame(parts.frame.to_lps, parts.frame.unit):
         tree = parts.tree
         sizes = [
@@ -258,7 +258,7 @@ def _anatomy(name: str, parts: _Parts, bore: Calibre, told: _Told) -> Anatomy:
 
 
 class _Growth:
-    """From an enlarged lumen to its tree: what is given, and the device that passes."""
+    """Growth of the tree of an enlarged lumen, and choice of the device that passes."""
 
     def __init__(self, field, scale, wishes, places, note):
         self._field, self._scale, self._note = field, scale, note
@@ -307,7 +307,7 @@ class _Growth:
         return tree, entry.at_end, arch
 
     def _relabelled(self, curves) -> dict[str, np.ndarray]:
-        """Drawn curves by the names that the user wants; the root is renamed later."""
+        """Drawn curves by the user's names; the root is renamed later."""
         names = naming.renamed([ROOT, TRUNK, *curves], self._changes)[2:]
         for old, new in zip(curves, names, strict=True):
             if old != new:
@@ -315,7 +315,7 @@ class _Growth:
         return dict(zip(names, curves.values(), strict=True))
 
     def _choose_device(self, entry) -> None:
-        """The thinnest device where the usual one passes less than half of the tree."""
+        """Chooses the thinnest device if the usual one passes less than half of it."""
         ways, ends = self._ways, self._ends
         if self._given or extract.fits(ways, ends, entry):
             return
@@ -328,7 +328,7 @@ class _Growth:
         )
 
     def _computed(self, entry):
-        """Entry, computed curves by name, names of right branches and of the root."""
+        """Entry, curves by name, names of right branches and root, whether an arch."""
         ways, ends, places, note = self._ways, self._ends, self._places, self._note
         seen, end = Arch.of(ways, ends, places.get("heart")), ""
         arch = None if isinstance(seen, str) else seen
@@ -373,7 +373,7 @@ class _Growth:
         return entry, curves, frozenset(names[row] for row in right), root, bool(arch)
 
     def _renamed(self, computed, found) -> list[str]:
-        """Names of root and curves as the user wants them; notes the nameless."""
+        """Names of root and curves after the user's changes; notes unnamed curves."""
         names = naming.renamed(computed, self._changes)
         curves = dict(zip(names[1:], found, strict=True))
         for old, new in zip(computed, names, strict=True):
@@ -400,7 +400,7 @@ class _Growth:
 def _placed(
     key: str, place: np.ndarray, measure: SurfaceDepth, middle: str
 ) -> np.ndarray:
-    """A given place (3,) m, LPS, which must be near the lumen."""
+    """A given place (3,) m, LPS; ValueError if it is not near the lumen."""
     away = -float(measure(place[None])[0])
     if away > NEAR_INLET:
         raise ValueError(

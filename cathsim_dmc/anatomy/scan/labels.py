@@ -1,4 +1,4 @@
-"""The surface of the labels of a segmented scan."""
+"""Surface of the labels of a segmented scan."""
 
 import bz2
 import gzip
@@ -14,13 +14,13 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.scan.mesh import parsed
 from cathsim_dmc.anatomy.scan.units import UNITS, to_lps
 
-BLUR = 0.7  # voxels, standard deviation that takes the steps off a surface
+BLUR = 0.7  # voxels, standard deviation of the smoothing of voxel steps
 MOST_VOXELS = 500_000_000  # of a label map: 512 x 512 x 1,900
 _PAD = 3  # voxels around the labels
 _MOST_LABELS = 500
-_DIFFER = 0.3  # of neighbours in an image, at least; of labels far less
+_DIFFER = 0.3  # least share of differing neighbours in an image; labels: far less
 _HEADER = 16_384  # bytes of a MetaImage that hold its header
-# What files call units of length, and the axes of spaces of NRRD files in LPS.
+# Names of units of length in files, and axes of the spaces of NRRD files in LPS.
 _UNITS = {
     "mm": "mm millimeter millimetre millimeters millimetres",
     "cm": "cm centimeter centimetre centimeters centimetres",
@@ -34,7 +34,7 @@ _SPACES = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0), "LAS": (1.0, -1.0, 
 class Labelled(NamedTuple):
     """The surface of labels: vertices (V, 3) m in LPS, faces (F, 3).
 
-    `notes` say what was taken, and ask what the file leaves open; `unit` is its own.
+    `notes` state what was assumed and ask about gaps; `unit` is that of the file.
     """
 
     vertices: np.ndarray
@@ -46,7 +46,7 @@ class Labelled(NamedTuple):
 class _Voxels(NamedTuple):
     """Voxels, matrix (3, 3) and origin (3,) to m in LPS, names of labels.
 
-    `unit` is what the header says, or none; `frame` a question, if it says none.
+    `unit` is that of the header, or None; `frame` is a question if it has no frame.
     """
 
     voxels: np.ndarray
@@ -60,14 +60,14 @@ class _Voxels(NamedTuple):
 def label_surface(
     path: str | Path, labels: Sequence[int] = (), units: str | None = None
 ) -> Labelled:
-    """Surface of the labels of a label map that are the lumen, or of its only one.
+    """Surface of the lumen's labels in a label map; by default of its only label.
 
-    ``units`` are those of its header if that is wrong or names none.
+    ``units`` replace those of its header.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no label map, the package that reads it is missing, or
-            the labels are not in it; lists those that are.
+            the labels are not in it; lists the labels that are.
     """
     from scipy.ndimage import find_objects, gaussian_filter
     from skimage.measure import marching_cubes
@@ -126,14 +126,14 @@ def label_surface(
 
 
 def _source(given: str | None, said: str | None) -> str:
-    """Where the unit of a label map comes from."""
+    """Text on the source of the unit of a label map."""
     if given is None:
         return f"unit {said}, as its header says" if said else "no unit named: mm taken"
     return f"unit {given}, as given" + (f" (its header says {said})" if said else "")
 
 
 def _unit(names: Sequence[str]) -> str | None:
-    """Key of `UNITS` of what a header calls its units, or None if it names none."""
+    """Key of `UNITS` for the unit names of a header; None without a name."""
     names = sorted({name.strip().lower() for name in names} - {"", "none", "???"})
     found = [k for k, called in _UNITS.items() if set(names) <= set(called.split())]
     if names and not found:
@@ -156,9 +156,9 @@ def _require_few(shape: Sequence[int]) -> int:
 
 
 def _require_end(path: Path, count: int, encoding: str, detached: bool) -> None:
-    """ValueError if the packed voxels of a NRRD file go on after its last voxel.
+    """ValueError if a NRRD file holds more compressed voxels than it announces.
 
-    Its reader unpacks the file to its end.
+    Its reader would unpack the file to its end.
     """
     opened = {"gz": gzip.open, "bz": bz2.open}
     if encoding[:2] not in opened:
@@ -175,7 +175,7 @@ def _require_end(path: Path, count: int, encoding: str, detached: bool) -> None:
 
 
 def _grey(voxels: np.ndarray, values: np.ndarray) -> str:
-    """What shows that voxels are the grey values of an image, or nothing."""
+    """Evidence that voxels are grey values of an image; empty for labels."""
     if not np.array_equal(np.rint(values), values):
         return "numbers that are not whole"
     if values[0] < 0:
@@ -215,13 +215,13 @@ def _nifti(path: Path) -> _Voxels:
 
 
 def _nrrd(path: Path) -> _Voxels:
-    """Slicer's files name their labels."""
+    """Voxels of a NRRD file; those of 3D Slicer name their labels."""
     import nrrd
 
     header = nrrd.read_header(str(path))
     data, detached = path, {"datafile", "data file"} & set(header)
     if detached:
-        # Only a file beside it: a header may name any.
+        # Only a file in the same folder is read: a header may name any path.
         named = str(header[detached.pop()])
         data = path.parent / named
         if path.suffix.lower() != ".nhdr" or Path(named).name != named:
@@ -287,8 +287,8 @@ def _meta(path: Path) -> _Voxels:
     _require_few([int(size) for size in entries.get("DimSize", [])])
     reader = vtkIOImage.vtkMetaImageReader()
     reader.SetFileName(str(path))
-    # Voxels that a file lacks have any values. VTK tells of them by an event alone, and
-    # of that only with its warnings on.
+    # VTK leaves missing voxels undefined. It reports them by an event only, and only
+    # with its warnings on.
     vtkCommonCore.vtkObject.GlobalWarningDisplayOn()
     failed: list[str] = []
     told = vtkCommonCore.vtkCommand.ErrorEvent

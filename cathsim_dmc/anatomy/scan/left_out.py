@@ -1,4 +1,4 @@
-"""Vessels of a lumen that are in no tree: where, how wide and how long."""
+"""Vessels of a lumen that its tree leaves out: places, widths and lengths."""
 
 from typing import NamedTuple
 
@@ -10,10 +10,10 @@ from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.units import mm, shown
 from cathsim_dmc.anatomy.scan.ways import CELL, Ways, in_reach
 
-REACH = (1.2, 1e-3)  # radii and m from a centreline, up to which lumen is its vessel's
-THIN = 10e-3  # m, least length of a vessel too thin for the device that is told
-SHORT = 2.0  # of its width: least length of what is neither a stub nor an aneurysm
-WIDE = 98.0  # percentile of the depths of a vessel that is its radius
+REACH = (1.2, 1e-3)  # radii and m from a centreline that its vessel covers
+THIN = 10e-3  # m, least length of a reported vessel too thin for the device
+SHORT = 2.0  # of its width: least length of a vessel, not a stub or an aneurysm
+WIDE = 98.0  # percentile of the depths of a vessel that gives its radius
 
 
 class LeftOut(NamedTuple):
@@ -27,8 +27,8 @@ class LeftOut(NamedTuple):
 def left_out(ways: Ways, tree: VesselTree) -> list[LeftOut]:
     """Vessels longer than their own width that no vessel of a tree covers.
 
-    Their length is counted from the lumen of the tree on, or from a longer one that is
-    left out, too. The longest is first.
+    Lengths count from the lumen of the tree, or from that of a longer vessel that is
+    left out. The longest comes first.
     """
     lines = [vessel.centreline for vessel in tree.vessels.values()]
     centres = np.concatenate([line.points for line in lines])
@@ -48,9 +48,9 @@ def left_out(ways: Ways, tree: VesselTree) -> list[LeftOut]:
 def _beyond(
     ways: Ways, taken: np.ndarray, before: np.ndarray
 ) -> list[tuple[LeftOut, np.ndarray]]:
-    """Of each piece of lumen that is not `taken` (n,) the longest vessel, and its way.
+    """Longest vessel, and its path, in each part of the lumen that is not `taken` (n,).
 
-    Ways follow the nodes `before` (n,) each.
+    Paths follow the predecessors `before` (n,).
     """
     beyond = ways.main & ~taken
     links = ways.links[beyond[ways.links].any(axis=1)]
@@ -80,12 +80,12 @@ def said(
 ) -> str | None:
     """A note on vessels left out for a device with a radius (m), or None.
 
-    In a tree of drawn centrelines they are left out because they have none.
+    In a tree of `drawn` centrelines they are left out for want of one.
     """
     found = [one for one in found if one.width > 2.0 * radius or one.length > THIN]
     if not found:
         return None
-    # Of those that are hardly longer than wide, as bulges are, the longest is told.
+    # Of vessels hardly longer than wide, such as bulges, only the longest is reported.
     short = [one for one in found if one.length < SHORT * one.width]
     long = [one for one in found if one.length >= SHORT * one.width]
     texts = [_told(one, radius, drawn) for one in long]

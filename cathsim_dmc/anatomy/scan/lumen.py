@@ -1,4 +1,4 @@
-"""A lumen as an import uses it: read, scaled, turned and mended."""
+"""Lumen surface of an import: read, scaled, turned and mended."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,12 +18,12 @@ from cathsim_dmc.anatomy.surface import sampled
 
 SIZE = (12e-3, 2.0)  # m across: an intracranial segment, an aorta with arms and legs
 WIDTH = (1.0e-3, 35e-3)  # m, 95th percentile of radii: cerebral artery, aneurysm
-NO_WIDTH = (0.5e-3, 50e-3)  # m: beyond this a unit that is given is refused
-VOLUME = 2e-3  # m^3, most that is searched for ways, at 10^9 points per m^3
-RARE = {"inch": 0.035}  # units that scans have less often than others, and how often
-POOR = 1e-3  # likelihood under which even the only unit is asked for
-# What is scanned, to tell units apart: that radius and the size, m, the deviations of
-# their logarithms, and how often.
+NO_WIDTH = (0.5e-3, 50e-3)  # m: outside this range a given unit is refused
+VOLUME = 2e-3  # m^3, largest lumen that is searched, at 10^9 points per m^3
+RARE = {"inch": 0.035}  # rare units of scans, and their relative frequency
+POOR = 1e-3  # likelihood below which even the only likely unit must be given
+# Usual scans, to tell units apart: radius as in WIDTH and size, m, deviations of their
+# logarithms, and relative frequency.
 SCANS = {
     "cerebral arteries": ((1.8e-3, 45e-3), (0.35, 0.6), 1.0),
     "coronary arteries": ((1.8e-3, 90e-3), (0.25, 0.3), 1.0),
@@ -36,25 +36,25 @@ SCANS = {
     "aneurysm of the aorta": ((22e-3, 260e-3), (0.35, 0.4), 0.4),
     "a mouse's aorta": ((0.8e-3, 25e-3), (0.25, 0.35), 0.015),
 }
-# m, radius of a lumen that is imported as it is, and to which narrower ones are
-# enlarged, so that every length of the import suits them as an adult's aorta.
+# Radii, m: least of a lumen that is imported at its size, and to which narrower ones
+# are enlarged, so that the lengths of the import suit them as an adult's aorta.
 WIDE, ENLARGED = 8e-3, 12e-3
-MOST = 4e-4  # m^3 that a lumen is enlarged to at most, for the time that it takes
-SURE = 0.95  # probability of a unit that is not asked for
-UNLIKELY = 0.003  # probability of a unit that is not named as another one
+MOST = 4e-4  # m^3, largest volume after enlargement, which limits the time
+SURE = 0.95  # probability above which a unit need not be given
+UNLIKELY = 0.003  # probability below which a unit is not named as an alternative
 _SAMPLES = 1000
-_VERTICES = 20_000  # of the surface between those samples, about, at most
-_WIDEST = 0.2  # of the size: balls begin with this radius
-_AROUND = 0.2  # mean square of the second direction in which walls lie, least
-_SMOOTH = 1500  # triangles for each time that a surface is smoothed
-_MOST = 100  # times
+_VERTICES = 20_000  # of the surface used beside those samples, about, at most
+_WIDEST = 0.2  # of the size: initial and largest radius of a ball
+_AROUND = 0.2  # least mean square of wall directions on their second main axis
+_SMOOTH = 1500  # triangles for each smoothing pass
+_MOST = 100  # smoothing passes, at most
 
 
 class Lumen(NamedTuple):
-    """A closed surface (m, LPS), its file's unit, and what was guessed and mended.
+    """A closed surface (m, LPS), its file's unit, and notes on guesses and repairs.
 
-    `scale` is by how much it is enlarged while it is imported, `frame` that of its
-    file, "LPS" or "RAS".
+    `scale` is the factor by which the import enlarges it, `frame` that of the file,
+    "LPS" or "RAS".
     """
 
     surface: Surface
@@ -76,9 +76,9 @@ def read_lumen(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no such surface; says how to mend it.
+        ValueError: if the file holds no such surface; says how to mend it.
     """
-    # Before anything is read:
+    # Checks the options before the file is read.
     to_lps("mm" if units is None else units, "LPS" if frame is None else frame, axes)
     given, labelled = units, str(path).lower().endswith(mesh.LABEL_MAPS)
     if labelled:
@@ -117,7 +117,7 @@ def read_lumen(
     if scale != 1.0:
         surface = Surface(surface.vertices / scale, surface.faces)
     if walled and not labelled:
-        # Until now what lies between two walls was measured, too.
+        # The first radius includes the space between the two surfaces of the wall.
         why, radius = _in_wall(str(path), surface, units, given)
         say(f"note: {why}")
         notes = (why, *notes[1:])
@@ -134,9 +134,9 @@ def read_lumen(
 def _in_wall(
     name: str, surface: Surface, units: str, given: str | None
 ) -> tuple[str, float]:
-    """A line on the unit and the radius (m) of the inner surface (m) of a wall.
+    """A line on the unit, and the radius (m), of the inner surface of a thick wall.
 
-    ValueError if the unit that is likely for the wall is not that for its lumen.
+    ValueError if the likely unit of the lumen is not that of the wall.
     """
     vertices = surface.vertices / UNITS[units]
     likely, why, radius = guess_units(name, vertices, surface.faces, given)
@@ -149,7 +149,7 @@ def _in_wall(
 
 
 def _else(size: float, units: str) -> str:
-    """Units to pass for a size, m, that is none in the unit `units`."""
+    """Hint on the units in which an implausible size, m, of `units` is plausible."""
     sizes = {unit: size / UNITS[units] * factor for unit, factor in UNITS.items()}
     fits = [
         f"{size:.3g} m across when it is {unit!r} (--units {unit})"
@@ -176,7 +176,7 @@ def _frame(path: str | Path, given: str | None) -> tuple[str, list[str]]:
 
 
 def enlargement(radius: float, volume: float) -> float:
-    """By how much a lumen of a radius (m) and a volume (m^3) is enlarged, 1 or more."""
+    """Enlargement, >= 1, of a lumen with a radius (m) and a volume (m^3)."""
     if not radius < WIDE:
         return 1.0
     most = (MOST / max(abs(volume), 1e-12)) ** (1 / 3)
@@ -186,9 +186,9 @@ def enlargement(radius: float, volume: float) -> float:
 def guess_units(
     name: str, vertices: np.ndarray, faces: np.ndarray, units: str | None
 ) -> tuple[str, str, float]:
-    """The unit given or likely, a line on why, and the radius of the wide part, m.
+    """Unit, given or guessed, a line on the reason, and radius of the wide part, m.
 
-    The likely unit makes width and size those of something that is scanned, `SCANS`.
+    The guessed unit makes width and size those of a usual scan, see `SCANS`.
     ValueError if the width is implausible in the unit, or two units are likely.
     """
     found = typical_radius(vertices, faces), np.linalg.norm(np.ptp(vertices, axis=0))
@@ -254,7 +254,7 @@ def guess_units(
 
 
 def _within(seen: np.ndarray, width: tuple[float, float]) -> bool:
-    """Whether a radius and a size (2,) m are those of a lumen, by limits of radii."""
+    """Whether a radius and a size (2,) m are plausible; `width` limits the radius."""
     return width[0] <= seen[0] <= width[1] and SIZE[0] <= seen[1] <= SIZE[1]
 
 
@@ -291,18 +291,18 @@ def typical_radius(vertices: np.ndarray, faces: np.ndarray) -> float:
     ]
     radii = np.where(enclosed, radii, most).reshape(2, -1).min(axis=0)
     found = radii[radii < most]
-    enough = len(found) >= 0.2 * _SAMPLES  # else hardly any place faces another one
+    enough = len(found) >= 0.2 * _SAMPLES  # else few points face another wall
     return float(np.percentile(found, 95)) if enough else float("nan")
 
 
 def _enclosed(away: np.ndarray) -> bool:
-    """Whether places (n, 3) lie around a middle, as in a tube and not in its wall."""
+    """Whether points (n, 3) surround their origin, as in a tube and not in its wall."""
     away = away / np.linalg.norm(away, axis=1, keepdims=True)
     return np.linalg.eigvalsh(away.T @ away)[1] > _AROUND * len(away)
 
 
 def _smoothed(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The surface without noise, which shrinks balls: the finer, the more smoothed."""
+    """Smooths noise, which would shrink balls; a finer mesh takes more passes."""
     import igl
 
     vertices, faces = merged(vertices, faces)
@@ -316,7 +316,7 @@ def _smoothed(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
 def _ball(
     tree: cKDTree, points: np.ndarray, normals: np.ndarray, size: float
 ) -> np.ndarray:
-    """Radii of the balls that touch at ``points`` on the side of ``normals``."""
+    """Radii (n,) of the balls that touch at ``points`` on the side of ``normals``."""
     radii = np.full(len(points), size)
     active = np.arange(len(points))
     for _ in range(30):
@@ -325,7 +325,7 @@ def _ball(
         away = points[active] - tree.data[other]
         square = np.vecdot(away, away)
         slope = np.vecdot(normals[active], away)
-        # Points beside the place itself say nothing: the surface is not smooth.
+        # Points next to the place itself do not count: the surface is not smooth.
         steep = slope < -0.35 * np.sqrt(square)
         shrinks = (gap < 0.999 * radii[active]) & steep
         if not shrinks.any():

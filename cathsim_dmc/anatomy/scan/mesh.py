@@ -1,4 +1,4 @@
-"""Reading a lumen's triangles from a mesh file."""
+"""Reader of a lumen's triangles from a mesh file."""
 
 import io
 import re
@@ -23,13 +23,13 @@ _OTHERS = {
 FORMATS = {"obj": 35, "stl": 50, "ply": 12, "vtp": 12, "vtk": 12}
 _STL_TEXT = 100  # seven lines
 _BEHIND = 4096  # bytes that may follow the last triangle of a binary STL
-_SAID = 300  # characters of what a reader says, at most
+_SAID = 300  # characters of the message of a reader, at most
 _COMMENTS = 4096  # bytes at the start of a file with its frame, or at its end
 MOST = 4_000_000  # triangles; reading more takes gigabytes
 
 
 def parsed(path: Path, kind: str, read: Callable[[Path], Any], extra: str) -> Any:
-    """What a function reads from a file; errors say what to do, in one line."""
+    """Result of `read(path)`; errors become one line that says what to do."""
     if path.is_dir():
         raise ValueError(
             f"{path} is a directory; give one file: a lumen's surface (STL, OBJ, PLY, "
@@ -49,7 +49,7 @@ def parsed(path: Path, kind: str, read: Callable[[Path], Any], extra: str) -> An
         raise ValueError(
             f"{path} needs {error.name}: {extras.adding(extra)}."
         ) from error
-    except Exception as error:  # readers raise whatever their format leads to
+    except Exception as error:  # readers raise errors of any kind
         said = re.sub(r"\s+", " ", str(error)).strip()[:_SAID] or type(error).__name__
         raise ValueError(
             f"{path} cannot be read as {kind.upper()}: {said}. Export it again."
@@ -57,7 +57,7 @@ def parsed(path: Path, kind: str, read: Callable[[Path], Any], extra: str) -> An
 
 
 def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 in the file's unit and faces (F, 3) int64, as they are.
+    """Vertices (V, 3) float64 in the file's unit and faces (F, 3) int64, unmended.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -89,7 +89,7 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
             "(points and volumes are none, and lines are centrelines: --centreline), "
             "named after its format."
         )
-    # Points of no triangle are dropped: they would count for the size.
+    # Points of no triangle are dropped: they would change the size.
     used, corners = np.unique(faces, return_inverse=True)
     if used[0] < 0 or used[-1] >= len(vertices):
         raise ValueError(
@@ -127,7 +127,7 @@ def stated_frame(path: str | Path) -> str | None:
 
 
 def _require_end(path: Path) -> None:
-    """ValueError if a file of text is cut off."""
+    """ValueError if a text file is truncated."""
     kind = path.suffix.lower().lstrip(".")
     with path.open("rb") as stream:
         head = stream.read(_COMMENTS)
@@ -149,7 +149,7 @@ def _require_obj_end(path: Path) -> None:
     if last.startswith(b"#") or not last.strip(b"\r\0 "):
         return
     data = path.read_bytes()
-    # Some programs leave the end of the last line out; their triangles use all points.
+    # Some programs omit the last line break; a complete file uses all of its points.
     rows = re.findall(rb"(?m)^f[ \t]+(.*)$", data)
     used = {corner.split(b"/")[0] for row in rows for corner in row.split()}
     points = len(re.findall(rb"(?m)^v[ \t]", data))
@@ -167,7 +167,7 @@ def _require_ply_end(data: bytes) -> None:
     whole = sum(int(count) for _, count in counts)
     rows = [row.split() for row in body.splitlines() if row.strip()]
     held = len(rows)
-    faces = header.rpartition(b"element ")[2]  # the last element, mostly these
+    faces = header.rpartition(b"element ")[2]  # the last element: mostly the faces
     last = re.match(rb"face \d+\s+property list", faces)
     if rows and last and len(rows[-1]) <= int(rows[-1][0]):
         held -= 1  # its last row lacks a corner
@@ -186,7 +186,7 @@ def _require_stl_end(path: Path) -> None:
 
 
 def _announced(path: Path) -> int:
-    """Triangles that a file announces, or the most its size leaves room for."""
+    """Number of triangles that a file announces, or the most that fit in its size."""
     kind = path.suffix.lower().lstrip(".")
     with path.open("rb") as stream:
         # The counts of a VTP file may stand anywhere in it.
@@ -226,7 +226,7 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     data = path.read_bytes()
     if kind == "obj":
         data = _plain_obj(data)
-    elif kind == "stl":  # of text it is all
+    elif kind == "stl":  # a text file is kept whole
         data = data[: 84 + 50 * int.from_bytes(data[80:84], "little")]
     elif re.search(rb"(?m)^format binary", data[:_COMMENTS]):
         return ply_files.triangles(data)
@@ -237,10 +237,10 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _plain_obj(data: bytes) -> bytes:
-    """An OBJ file with single blanks, whose corners are counted from its first point.
+    """An OBJ file with single blanks and absolute indices of its points.
 
-    The reader knows no other white space. It takes corners that are counted back from
-    the last point so far as counted from the end of the file, and a corner 0 as 1.
+    The reader knows no other white space. It counts relative indices from the end of
+    the file, not from the last point so far, and takes an index 0 as 1.
     """
     if b"\t" in data or b"\n " in data:
         data = re.sub(rb"(?m)^ +", b"", data.replace(b"\t", b" "))

@@ -30,22 +30,23 @@ PATTERNS = {
     (): (0.003, "none of these"),
 }
 TRUNKS = {"bovine": "trunk of bca and lcca", "bicarotid": "trunk of rcca and lcca"}
-# Any branch of an arch: radius, m, log deviation, and how often a fork is seen; and
-# the distance between neighbours, m, with its log deviation.
+# Any branch of an unlisted arch: radius, m, with its log deviation, probability of a
+# visible fork, and distance between neighbours, m, with its log deviation.
 OTHER, OTHER_FORKS, OTHER_SPACE = (4.2e-3, 0.5), 0.5, (18e-3, 0.8)
-CUT = 0.03  # probability that the scan shows nothing of a branch
-SHORT = 0.04  # that it is cut short
-# Of thin arteries without a name: radius, m, and log deviation of a wider one.
+CUT = 0.03  # probability that a branch is missing from the scan
+SHORT = 0.04  # probability that a branch is cut short
+# Thin arteries without a name: radius, m, and log deviation of wider ones.
 EXTRA_RADIUS, EXTRA_SPREAD = 2.0e-3, 0.8
-# Of these, how many leave between LCCA and LSA, as vertebral arteries do: others, such
+# Share of these that leave between LCCA and LSA, as vertebral arteries do: others, such
 # as a lowest thyroid artery, leave before the LCCA.
 BETWEEN = 0.05
-ALONE = 0.3  # that a vertebral artery is seen where the wider LSA beside it is not
-BUMP = 0.02  # that one that looks cut short is none
-# Of each: radius beyond the ostium, m (`arch.sampler`, vertebral: 1.9), for an aorta as
-# wide as `AORTA` (`SPREAD`: deviation of its logarithm); its share in the distance
-# between neighbours, m (a vertebral artery leaves between others that are no farther
-# apart); length up to the first fork, m: mean, deviation, and how often none is seen.
+ALONE = 0.3  # probability of a vertebral artery without the wider LSA beside it
+BUMP = 0.02  # probability that an apparent branch that is cut short is none
+# Each branch: radius beyond the ostium, m (`arch.sampler`, vertebral: 1.9 mm), in an
+# aorta of the radius `AORTA` (`SPREAD`: deviation of its logarithm); its share of the
+# distance between neighbours, m (0 for a vertebral artery, which leaves between others
+# at their usual distance); length up to the first fork, m: mean, deviation, and
+# probability of no visible fork.
 BRANCHES = {
     "bca": (6.2e-3, 12e-3, (42e-3, 10e-3, 0.5)),
     "bovine": (6.4e-3, 26e-3, (12e-3, 8e-3, 0.02)),
@@ -58,18 +59,18 @@ BRANCHES = {
 }
 AORTA = 13.3e-3
 APART = 0.5  # deviation of the logarithm of a distance between neighbours
-# Cosine between the way of a branch, or its ostium seen from the middle of the aorta,
-# and the right and back of the arch's plane: mean and deviation. An aberrant right
-# subclavian artery leaves the back of the aorta and runs behind to the right.
+# Cosine between the direction of a branch, or of its ostium from the aorta's middle,
+# and the normal of the arch's plane (right and back): mean and deviation. An aberrant
+# right subclavian artery leaves the back of the aorta and runs behind it to the right.
 SIDES = {"way": (0.0, 0.35), "ostium": (0.0, 0.3)}
 SIDES_OF_RSA = {"way": (0.55, 0.3), "ostium": (0.6, 0.25)}
-# How often such a branch is seen to lead aside, to an arm, where as much of it is seen
-# as `Offshoot.aside` asks for; half of any others.
+# Probability that a branch leads aside, to an arm, if it is long enough for
+# `Offshoot.aside`; 0.5 for others.
 TO_ARM = {"bca": 0.8, "lsa": 0.7, "rsa": 0.7}
 TO_ARM |= dict.fromkeys(("lcca", "rcca", "bicarotid", "lva"), 0.05)
-_SIDES = np.log(2.0 / np.sqrt(2.0 * np.pi))  # against one of any side
+_SIDES = np.log(2.0 / np.sqrt(2.0 * np.pi))  # density relative to a uniform cosine
 VESSEL_NAME = re.compile("[a-z][a-z0-9_]*")
-_FORK_DENSITY = 1.0 / 60e-3  # 1/m, to which densities of forks are compared
+_FORK_DENSITY = 1.0 / 60e-3  # 1/m, reference of the densities of forks
 
 
 class Naming(NamedTuple):
@@ -77,11 +78,11 @@ class Naming(NamedTuple):
 
     names: list[str]
     notes: Sequence[str] = ()
-    right: tuple[int, ...] = ()  # curves that share a BCA, named or not
+    right: tuple[int, ...] = ()  # indices of the curves that share a BCA
 
 
 class Hypothesis(NamedTuple):
-    """Heart at the last point of the aorta, pattern, labels from the heart on."""
+    """Whether the heart is at the aorta's last point, pattern, labels from heart on."""
 
     heart_last: bool
     pattern: tuple[str, ...]
@@ -142,7 +143,7 @@ def name_branches(
 
 
 def neutral_names(curves: Sequence[np.ndarray]) -> list[str]:
-    """Names of curves that leave no arch, in the order in which they part."""
+    """Neutral names of curves, numbered in the order in which they fork."""
     leave = [
         max((common(a, b) for b in curves if b is not a), default=0) for a in curves
     ]
@@ -169,10 +170,10 @@ def hypotheses(
 ) -> dict[Hypothesis, float]:
     """Probability of every hypothesis about offshoots in the order of an aorta's line.
 
-    `scale` is its width by that of a usual one; `odds` are the log odds of what else is
-    seen, by whether the heart is at the last point, and exclude what they leave out.
+    `scale` is the width of the aorta relative to a usual one. `odds` are log odds of
+    other evidence by whether the heart is at the last point; a missing key excludes it.
     """
-    # To the patient's right and back if the heart is at the first point.
+    # This points to the patient's right and back if the heart is at the first point.
     side = np.cross(bend.up, bend.along)
     sides = []
     for one in found:
@@ -196,7 +197,7 @@ def _labellings(
     scale: float,
     head: np.ndarray,
 ):
-    """Every (pattern, labels, log weight) of offshoots in order from the heart."""
+    """Yields all (pattern, labels, log weight) of offshoots in order from the heart."""
     count = len(seen)
     for pattern, (frequency, _) in PATTERNS.items():
         if not pattern:
@@ -238,7 +239,7 @@ def _unlisted(seen: Sequence[Offshoot], frequency: float, scale: float) -> float
 
 
 def _between(seen: Sequence[Offshoot], labels: Sequence[str]) -> int:
-    """How many arteries without a name leave between LCCA and LSA."""
+    """Number of arteries without a name that leave between LCCA and LSA."""
     near = zip(labels, seen[1:], labels[1:], labels[2:], strict=False)
     return sum(
         first in ("lcca", "bovine") and label == "extra" and last == "lsa"
@@ -250,14 +251,14 @@ def _between(seen: Sequence[Offshoot], labels: Sequence[str]) -> int:
 def _fit(
     one: Offshoot, label: str, scale: float, sides: np.ndarray, head: np.ndarray
 ) -> float:
-    """Log probability of the calibre, the fork and the ways of an offshoot."""
+    """Log probability of the calibre, the fork and the directions of an offshoot."""
     if label == "extra":
         if not one.curves:
             return float(np.log(BUMP))
         wider = max(np.log(one.radius / (scale * EXTRA_RADIUS)), 0.0) / EXTRA_SPREAD
         return float(np.log(EXTRA) - 0.5 * wider**2)
     radius, _, (length, spread_of_it, none) = BRANCHES[label]
-    # What was cut short shows little more than the mouth of a branch.
+    # A branch that is cut short shows little more than its ostium.
     spread = SPREAD if one.curves else 2.0 * SPREAD
     weight = normal(np.log(one.radius / (scale * radius)), spread)
     if one.curves:
@@ -299,7 +300,7 @@ def question(
     seen: Sequence[Offshoot],
     names: Mapping[int, str],
 ) -> str:
-    """What the notes ask about offshoots, from the heart on, that have no name."""
+    """Question about offshoots without a name, which are given from the heart on."""
 
     def text(key: Hypothesis) -> str:
         missing = [
@@ -314,9 +315,9 @@ def question(
 
 
 def right_sided(seen: Sequence[Offshoot], curves: Sequence[np.ndarray]) -> Naming:
-    """Neutral names of curves of a right-sided arch, and what the notes ask.
+    """Neutral names of the curves of a right-sided arch, and a question.
 
-    Its branches are `seen` from the heart on.
+    `seen` are its branches from the heart on.
     """
     names = neutral_names(curves)
     which = left_by(seen, dict(enumerate(names)))
@@ -325,7 +326,7 @@ def right_sided(seen: Sequence[Offshoot], curves: Sequence[np.ndarray]) -> Namin
 
 
 def left_by(seen: Sequence[Offshoot], names: Mapping[int, str]) -> str:
-    """A question's beginning: the offshoots of an arch, from the heart on."""
+    """Beginning of a question: the offshoots of an arch, from the heart on."""
     places = []
     for one in seen:
         own = ", ".join(names[i] for i in one.curves) or "a branch that is cut short"

@@ -25,22 +25,22 @@ from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common
 
 OUT = 1.15  # radii of the aorta beyond which a branch has left it
-SHARED = 3e-3  # m beyond that, which curves of one branch share
-NEAR = 95e-3  # m of aorta to both sides of the top of the arch that has its branches
+SHARED = 3e-3  # m beyond that, least common length of curves of one branch
+NEAR = 95e-3  # m of aorta to both sides of the apex, where branches are the arch's
 CALIBRE = (4e-3, 16e-3)  # m past the ostium between which a calibre is taken
 STUB = 4e-3  # m, least height of a branch that was cut short
 STUB_OUT = (1.2, 1.5e-3)  # radii and m beyond which lumen is that of a stub
-STUB_RADIUS = 1.2e-3  # m
-STUB_END = 2.5  # radii from an end of the aorta
+STUB_RADIUS = 1.2e-3  # m, least radius of one
+STUB_END = 2.5  # radii from an end of the aorta without stubs
 STUB_APART = 45e-3  # m of aorta, at most, to the nearest branch
 STUB_WIDE = 30e-3  # m along the aorta: wider ones are no stub
 SURE = 0.95  # least probability of a name, and of the end at the heart
 EXTRA = 0.002  # probability that a branch is none of those that are looked for
 SPREAD = 0.3  # standard deviation of the logarithm of a radius
-# The same of vertebral arteries, and of wider ones where a carotid may be meant.
+# The same of vertebral arteries, and of wide ones that may be carotids.
 VARIED, WIDER = 0.45, 0.25
-# Of the vessels that a branch leads to: radius (m), range of the angle of their way
-# from the head's direction (degrees), and the deviation beyond it.
+# Vessels that a branch leads to: radius (m), range of the angle between their direction
+# and that to the head (degrees), and the deviation beyond this range.
 PARTS = {
     "rcca": (3.2e-3, 0.0, 25.0, 15.0),
     "lcca": (3.2e-3, 0.0, 30.0, 15.0),
@@ -58,34 +58,34 @@ LEADS = {
     "rsa": ("rsa", "rva"),
     "lcca": ("lcca", "lva"),  # only where they part `AT_ONCE`
 }
-AT_ONCE = 8e-3  # m past the ostium; what leaves a carotid artery later is no vertebral
-# Of a branch that leads to an arm: m of its end over which its direction is taken,
-# least length, m, and most cosine between that direction and the head's. And m past its
-# fork from which on one that leads to none is told.
+AT_ONCE = 8e-3  # m past the ostium; a vertebral artery does not leave a carotid later
+# A branch leads to an arm if it is longer than ARM_SEEN, m, and the cosine between the
+# direction of its last TAIL, m, and the head is below ASIDE. A branch longer than
+# NO_ARM, m, past its fork that does not, leads to none.
 TAIL, ARM_SEEN, ASIDE, NO_ARM = 25e-3, 60e-3, 0.5, 65e-3
-# Of such an arm past a fork: least radius, m, and angle from the head, degrees.
+# The artery of an arm past a fork: least radius, m, and angle to the head, degrees.
 ARM_RADIUS, ARM_ANGLE = 2.2e-3, 50.0
-# What a branch may also lead to, by a common trunk or a bypass, unless this leaves the
-# arch itself, and how often it does.
+# Vessel that a branch may also lead to, by a common trunk or a bypass, unless it leaves
+# the arch itself; and the probability.
 MIXED, MIXES = {"lsa": "lcca", "rsa": "rcca", "lcca": "lsa"}, 0.02
-TWINS = 85e-3  # m that two curves share after all others have left: one vessel
+TWINS = 85e-3  # m, common length without others from which two curves are one vessel
 
 
 @dataclass(frozen=True)
 class Offshoot:
-    """A branch of the arch, with all that it leads to; m."""
+    """A branch of the arch with the curves that it leads to; lengths in m."""
 
     place: np.ndarray  # (3,), where it leaves the lumen of the aorta
     s: float  # arc length of the aorta there
     radius: float  # of its lumen beyond that
     curves: tuple[int, ...]  # rows of the centrelines in it; none if it was cut short
-    fork: float | None  # past the ostium, the first place at which it parts
+    fork: float | None  # distance of the first fork past the ostium
     rows: tuple[np.ndarray, ...]  # (n_i, 3), its curves from the ostium on
 
     def aside(self, head: np.ndarray) -> bool | None:
-        """Whether one of its curves leads aside in the end; the `head` is at (3,).
+        """Whether the end of one of its curves leads aside; `head` (3,) is a direction.
 
-        None if none does, and all are too short past their fork to tell.
+        None if no curve does, and all are too short past their fork to tell.
         """
         long = False
         for row in self.rows:
@@ -100,13 +100,13 @@ class Offshoot:
 def offshoots(
     ways: Ways, bend: Bend, depth: np.ndarray, curves: Sequence[np.ndarray]
 ) -> list[Offshoot]:
-    """Branches along an aorta of depths (n,) m, which curves (m_i, 3) m leave."""
+    """Branches of an aorta with depths (n,) m, which curves (m_i, 3) m leave."""
     aorta = cKDTree(bend.line)
     groups_: list[tuple[list[int], list[np.ndarray], float]] = []
     for number, row, s in departures(bend, depth, curves):
         for members, rows, _ in groups_:
             shared = arc_lengths(rows[0][: max(common(rows[0], row), 1)])[-1]
-            # They leave in one lumen, even if they part at once.
+            # Curves that leave in one lumen are one branch, even if they fork at once.
             apart = np.linalg.norm(rows[0][0] - row[0])
             if apart < depth_of(ways, rows[0][:1])[0] or shared > SHARED:
                 members.append(number)
@@ -135,7 +135,7 @@ def offshoots(
 def departures(
     bend: Bend, depth: np.ndarray, curves: Sequence[np.ndarray]
 ) -> Iterator[tuple[int, np.ndarray, float]]:
-    """Curves as they leave an aorta: number, points (k, 3) beyond it, arc length."""
+    """Yields index, points (k, 3) beyond the aorta and arc length of leaving curves."""
     aorta = cKDTree(bend.line)
     for number, curve in enumerate(curves):
         distance, near = aorta.query(curve)
@@ -148,9 +148,9 @@ def departures(
 def third_limb(
     ways: Ways, bend: Bend, depth: np.ndarray, curves: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, float] | None:
-    """Place (3,) and radius (m) of the widest branch at a bend, by the aorta's width.
+    """Place (3,) and radius (m) of the widest branch at a bend, relative to the aorta.
 
-    None if all are much narrower than the aorta, as those of an arch are.
+    None if all branches are much narrower than the aorta, as in an arch.
     """
     sixth = max(1, len(depth) // 6)
     ends = min(float(np.median(end)) for end in (depth[:sixth], depth[-sixth:]))
@@ -188,7 +188,7 @@ def _stubs(ways, bend, depth, curves, aorta) -> Iterator[Offshoot]:
     nodes, distance, near = nodes[there], distance[there], near[there]
     wide = depth[near]
     outside = distance > STUB_OUT[0] * wide + STUB_OUT[1]
-    # Nothing at the aorta's own ends, into whose corners its line leads.
+    # Stubs at the ends of the aorta are corners into which its line leads.
     from_end = 1e-3 * np.minimum(near, len(bend.line) - 1 - near)
     outside &= from_end > STUB_END * wide
     row = np.full(len(ways.points), -1)
@@ -218,7 +218,7 @@ def _stubs(ways, bend, depth, curves, aorta) -> Iterator[Offshoot]:
 
 
 def mixed(label: str, others: Collection[str]) -> str | None:
-    """What a branch may also lead to, if none of the others of its arch is that."""
+    """Vessel that a branch may also lead to; None if `others` of the arch are it."""
     other = MIXED.get(label)
     return None if other in others else other
 
@@ -232,10 +232,10 @@ def leads(
     heart_last: bool,
     others: Collection[str] = (),
 ) -> dict[int, tuple[str, float]]:
-    """Names of the curves of a branch with their probabilities, by their rows.
+    """Names of the curves of a branch with their probabilities, by index.
 
-    The branch is `called` something with a probability, the `others` of the arch have
-    names of their own; `scale` is the width of the aorta by that of a usual one,
+    `called` is the name of the branch and its probability, `others` are the names of
+    the other branches; `scale` is the width of the aorta relative to a usual one,
     `heart_last` whether its last point is at the heart.
     """
     label, sure = called
@@ -249,7 +249,7 @@ def leads(
         return {} if label == "bicarotid" else {numbers[0]: (name, sure)}
     seen = [_look(ways, bend, row, max(share[i])) for i, row in enumerate(rows)]
     if single:
-        # A carotid artery leads to no arm, but by a common trunk or a bypass.
+        # A carotid artery leads to an arm only by a common trunk or a bypass.
         arm = any(r > scale * ARM_RADIUS and angle > ARM_ANGLE for r, angle in seen)
         return {} if arm else {one.curves[0]: (label, sure)}
     downstream = bend.along * (-1.0 if heart_last else 1.0)
@@ -272,7 +272,7 @@ def leads(
         if sure * by[name] >= SURE and name != "extra":
             found[number] = (name, sure * by[name])
     if label == "bovine" and len(rows) == 2 and len(found) == 1:
-        # What parts from the left carotid begins as the brachiocephalic artery.
+        # The curve that leaves the left carotid begins as the brachiocephalic artery.
         ((name, surety),) = found.values()
         (other,) = set(numbers) - set(found)
         if name == "lcca":
@@ -286,7 +286,7 @@ def normalised(weights: Mapping[Any, float]) -> dict[Any, float]:
 
 
 def summed(odds: Mapping[Any, float], of: Callable[[Any], str]) -> dict[str, float]:
-    """Probability of each thing that hypotheses say, which `of` tells of each."""
+    """Total probability of the hypotheses with each value of the function `of`."""
     by: dict[str, float] = defaultdict(float)
     for key, value in odds.items():
         by[of(key)] += value
@@ -294,12 +294,12 @@ def summed(odds: Mapping[Any, float], of: Callable[[Any], str]) -> dict[str, flo
 
 
 def _shares(rows: Sequence[np.ndarray]) -> list[list[int]]:
-    """First points that every two of some curves share."""
+    """Number of first points that each pair of curves shares."""
     return [[0 if a is b else common(a, b) for b in rows] for a in rows]
 
 
 def without_twins(rows: Sequence[np.ndarray]) -> list[int]:
-    """Rows of the curves but for those that run in the vessel of a longer one."""
+    """Indices of the curves without those that run in the vessel of a longer one."""
     share = _shares(rows)
     along = [arc_lengths(row) for row in rows]
     out: list[int] = []
@@ -315,7 +315,7 @@ def without_twins(rows: Sequence[np.ndarray]) -> list[int]:
 
 
 def _look(ways: Ways, bend: Bend, row: np.ndarray, shared: int) -> tuple[float, float]:
-    """Radius (m) and angle (degrees) from the head of what a curve has for its own."""
+    """Radius (m), and angle (degrees) to the head, of the own part of a curve."""
     own = row[min(shared, len(row) - 3) :]
     s = arc_lengths(own)
     part = own[(s >= min(8e-3, 0.4 * s[-1])) & (s <= CHORD)]
@@ -339,7 +339,7 @@ def _assignment(order, label, seen, share, aside, scale, doubt) -> float:
         off = max(least - angle, angle - most, 0.0) / deviation
         weight += max(normal(off, 1.0), -6.0)
     for vertebral, artery in (("rva", "rsa"), ("lva", "lsa")):
-        # It leaves the subclavian artery, not the trunk.
+        # A vertebral artery leaves the subclavian artery, not the trunk.
         if vertebral in place and artery in place:
             own = share[place[vertebral]]
             weight -= 5.0 if own[place[artery]] < max(own) else 0.0
@@ -366,7 +366,7 @@ def _assignment(order, label, seen, share, aside, scale, doubt) -> float:
     if label in ("lcca", "lsa", "rsa", "bovine") and missing not in place:
         weight -= 4.0
     elif label == "bovine":
-        # It leaves the trunk first, on the side of the descending aorta.
+        # The LCCA leaves the trunk first, on the side of the descending aorta.
         k = place["lcca"]
         rest = [j for j in range(len(order)) if j != k]
         if len(rest) > 1:
@@ -378,5 +378,5 @@ def _assignment(order, label, seen, share, aside, scale, doubt) -> float:
 
 
 def normal(value: float, deviation: float) -> float:
-    """Logarithm of a normal density, but for a constant."""
+    """Logarithm of a normal density, up to a constant."""
     return float(-0.5 * (value / deviation) ** 2 - np.log(deviation))

@@ -1,4 +1,4 @@
-"""Places of a scan's tree: its inlet, its goals and its ends; and their figures."""
+"""Inlet, goals and ends of the tree of a scan, and measures of an anatomy."""
 
 from typing import Any
 
@@ -15,12 +15,12 @@ from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 GOAL_PAST_OSTIUM = 30e-3  # m along a branch, its first goal
 GOAL_DISTAL = 0.8  # of the passable part of a branch, its second goal
 ROOT_REST = 3.0  # radii, least length of a root past its last branch that has a goal
-INLET_WIDTH = 0.8  # of the lumen near the inlet; the rest of the blind end is cut off
-INLET_SEARCH = 40e-3  # m of the root in which that width is looked for
+INLET_WIDTH = 0.8  # of the width near a blind end, which is cut off up to there
+INLET_SEARCH = 40e-3  # m of the root over which that width is taken
 # m, by which a goal may lie deeper in another vessel than in its own, a little less
-# than `check` allows; and the steps in which it is moved on to where it does not.
+# than `check` allows; and the step, m, of the search for a place where it does not.
 DEEPER, MOVE = 0.4e-3, 1e-3
-SHARES = (1.0, 0.6, 0.3)  # of a blind end that are tried to be cut off at the inlet
+SHARES = (1.0, 0.6, 0.3)  # of a blind end to cut off at the inlet, tried in order
 
 
 def passable_length(vessel: Vessel, device: float = DEVICE_RADIUS) -> float:
@@ -33,13 +33,13 @@ def passable_length(vessel: Vessel, device: float = DEVICE_RADIUS) -> float:
 def place_inlet(
     tree: VesselTree, at_end: bool, share: float = 1.0
 ) -> tuple[VesselTree, Inlet]:
-    """Start the root where the lumen has its width, or a share of the way there."""
+    """Start the root where the lumen has its width, or at a share of that length."""
     name, line = tree.root.name, tree.root.centreline
     if at_end:
         near = line.arc_length <= min(INLET_SEARCH, 0.3 * line.length)
         wide = INLET_WIDTH * np.median(line.radii[near])
         first = int((line.radii >= wide).argmax())
-        # Further by that width, because a vessel's end may be cut off at a slant.
+        # Farther by that radius, as the end of a vessel may be oblique.
         start = float(line.arc_length[first] + INLET_WIDTH * line.radii[first])
         line = line.slice(start * share, line.length)
     place = line.at(0.0)
@@ -65,8 +65,8 @@ def cut_open(
     crossing: np.ndarray = np.asarray(front.any(axis=1) & ~front.all(axis=1))
     pairs = adjacent(faces)
     label = groups(len(faces), pairs[crossing[pairs].all(axis=1)])
-    # Of the rings that the plane cuts the one around the inlet. By mean distance, not
-    # the smallest: a neighbour may pass close by.
+    # The plane may cut several rings; the one around the inlet has the least mean
+    # distance. The least distance may be that of a neighbouring vessel.
     away = np.linalg.norm(vertices[faces].mean(axis=1) - inlet.position, axis=1)
     count = np.bincount(label, crossing)
     mean = np.bincount(label, crossing * away) / np.where(count > 0, count, np.nan)
@@ -111,9 +111,9 @@ def place_goals(
 ) -> dict[str, Goal]:
     """One goal past the ostium of each branch and one far along it, by name.
 
-    The root has one, past its last branch; none if it ends in its branches. A device
-    of a radius (m) passes on all ways to them. A goal that would lie in the ostium of
-    another vessel is moved; `scale` is by how much the tree was enlarged.
+    The root has one past its last branch, or none if it ends in its branches. A device
+    with a radius (m) can reach all of them. A goal that would lie in the ostium of
+    another vessel is moved; `scale` is the enlargement of the tree while it grew.
     """
     goals = {}
     for key, vessel in tree.vessels.items():
@@ -144,9 +144,9 @@ def place_goals(
 def _in_own_lumen(
     tree: VesselTree, vessel: Vessel, s: float, limits: tuple[float, float], more: float
 ) -> float:
-    """Arc length, m, nearest to `s` within limits at which no other vessel is deeper.
+    """Arc length, m, nearest to `s` at which no other vessel is deeper by `more`, m.
 
-    It is deeper by `more`, m, than the vessel itself. Where there is none, `s`.
+    The search is within `limits`, m; it returns `s` if there is none.
     """
     line, (low, high) = vessel.centreline, limits
 
@@ -162,7 +162,7 @@ def _in_own_lumen(
 
 
 def flat_ends(tree: VesselTree, opening: Inlet) -> tuple[End, ...]:
-    """The inlet, open, and the capped ends of all vessels that do not go on."""
+    """The open inlet, and capped ends of all vessels that do not end in branches."""
     ends = [
         End(opening.vessel, opening.position, -opening.direction, opening.radius, True)
     ]
@@ -170,7 +170,7 @@ def flat_ends(tree: VesselTree, opening: Inlet) -> tuple[End, ...]:
         length = vessel.centreline.length
         branches = [k for k, v in tree.vessels.items() if v.parent == key]
         if any(tree.origin(k) > length - 1e-6 for k in branches):
-            continue  # goes on in its branches
+            continue  # the vessel ends in its branches
         place = vessel.centreline.at(length)
         ends.append(End(key, place.position, place.tangent, float(place.radius), False))
     return tuple(ends)
@@ -179,7 +179,7 @@ def flat_ends(tree: VesselTree, opening: Inlet) -> tuple[End, ...]:
 def resized(
     tree: VesselTree, inlet: Inlet, surface: Surface, factor: float
 ) -> tuple[VesselTree, Inlet, Surface]:
-    """A tree, its inlet and its surface, `factor` times as large."""
+    """A tree, its inlet and its surface, scaled by `factor`."""
     if factor == 1.0:
         return tree, inlet, surface
     inlet = Inlet(
@@ -190,9 +190,9 @@ def resized(
 
 
 def describe(anatomy: Anatomy, device: float = DEVICE_RADIUS) -> dict[str, Any]:
-    """Figures of an imported anatomy, JSON values in millimetres.
+    """Measures of an imported anatomy as JSON values, lengths in millimetres.
 
-    How far a device of a radius (m) passes is among them.
+    `passable_mm` is the length up to which a device with a radius (m) passes.
     """
     vessels, goals, inlet = {}, {}, anatomy.inlet
     for key, vessel in anatomy.tree.vessels.items():
@@ -229,7 +229,7 @@ def describe(anatomy: Anatomy, device: float = DEVICE_RADIUS) -> dict[str, Any]:
 def opened_at_inlet(
     tree: VesselTree, at_end: bool, surface: Surface
 ) -> tuple[VesselTree, Inlet, Surface]:
-    """The tree from its inlet on, the inlet, and the surface cut off there."""
+    """The tree from its inlet on, the inlet, and the surface cut there."""
     # Less is cut off where the plane of the inlet would meet a branch.
     for share in SHARES if at_end else SHARES[:1]:
         opened, inlet = place_inlet(tree, at_end, share)
@@ -260,5 +260,5 @@ def opened_at_inlet(
 
 
 def _listed(places: list[np.ndarray]) -> str:
-    """The first places (3,) m for a message."""
+    """Text of the first eight places (3,) m, for a message."""
     return ", ".join(map(shown, places[:8]))

@@ -1,4 +1,4 @@
-"""Triangles of binary PLY files, whose polygons may differ in their corners."""
+"""Triangles of binary PLY files, whose polygons may have any number of corners."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ _TYPES = {
 
 
 def triangles(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) and triangles (F, 3); polygons are divided.
+    """Vertices (V, 3) and triangles (F, 3) int64; polygons are divided.
 
     ValueError if the file ends early.
     """
@@ -54,9 +54,9 @@ def _elements(header: str) -> list[tuple[str, int, list[list[str]]]]:
 def _rows(
     body: bytes, at: int, count: int, properties: list[list[str]], order: str
 ) -> tuple[list[np.ndarray], int]:
-    """Rows of an element, in blocks of one type, and where they end."""
+    """Rows of an element, in blocks of one type, and the offset of their end."""
     blocks: list[np.ndarray] = []
-    left, many = count, count  # mostly all rows are like the first one
+    left, many = count, count  # usually all rows are like the first one
     while left > 0:
         kind, lengths = _type_of(body, at, properties, order)
         room = (len(body) - at) // kind.itemsize
@@ -75,7 +75,7 @@ def _rows(
 def _type_of(
     body: bytes, at: int, properties: list[list[str]], order: str
 ) -> tuple[np.dtype[Any], dict[str, int]]:
-    """Type of the row at a place, and the lengths of its lists by their fields."""
+    """Type of the row at an offset, and the lengths of its lists by their fields."""
     fields: list[tuple[Any, ...]] = []
     lengths: dict[str, int] = {}
     for first, *words in properties:

@@ -1,4 +1,4 @@
-"""Mending a lumen's surface: what is wrong is put right, counted and said."""
+"""Repair of a lumen's surface; each repair is counted and noted."""
 
 from typing import NamedTuple
 
@@ -10,25 +10,27 @@ from cathsim_dmc.anatomy.scan.places import cut_open
 from cathsim_dmc.anatomy.scan.units import enlargement, mm, shown
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
-PART_AREA = 0.03  # of the surface's area: smaller separate parts are dropped
-PART_WIDTH = 12e-3  # m, and if they are not wider, or lie in the largest part:
-PART_INSIDE = 0.25  # of such a part
-MOST_SHOWN = 4  # separate parts whose places are told
-NON_MANIFOLD = 0.01  # of the triangles: more at non-manifold edges are not mended
+# A separate part is dropped if its share of the area is at most PART_AREA, and it is at
+# most PART_WIDTH, m, wide or more than PART_INSIDE of it lies in the largest part.
+PART_AREA = 0.03
+PART_WIDTH = 12e-3
+PART_INSIDE = 0.25
+MOST_SHOWN = 4  # separate parts whose places an error names
+NON_MANIFOLD = 0.01  # largest share of triangles at non-manifold edges to cut out
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
-FOLD = 2.5e-3  # m, most that a vertex of a self-intersection is moved
-LITTLE = 0.5e-3  # m, and before a patch is cut out
-WIDE_HOLE = 14e-3  # m, and of a lumen that is enlarged to 24 mm
-CUT = 16e-3  # m, widest hole that is filled where it was cut out
+FOLD = 2.5e-3  # m, largest movement of a vertex of a self-intersection
+LITTLE = 0.5e-3  # m, the same before a patch is cut out
+WIDE_HOLE = 14e-3  # m, largest such limit in an enlarged lumen
+CUT = 16e-3  # m, widest filled hole where triangles were cut out
 END_AREA = 0.5e-6  # m^2, least area of an open end
 END = 0.55  # largest |cosine| between an end's axis and the normals around it
-# Of an open end seen from inside, in radii of its rim: how far behind the rim, and how
-# near the wall is all around, but for a share of the directions across.
+# Test of an open end, in radii of its rim: rays across start BEHIND the rim, and fewer
+# than OPEN of all DIRECTIONS may find no wall within NEARBY.
 BEHIND, NEARBY, DIRECTIONS, OPEN = 0.75, 2.5, 32, 0.12
-RAGGED = 0.1  # of an end's width: rims that are less flat are cut back to a plane
+RAGGED = 0.1  # of an end's width: less flat rims are cut back to a plane
 DENSE = 30_000  # triangles; more are decimated
-FEW = 12_000  # triangles that are left then
+FEW = 12_000  # triangles after decimation
 ROUNDS = 6
 _OF_WALL = (
     "The surface was taken for that of a thick wall, and cut at its rims: export the "
@@ -38,7 +40,7 @@ _AGAIN = "Smooth or remesh that place, or export the segmentation again."
 
 
 class Mended(NamedTuple):
-    """A closed surface (m), a line for each change, and if it was that of a wall."""
+    """A closed surface (m), a note for each change, whether the file had a wall."""
 
     surface: Surface
     notes: list[str]
@@ -46,10 +48,10 @@ class Mended(NamedTuple):
 
 
 def mend(name: str, vertices: np.ndarray, faces: np.ndarray) -> Mended:
-    """Close a surface (V, 3) m, (F, 3), turn it outwards, and leave one part of it.
+    """Close a surface (V, 3) m, (F, 3), turn it outwards, and keep one part of it.
 
-    ValueError if it cannot be mended; says what is wrong in the file called `name`, and
-    where.
+    ValueError if it cannot be mended; says what is wrong, and where, in the file called
+    `name`.
     """
     work = _Work(name, vertices, faces)
     work.merge()
@@ -72,10 +74,10 @@ class _Work:
         self.notes: list[str] = []
         self._ends, self._ragged = 0, 0.0
         self.walled = self._rims = False
-        self._cut: set[tuple[float, ...]] = set()  # corners of what was cut out
+        self._cut: set[tuple[float, ...]] = set()  # corners of cut triangles
 
     def merge(self) -> None:
-        """One vertex per place, and no triangle without area or twice."""
+        """Merges coincident vertices; drops repeated triangles and empty ones."""
         before = len(self.faces)
         self.vertices, self.faces = topology.merged(self.vertices, self.faces)
         self.vertices, self.faces = topology.joined(self.vertices, self.faces)
@@ -92,7 +94,7 @@ class _Work:
         area = topology.areas(self.vertices, self.faces)
         share = np.bincount(label, area) / area.sum()
         wide = topology.widths(self.vertices, self.faces, label) > PART_WIDTH
-        # What lies in the lumen or its wall, such as calcifications, is no vessel.
+        # Parts inside the lumen or its wall, such as calcifications, are no vessels.
         inside = topology.inside(self.vertices, self.faces, label, int(share.argmax()))
         inside = inside > PART_INSIDE
         large = np.flatnonzero((share > PART_AREA) | (wide & ~inside))
@@ -131,7 +133,7 @@ class _Work:
         self._keep(label == large[0])
 
     def decimate(self) -> None:
-        """Fewer triangles where there are very many."""
+        """Decimates a surface with more than `DENSE` triangles."""
         if len(self.faces) <= DENSE:
             return
         points, faces = topology.decimated(self.vertices, self.faces, FEW)
@@ -243,7 +245,7 @@ class _Work:
             )
 
     def _cut_back(self, loop: np.ndarray, middle: np.ndarray, axis: np.ndarray) -> bool:
-        """Cut a ragged rim back to a plane and cap that, whether it had to and could.
+        """Cut a ragged rim back to a plane and cap it; False if nothing was cut.
 
         A fan over ragged triangles would fold into the lumen.
         """
@@ -263,7 +265,7 @@ class _Work:
         faces = np.concatenate(kept)
         gone = self.vertices[np.setdiff1d(self.faces, faces)]
         if np.linalg.norm(gone - middle, axis=1).max(initial=0.0) > 1.2 * reach:
-            return False  # a branch would go, too
+            return False  # a branch would be cut off, too
         self.vertices, self.faces = points, faces
         self._ragged = max(self._ragged, float(ragged))
         return True
@@ -271,9 +273,8 @@ class _Work:
     def _is_end(self, loop: np.ndarray, axis: np.ndarray, wide: bool) -> bool:
         """Whether a vessel ends at the loop: the wall behind it surrounds its axis.
 
-        Triangles at the rim show it where they run across its plane, but not where the
-        rim of a wide end is turned in or out. Behind a hole in the side the vessel goes
-        on both ways.
+        At an end the triangles of the rim cross its plane, unless the rim of a wide end
+        is turned in or out. Behind a hole in the side the vessel continues both ways.
         """
         beside = np.isin(self.faces, loop).any(axis=1)
         corners = self.vertices[self.faces[beside]]
@@ -287,7 +288,7 @@ class _Work:
         return bool(far.mean() < OPEN or (across and not both_ways.any()))
 
     def _far_behind(self, loop: np.ndarray, axis: np.ndarray) -> np.ndarray:
-        """Directions (n,) bool across the axis behind a loop without a wall near by."""
+        """Mask (n,) of directions across the axis behind a loop without a near wall."""
         import igl
 
         rim = self.vertices[loop]
@@ -296,7 +297,7 @@ class _Work:
         off = self.vertices - middle
         near = off[np.linalg.norm(off, axis=1) < NEARBY * reach]
         back = np.sign(near.mean(axis=0) @ axis) * axis
-        # Its tolerances suit coordinates of order one.
+        # libigl's tolerances suit coordinates of order one.
         vertices, faces = 1e3 * self.vertices, np.ascontiguousarray(self.faces)
         boxes = igl.AABB()
         boxes.init(vertices, faces)
@@ -315,10 +316,10 @@ class _Work:
             self.notes.append("surface turned inside out: normals pointed inwards")
 
     def untangle(self) -> None:
-        """Smooths folds that pierce the surface, or cuts out small patches.
+        """Smooth folds that pierce the surface, or cut out small patches.
 
         A patch that is cut out leaves a hole as wide as the triangles around it, so
-        folds are smoothed first if that moves them little.
+        smoothing comes first where it moves the vertices little.
         """
         first = None
         for turn in range(ROUNDS + 1):
@@ -349,7 +350,7 @@ class _Work:
             )
 
     def _crossings(self, vertices: np.ndarray) -> tuple[int, str, np.ndarray]:
-        """Triangles that are pierced, where, and those (F,) with an edge that does."""
+        """Number of pierced triangles, place of one, and mask (F,) of all involved."""
         faces, edges = topology.crossings(vertices, self.faces)
         tangled = np.isin(self.faces, np.unique(edges)).sum(axis=1) >= 2
         tangled[faces] = True
@@ -357,9 +358,9 @@ class _Work:
         return len(np.unique(faces)), where, tangled
 
     def _smooth_folds(self, limit: float) -> bool:
-        """Move vertices of folds to their neighbours; False if that is not enough.
+        """Smooth the vertices of folds; False if that fails or moves one too far.
 
-        `limit` is the most that a vertex is moved, m.
+        `limit` is the largest movement, m.
         """
         import igl
 

@@ -1,4 +1,4 @@
-"""Triangles and how they hang together: parts, borders, orientation, walls."""
+"""Topology of triangle meshes: parts, borders, orientation, walls."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -12,18 +12,18 @@ from cathsim_dmc.anatomy.parts import Surface
 
 MERGE = 1e-6  # of the mesh's size: vertices nearer than this are one
 JOIN = 1e-5  # of it: vertices of borders nearer than this are one
-ROUNDS = 6  # in which triangles without area are taken out, neighbours of others later
-TOUCH = 1e-6  # share of an edge or a triangle that counts as its border
-# Of the wall of a vessel with a thickness:
+ROUNDS = 6  # passes that remove triangles without area; neighbours need several
+TOUCH = 1e-6  # of an edge or a triangle: a hit this near to its border does not count
+# Detection of the thick wall of a vessel.
 RAYS = 64
-ENCLOSED = 0.75  # share of rays that hit: the place is inside a vessel
-WALL = 0.25  # of the area: a surface of which so much is enclosed is a wall
+ENCLOSED = 0.75  # share of rays that hit, above which a point is inside a vessel
+WALL = 0.25  # enclosed share of its area, above which a surface is a wall
 EDGE = 0.6  # cosine between the normals of triangles at the rim of an open end
-SOME = 500  # triangles by which a surface is first looked at
+SOME = 500  # triangles of the first, fast test
 
 
 def merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One vertex per place, and no triangle with a vertex twice or given twice."""
+    """Surface without coincident vertices, degenerate and repeated triangles."""
     size = np.linalg.norm(np.ptp(vertices, axis=0))
     cell = np.rint(vertices / max(size * MERGE, 1e-30)).astype(np.int64)
     _, first, inverse = np.unique(cell, axis=0, return_index=True, return_inverse=True)
@@ -37,10 +37,10 @@ def merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface; corners of its borders that hardly differ are one.
+    """The same surface with nearly coincident vertices of its borders merged.
 
-    Triangles that share no vertices have such corners where their coordinates were
-    rounded, or computed, differently.
+    Separate triangles have such vertices if their coordinates were rounded, or
+    computed, differently.
     """
     edges, times = edge_counts(faces)
     border = np.unique(edges[times == 1])
@@ -58,7 +58,7 @@ def joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 def inside(
     vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, part: int
 ) -> np.ndarray:
-    """Share of each of n parts (n,) that lies inside one of them, of itself none.
+    """Share (n,) of each of n parts that lies inside the part `part`; 0 for itself.
 
     Faces (F, 3) are labelled (F,) by their parts.
     """
@@ -91,20 +91,20 @@ def widths(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray) -> np.nda
 
 
 def edge_counts(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges (E, 2), lower vertex first, and the triangles at each (E,)."""
+    """Edges (E, 2), lower vertex first, and the number (E,) of triangles at each."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return np.unique(edges, axis=0, return_counts=True)
 
 
 def handles(faces: np.ndarray) -> int:
-    """Handles of a closed surface in one part, by its Euler characteristic."""
+    """Genus of a closed connected surface, from its Euler characteristic."""
     import igl
 
     return 1 - igl.euler_characteristic(np.ascontiguousarray(faces)) // 2
 
 
 def parts(faces: np.ndarray) -> np.ndarray:
-    """Number (F,) of the connected part that each triangle belongs to, from 0."""
+    """Label (F,) of the connected part that each triangle belongs to, from 0."""
     import igl
 
     label = igl.vertex_components(np.ascontiguousarray(faces))[faces[:, 0]]
@@ -119,7 +119,7 @@ def adjacent(faces: np.ndarray) -> np.ndarray:
 
 
 def groups(count: int, pairs: np.ndarray) -> np.ndarray:
-    """Number (count,) of the group that each of some things joined in pairs is in."""
+    """Label (count,) of the connected group of each element; `pairs` are connected."""
     link = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
     return connected_components(link, directed=False)[1]
 
@@ -130,7 +130,7 @@ def oriented(faces: np.ndarray) -> tuple[np.ndarray, int]:
 
     out, part = igl.bfs_orient(np.ascontiguousarray(faces))
     changed = (out != faces).any(axis=1)
-    # Of both ways to orient a part, the one in which more triangles stay as given.
+    # Of the two orientations of a part, the one that keeps more triangles as given.
     other = (np.bincount(part, changed) > 0.5 * np.bincount(part))[part]
     out[other] = out[other, ::-1]
     return out, int((changed != other).sum())
@@ -139,12 +139,12 @@ def oriented(faces: np.ndarray) -> tuple[np.ndarray, int]:
 def decimated(
     vertices: np.ndarray, faces: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface of about so many triangles, or as it is if it has no more."""
+    """The surface decimated to about `count` triangles; unchanged if it has no more."""
     if len(faces) <= count:
         return vertices, np.asarray(faces, dtype=np.int64)
     from fast_simplification import simplify
 
-    scale = 1e3  # its tolerances suit coordinates of order one
+    scale = 1e3  # the tolerances suit coordinates of order one
     points, fewer = simplify(
         (vertices * scale).astype(np.float32),
         faces.astype(np.int32),
@@ -191,7 +191,7 @@ def crossings(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def border_loops(faces: np.ndarray) -> Iterator[np.ndarray]:
-    """Closed rows of vertices along the borders, in the direction of their faces."""
+    """Yields closed loops of border vertices, in the direction of their faces."""
     import networkx
 
     pairs = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -207,8 +207,8 @@ def border_loops(faces: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def without_slivers(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int]:
-    """Triangles of which three corners lie in line are taken out, and how many."""
-    # The corner between the other two is put into the neighbour at the long edge.
+    """Faces without those whose corners are collinear, and the number removed."""
+    # The middle corner is inserted into the neighbour at the longest edge.
     removed = 0
     for _ in range(ROUNDS):
         corners = vertices[faces]
@@ -241,7 +241,7 @@ def without_slivers(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
 
 
 def inner_shell(vertices: np.ndarray, shells: Sequence[np.ndarray]) -> int | None:
-    """Which of two surfaces, faces (n, 3), lies inside the other; None if neither."""
+    """Index of the inner of two surfaces, faces (n, 3); None if neither is inside."""
     import igl
 
     share = []
@@ -257,7 +257,7 @@ def inner_shell(vertices: np.ndarray, shells: Sequence[np.ndarray]) -> int | Non
 def overlap(
     vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, chosen: np.ndarray
 ) -> bool:
-    """Whether some of the chosen parts lie in others partly, but not wholly.
+    """Whether some of the chosen parts lie partly, but not wholly, in others.
 
     Faces (F, 3) are labelled (F,) by their parts.
     """
@@ -266,10 +266,10 @@ def overlap(
 
 
 def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
-    """Faces (F,) bool of the inner surface of a wall, or None if it is no wall.
+    """Mask (F,) of the faces of the inner surface of a wall; None if there is no wall.
 
-    A wall with an open end is one closed surface. Seen from its inner side almost every
-    ray meets the wall again. Faces (F, 3) are oriented alike.
+    A wall with an open end is one closed surface. Almost every ray from its inner side
+    meets the wall again. Faces (F, 3) must be consistently oriented.
     """
     import igl
 
@@ -278,10 +278,10 @@ def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     area = areas(vertices, faces)
     outward = igl.per_face_normals(vertices, faces, np.zeros(3))
     outward *= np.sign(Surface(vertices, faces).volume)
-    middles = 1e3 * vertices[faces].mean(axis=1)  # its tolerances suit millimetres
+    middles = 1e3 * vertices[faces].mean(axis=1)  # the tolerances suit millimetres
 
     def enclosed(rows: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Share of the rays from some faces that hit, and whether many do of enough."""
+        """Share of rays from each face that hit; whether enough area is enclosed."""
         places, normals = middles[rows], outward[rows]
         hits = igl.ambient_occlusion(1e3 * vertices, faces, places, normals, RAYS)
         inside = area[rows][hits > ENCLOSED].sum()
@@ -298,8 +298,8 @@ def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
 def _inner_faces(
     faces: np.ndarray, outward: np.ndarray, area: np.ndarray, hits: np.ndarray
 ) -> np.ndarray:
-    """Faces (F,) bool of the side of a wall from which most rays hit it again."""
-    # Parts between sharp edges are of one side.
+    """Mask (F,) of the faces of the side of a wall from which most rays hit it."""
+    # A patch between sharp edges belongs to one side.
     pairs = adjacent(faces)
     smooth = np.vecdot(outward[pairs[:, 0]], outward[pairs[:, 1]]) > EDGE
     label = groups(len(faces), pairs[smooth])
@@ -310,12 +310,12 @@ def _inner_faces(
         large = inner & (size > 0.02 * size[inner].max())
         chosen = large[label]
     else:
-        # Rounded rims: every triangle for itself, then the largest patch.
+        # With rounded rims each triangle counts alone, and the largest patch is kept.
         chosen = hits > 0.5
         label = groups(len(faces), pairs[chosen[pairs].all(axis=1)])
         sizes = np.bincount(label, area * chosen)
         chosen = label == sizes.argmax()
-    # The outer side is one piece: any other belongs to the inner side around it.
+    # The outer side is one patch: any other belongs to the inner side around it.
     label = groups(len(faces), pairs[~chosen[pairs].any(axis=1)])
     sizes = np.bincount(label, area * ~chosen)
     return chosen | (label != sizes.argmax())

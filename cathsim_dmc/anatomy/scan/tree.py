@@ -1,4 +1,4 @@
-"""From curves in a scan to a tree of vessels that starts at an inlet."""
+"""Growth of a vessel tree from curves in a scan and an inlet."""
 
 import re
 from collections.abc import Collection
@@ -13,14 +13,14 @@ from cathsim_dmc.anatomy.scan.naming import ROOT
 from cathsim_dmc.anatomy.scan.ways import DEVICE_RADIUS, Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
-TAIL = 15e-3  # m, end of a centreline that is cut off where it is too narrow
-# m, least radius of a vessel's end, of a 6 Fr device (1.0 mm) and a tenth to spare, for
-# a 5 Fr device; of others in proportion.
+TAIL = 15e-3  # m, end of a centreline within which a narrow tail is cut off
+# m, least radius of a vessel's end for a 5 Fr device: that of a 6 Fr device (1.0 mm)
+# and a tenth; in proportion for others.
 TAIL_RADIUS = 1.1e-3
-END_TRIM = 8e-3  # m, most that is cut off where a curve runs into its end
-TRUNKS = ("rsa", "lsa")  # keep what they share with others, such as vertebral arteries
-STEMS = ("bca", "lcca", "rcca")  # keep what they share with what has no name
-MIN_RADIUS = 0.1e-3  # m, floor of a centreline's radius where it scrapes the wall
+END_TRIM = 8e-3  # m, most that is cut off before a blind end
+TRUNKS = ("rsa", "lsa")  # keep the part shared with others, such as vertebral arteries
+STEMS = ("bca", "lcca", "rcca")  # keep the part shared with unnamed vessels
+MIN_RADIUS = 0.1e-3  # m, least radius of a centreline that touches the wall
 BCA = "bca"  # the common trunk of the right branches
 # Branches of which the brachiocephalic artery is the trunk.
 _RIGHT = re.compile(
@@ -39,7 +39,7 @@ def grow_tree(
     """Join curves (n, 3) m by name into one tree whose root starts at the inlet (3,) m.
 
     The root ends at `far` (3,) m, or where the last curve leaves it. Drawn curves may
-    run off the deepest way and start anywhere; others are computed from the inlet on.
+    leave the deepest path and start anywhere; others are computed from the inlet on.
     """
     before = ways.deepest_from(ways.node(inlet))
     raw = {}
@@ -71,7 +71,7 @@ def grow_tree(
         line = _finish(field, own, anchor, tail)
         lines[name] = curve
         vessels[name] = Vessel(name, line, parent, ostium_of(line, trunk))
-    # Report in the order in which the files were given, parents first.
+    # Vessels have the order of the files, parents first.
     ordered = {ROOT: vessels[ROOT]}
     while len(ordered) < len(vessels):
         for name in curves:
@@ -81,7 +81,7 @@ def grow_tree(
 
 
 def _bulk(field: SurfaceDepth, curve: np.ndarray) -> float:
-    """Length times mean depth: the larger of two branches becomes the parent."""
+    """Sum of depths along a curve; the larger of two branches is the parent."""
     return float(np.maximum(field(curve), 0.0).sum())
 
 
@@ -91,19 +91,19 @@ def _separation(
     """Index of the last point of ``curve`` before it leaves ``other`` for good."""
     distance, nearest = cKDTree(other).query(curve)
     apart = distance > np.maximum(0.4 * depth, 1e-3)
-    # They part for good where a wall stands between them: at a wide flat end, or where
-    # two drawn curves begin, they may part and meet again in one lumen. After that
-    # they may meet once more, in a ring of vessels.
+    # The curves separate for good where a wall is between them: at a wide flat end, or
+    # where two drawn curves begin, they may separate and meet again in one lumen.
+    # Beyond the wall they may meet once more, in a ring of vessels.
     share = np.linspace(0.0, 1.0, 9)[1:-1, None, None]
     between = curve[apart] + share * (other[nearest] - curve)[apart]
     walled = apart.copy()
     walled[apart] = field(between).min(axis=0) < 0.0
-    # Not at a corner of the lumen that the two cut before they ever met.
+    # A corner of the lumen that they cut before their first meeting does not count.
     walled[: int((~apart).argmax())] = False
     end = int(walled.argmax()) if walled.any() else len(curve)
     together = np.nonzero(~apart[:end])[0]
     first = min(int(together[-1]) + 1, len(curve) - 2) if len(together) else 0
-    # Walk back to where the two still ran together.
+    # Walks back to where the two still coincide.
     while first and distance[first] > max(0.5e-3, distance[first - 1]):
         first -= 1
     return min(first, len(curve) - 3)
@@ -114,7 +114,7 @@ def _parent(curve, lines, vessels, field) -> tuple[str, int]:
     depth = field(curve)
     at = {key: _separation(curve, depth, line, field) for key, line in lines.items()}
     key = max(at, key=lambda name: at[name])
-    # Of curves that leave a wide vessel side by side it is the parent.
+    # The wide vessel is the parent of curves that leave it side by side.
     while (vessel := vessels[key]).parent is not None:
         if vessel.centreline.project(curve[at[key]]).arc_length > vessel.ostium:
             break
@@ -123,7 +123,7 @@ def _parent(curve, lines, vessels, field) -> tuple[str, int]:
 
 
 def _shared_beginning(curves: list[np.ndarray], field: SurfaceDepth) -> np.ndarray:
-    """Part that the first curve shares with any other, or 60 % of it if alone."""
+    """Part that the bulkiest curve shares with any other, or 60 % of it if alone."""
     longest = max(curves, key=lambda curve: _bulk(field, curve))
     others = [curve for curve in curves if curve is not longest]
     if not others:
@@ -134,7 +134,7 @@ def _shared_beginning(curves: list[np.ndarray], field: SurfaceDepth) -> np.ndarr
 
 
 def _deep_start(curve: np.ndarray, field: SurfaceDepth) -> np.ndarray:
-    """Cut the beginning up to where the lumen has its full width."""
+    """Cut off the beginning, up to where the lumen has its full width."""
     depth = field(curve)
     head = depth[: max(2, len(curve) // 3)]
     settled = depth >= 0.8 * np.maximum.accumulate(head)[min(15, len(head) - 1)]
@@ -145,7 +145,7 @@ def _finish(
     field: SurfaceDepth, curve: np.ndarray, anchor: np.ndarray | None, tail: float
 ) -> Centreline:
     """Centre a curve in the lumen, end it at a `tail` radius (m), measure its radii."""
-    # Towards a blind end the depth tells the distance to the end, not the middle.
+    # Near a blind end the depth is the distance to the end, not to the side wall.
     last = min(len(curve) // 2, int(END_TRIM / STEP))
     deep = field(curve[-last:])
     wide = np.nonzero(deep >= 0.75 * deep.max())[0][-1]
@@ -162,7 +162,7 @@ def _finish(
 
 
 def ostium_of(line: Centreline, trunk: Centreline) -> float:
-    """Arc length at which a branch leaves its parent's tube."""
+    """Arc length (m) at which a branch leaves its parent's tube."""
     place = trunk.project(line.points)
     outside = place.distance > place.radius
     at = int(outside.argmax()) if outside.any() else len(outside) // 2
@@ -173,8 +173,8 @@ def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
     """Give the common trunk of right branches its name, the brachiocephalic artery.
 
     If two right branches, by their names or because they are in `right`, share a trunk,
-    it becomes a vessel of its own and the parent of both, and of the left carotid of a
-    bovine arch, which leaves it before.
+    the trunk becomes a vessel of its own. It is the parent of both, and of the left
+    carotid of a bovine arch, which leaves it before them.
     """
     root = tree.root.name
     if BCA in tree.vessels:
@@ -193,7 +193,7 @@ def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
         if any(key != "lcca" or tree.origin(key) > split for key in others):
             continue
         if not vessel.ostium + 2.0 * STEP < split < line.length - 2.0 * STEP:
-            continue  # they part in the root's lumen, or at the curve's end
+            continue  # they fork in the root's lumen, or at the curve's end
         trunk = line.slice(0.0, split)
         rest = line.slice(split, line.length)
         vessels = {}
@@ -211,7 +211,7 @@ def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
 
 
 def with_root(tree: VesselTree, name: str) -> VesselTree:
-    """The tree whose root is called `name`."""
+    """The tree with its root renamed `name`."""
     old, vessels = tree.root.name, {}
     for key, vessel in tree.vessels.items():
         key = name if key == old else key

@@ -14,12 +14,12 @@ from cathsim_dmc import bounds
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6, "inch": 25.4e-3}
 _SYSTEMS = {"LPS": 1.0, "RAS": -1.0}
 _AXES = dict(zip("LPSRAI", np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
-# Frame in which places are shown: matrix (3, 3) from there to m, LPS, its unit, and by
-# how much places and lengths are enlarged.
+# Frame in which places are shown: matrix (3, 3) from there to m, LPS, its unit, and the
+# enlargement of places and lengths.
 _FILE: contextvars.ContextVar[tuple[np.ndarray, str, float]] = contextvars.ContextVar(
     "file", default=(1e-3 * np.eye(3), "mm", 1.0)
 )
-_OFF = 0.05  # most by which directions given by numbers may differ from a rotation
+_OFF = 0.05  # largest difference of given directions from a rotation
 
 
 def shown(point: np.ndarray) -> str:
@@ -31,20 +31,20 @@ def shown(point: np.ndarray) -> str:
 
 
 def mm(length: float | np.ndarray) -> float:
-    """A length (m) in mm, as it is in the patient; see `file_frame`."""
+    """A length (m) in mm at the size of the patient; see `file_frame`."""
     return 1e3 * float(length) / _FILE.get()[2]
 
 
 def enlargement() -> float:
-    """By how much places and lengths are enlarged; see `file_frame`."""
+    """Enlargement of places and lengths; see `file_frame`."""
     return _FILE.get()[2]
 
 
 @contextlib.contextmanager
 def file_frame(matrix: np.ndarray, unit: str, scale: float = 1.0) -> Iterator[None]:
-    """Has places `shown` in the unit and frame of a file; see `to_lps`.
+    """Context in which `shown` uses the unit and frame of a file; see `to_lps`.
 
-    Places and lengths are given `scale` times as large as in the patient.
+    Places and lengths given to `shown` and `mm` are enlarged by `scale`.
     """
     before = _FILE.set((matrix, unit, scale))
     try:
@@ -55,7 +55,7 @@ def file_frame(matrix: np.ndarray, unit: str, scale: float = 1.0) -> Iterator[No
 
 @contextlib.contextmanager
 def enlarged(scale: float) -> Iterator[None]:
-    """As `file_frame`, of the same file, `scale` times as large."""
+    """Context with the same unit and frame and another enlargement `scale`."""
     matrix, unit, _ = _FILE.get()
     with file_frame(matrix, unit, scale):
         yield
@@ -67,7 +67,7 @@ def to_lps(
     """Matrix (3, 3) that takes points of a scan to metres in LPS.
 
     ValueError unless `units` is a key of `UNITS` and `frame` "LPS" or "RAS"; `axes`
-    say how that frame is turned in the patient, see `upright`.
+    give the rotation of that frame in the patient, see `upright`.
     """
     scale = UNITS[bounds.choice("units", units, UNITS)]
     sign = _SYSTEMS[bounds.choice("mesh_frame", frame, _SYSTEMS)]

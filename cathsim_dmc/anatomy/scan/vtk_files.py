@@ -7,11 +7,11 @@ import numpy as np
 
 
 def _poly_data(path: Path) -> Any:
-    """The PolyData of a file, its cells proved; ValueError if it holds none."""
+    """The PolyData of a file with checked cells; ValueError if it holds none."""
     from vtkmodules import vtkCommonCore, vtkIOLegacy, vtkIOXML
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    vtkCommonCore.vtkObject.GlobalWarningDisplayOff()  # it prints what it cannot read
+    vtkCommonCore.vtkObject.GlobalWarningDisplayOff()  # VTK prints errors of reading
     if path.suffix.lower() == ".vtk":
         reader = vtkIOLegacy.vtkPolyDataReader()
         reader.SetFileName(str(path))
@@ -26,7 +26,7 @@ def _poly_data(path: Path) -> Any:
     reader.Update()
     read = reader.GetOutput()
     for cells in (read.GetVerts(), read.GetLines(), read.GetPolys(), read.GetStrips()):
-        # VTK does not look, and would read beyond the arrays.
+        # VTK does not check its indices, and would read beyond the arrays.
         corners = vtk_to_numpy(cells.GetConnectivityArray())
         stops = vtk_to_numpy(cells.GetOffsetsArray())
         beyond = stops[-1:] != len(corners) or np.diff(stops, prepend=0).min() < 0
@@ -54,15 +54,15 @@ def triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def space(path: Path) -> str:
-    """What a file says of its frame, as 3D Slicer's do: "SPACE=RAS", or nothing."""
+    """Frame that a file of 3D Slicer names, such as "SPACE=RAS"; else empty."""
     said = _poly_data(path).GetFieldData().GetAbstractArray("SPACE")
     return f"SPACE={said.GetVariantValue(0).ToString()}" if said else ""
 
 
 def lines(path: Path) -> list[np.ndarray]:
-    """Lines (n_i, 3), as of VMTK's centrelines: one for each way that it computed.
+    """Lines (n_i, 3), such as VMTK's centrelines.
 
-    Where VMTK has split them at their forks, the pieces of a way are joined again.
+    Pieces into which VMTK has split a centreline at forks are joined again.
     """
     from vtkmodules.util.numpy_support import vtk_to_numpy
 

@@ -1,4 +1,4 @@
-"""Shortest and deepest ways through a lumen, on a lattice of its inside."""
+"""Shortest and deepest paths through a lumen, on a lattice of its inside."""
 
 from functools import cache
 
@@ -14,25 +14,25 @@ from cathsim_dmc.anatomy.scan.units import mm
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 DEVICE_RADIUS = 0.84e-3  # m, 5 Fr catheter (1 Fr = 1/3 mm diameter)
-LATTICE = 1e-3  # m, spacing of the lattice on which ways are searched
-CELL = 0.2e-3  # m by which depths of its points are less than radii, in the mean
-CORRIDOR = 2e-3  # m, distance from a drawn curve at which a way costs twice
-SHALLOW = 0.2e-3  # m, lattice points nearer to the wall are no way
-NEAR = 2.5e-3  # m, of a place in the lumen to the lattice, if it belongs to it
+LATTICE = 1e-3  # m, spacing of the lattice on which paths are searched
+CELL = 0.2e-3  # m, mean difference of radii and the depths of lattice points
+CORRIDOR = 2e-3  # m, distance from a drawn curve at which a path costs twice
+SHALLOW = 0.2e-3  # m, least depth of lattice points
+NEAR = 2.5e-3  # m, largest distance from the lattice of a place that belongs to it
 
 
 class Ways:
-    """Shortest and deepest ways through a lumen.
+    """Shortest and deepest paths through a lumen.
 
-    Its lattice has `points` (n, 3) m with their `depth` (n,) m and `links` (e, 2) of
-    neighbours; `main` (n,) bool is the largest connected piece, `nodes` (m,) its rows.
-    The `device` is the radius (m) of what is to pass.
+    The lattice has `points` (n, 3) m with their `depth` (n,) m and `links` (e, 2) of
+    neighbours; `main` (n,) bool is the largest component, `nodes` (m,) its indices.
+    `device` is the radius (m) of the device that must pass.
     """
 
     def __init__(self, field: SurfaceDepth, device: float = DEVICE_RADIUS):
         """Build the lattice graph of a depth ``field`` (26 neighbours).
 
-        The radius of the ``device`` (m) is that for which ways are looked for.
+        ``device`` is the radius (m) for which paths are searched.
         """
         self.device = device
         low, high = field.box
@@ -50,7 +50,7 @@ class Ways:
             links.append(np.stack([found, at[found]], axis=1))
             lengths.append(np.full(len(found), LATTICE * np.linalg.norm(offset)))
         self.links, self._lengths = np.concatenate(links), np.concatenate(lengths)
-        # Of a point's links the offsets are in order; sorting them once is enough.
+        # The links of a point are in order of their offsets: one stable sort is enough.
         self._order = np.argsort(self.links[:, 0], kind="stable")
         rows = self.links[self._order, 0]
         self._starts = np.searchsorted(rows, np.arange(len(self.points) + 1))
@@ -59,55 +59,55 @@ class Ways:
         self.main = label == np.bincount(label).argmax()
         self.nodes = np.flatnonzero(self.main)
         self._lookup = cKDTree(self.points[self.main])
-        # A step of a deepest way costs its length over the fourth power of the depth,
-        # as blood flow does (Poiseuille): a way keeps to the middle, and in a ring of
-        # vessels it takes the artery, not the thin communicating one.
+        # A step of a deepest path costs its length over the fourth power of the depth,
+        # like the resistance to flow (Poiseuille): paths keep to the middle, and in a
+        # ring of vessels they take the artery, not the thin communicating one.
         depth = self.depth[self.links].mean(axis=1)
         deep = self._graph(self._lengths * (LATTICE / depth) ** 4)
-        # Of a node: lengths (n,) m of the shortest ways, predecessors on the deepest.
+        # By node: lengths (n,) m of shortest paths, predecessors (n,) on deepest paths.
         self.lengths_from = cache(lambda node: dijkstra(self._near, indices=node))
         self.deepest_from = cache(lambda node: _before(deep, node))
 
     def _graph(self, weights: np.ndarray) -> csr_matrix:
-        """The lattice's links with ``weights`` (e,), in both directions.
+        """Graph of the lattice's links with ``weights`` (e,), in both directions.
 
-        Dijkstra's algorithm is faster on these than on one direction taken as both.
+        Dijkstra's algorithm is faster on it than on an undirected graph.
         """
         shape, order = (len(self.points),) * 2, self._order
         graph = csr_matrix((weights[order], self.links[order, 1], self._starts), shape)
         return graph + graph.T
 
     def node(self, position: np.ndarray) -> int:
-        """Lattice point nearest to ``position`` (3,) m in the largest piece."""
+        """Node nearest to ``position`` (3,) m in the largest component."""
         return int(self.nodes[self._lookup.query(position)[1]])
 
     def walled(self, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-        """Whether there is wall between places (n, 3) m in the lumen: (n,) bool."""
+        """Mask (n,) of pairs of places (n, 3) m in the lumen with a wall in between."""
         share = np.linspace(0.0, 1.0, 7)[1:-1, None, None]
         between = first + share * (last - first)
         off = self._lookup.query(between, distance_upper_bound=1.5 * LATTICE)[0]
         return np.asarray(np.isinf(off).any(axis=0))
 
     def around(self, node: int, radius: float) -> np.ndarray:
-        """Rows (m,) of the points in a ball (m) that are joined to its middle in it."""
+        """Nodes (m,) that are connected to a node inside a ball of ``radius`` (m)."""
         near = self.nodes[self._lookup.query_ball_point(self.points[node], radius)]
         part = self._near[near][:, near]
         label = connected_components(part, directed=False)[1]
         return near[label == label[near == node]]
 
     def length(self, way: np.ndarray) -> float:
-        """Length (m) of a way (n,) of nodes."""
+        """Length (m) of a path (n,) of nodes."""
         return float(arc_lengths(self.points[way])[-1])
 
     def along(self, curve: np.ndarray, name: str) -> np.ndarray:
-        """Deepest way (m, 3) near ``curve`` (n, 3) m, from its start to its end.
+        """Deepest path (m, 3) m near ``curve`` (n, 3) m, from its start to its end.
 
-        A drawn curve chooses the vessel and the lumen the way through it. ValueError
-        if the lumen is closed between an end and the rest.
+        The drawn curve selects the vessel, the lumen the path through it. ValueError if
+        the lumen is closed between an end and the rest.
         """
         for place, which in ((curve[0], "start"), (curve[-1], "end")):
             own = int(np.linalg.norm(self.points - place, axis=1).argmin())
-            # Points hug the wall where a curve runs into its vessel's end.
+            # Near the end of a vessel, curves may be off the lattice but in the lumen.
             if self._lookup.query(place)[0] > NEAR and not self.main[own]:
                 raise ValueError(
                     f"the {which} of centreline {name!r} lies in a part of the lumen "
@@ -126,9 +126,9 @@ class Ways:
     def out_of(
         self, taken: np.ndarray, links: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Shortest ways out of `taken` (n,) nodes by some of the links (e, 2).
+        """Shortest paths from the `taken` (n,) nodes along the given links (e, 2).
 
-        Returns lengths (n,) m, inf where there is none, and the node before each (n,).
+        Returns lengths (n,) m, inf without a path, and predecessors (n,), -1 for none.
         """
         rows = np.unique(links)
         local = np.searchsorted(rows, links)
@@ -145,7 +145,7 @@ class Ways:
         return gone, before
 
     def trace(self, before: np.ndarray, node: int) -> np.ndarray:
-        """Nodes of the way that ends at ``node``, first to last."""
+        """Nodes of the path that ends at ``node``, first to last."""
         way = [node]
         while before[way[-1]] >= 0:
             way.append(int(before[way[-1]]))
@@ -157,10 +157,10 @@ def _before(graph: csr_matrix, node: int) -> np.ndarray:
 
 
 def in_reach(points: np.ndarray, centres: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Whether points (n, 3) lie in a ball of centres (m, 3) and radii (m,): (n,) bool.
+    """Mask (n,) of points (n, 3) in any ball with centres (m, 3) and radii (m,).
 
-    In a fourth dimension, in which a centre lies as far off as its ball is smaller than
-    the largest one, all balls have the same radius.
+    Centres are shifted along a fourth dimension so that all balls have the largest
+    radius and one search suffices.
     """
     most = float(reach.max())
     lifted = np.column_stack([centres, np.sqrt(most**2 - reach**2)])
@@ -170,7 +170,7 @@ def in_reach(points: np.ndarray, centres: np.ndarray, reach: np.ndarray) -> np.n
 
 
 def common(one: np.ndarray, other: np.ndarray) -> int:
-    """How many first points two curves share."""
+    """Number of first points that two curves share."""
     count = min(len(one), len(other))
     same = (one[:count] == other[:count]).all(axis=1)
     return count if same.all() else int(same.argmin())
