@@ -173,11 +173,15 @@ def slide() -> Iterator[Check]:
         action[3] = turn / MAX_ROTATION_SPEED
         heads, peak = [play.readings.head], 0.0
         for _ in range(round(duration / CONTROL_TIMESTEP)):
-            if environment.step(action).last():
-                break
+            ended = environment.step(action).last()
             heads.append(play.readings.head)
             peak = max(peak, float(play.wall_force.peak_max))
+            if ended:
+                break
         warnings = int(environment.physics.data.ptr.warning.number.sum())
+        if ended:  # one more step would begin another episode
+            yield Check.at_most(f"sliding, {name}: early ends", 1, 0, "", str(play.error))
+            break
         if name == SCRIPT[0][0]:
             continue
         steps = np.linalg.norm(np.diff(heads, axis=0), axis=-1)
