@@ -180,7 +180,8 @@ def slide() -> Iterator[Check]:
                 break
         warnings = int(environment.physics.data.ptr.warning.number.sum())
         if ended:  # one more step would begin another episode
-            yield Check.at_most(f"sliding, {name}: early ends", 1, 0, "", str(play.error))
+            early = f"sliding, {name}: early ends"
+            yield Check.at_most(early, 1, 0, "", str(play.termination))
             break
         if name == SCRIPT[0][0]:
             continue
