@@ -1,7 +1,7 @@
 """Motion of an anatomy with heart and breathing, as displacements of space.
 
 A place x in space holds what lies at X = x - u(x, t) in the anatomy at rest, with
-u = a(t) H(x) + b(t) B(x); the radius grows by g(X) p(t - s/c): docs/vessel_model.md.
+u = a(t) H(x) + b(t) B(x); the radius grows by g(x) p(t - s/c): docs/vessel_model.md.
 """
 
 from collections.abc import Sequence
