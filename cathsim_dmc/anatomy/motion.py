@@ -1,6 +1,6 @@
 """Motion of an anatomy with heart and breathing, as displacements of space.
 
-A place x in space holds what lies at X = x - u(x, t) in the anatomy at rest, with
+A point x in space corresponds to the point X = x - u(x, t) of the anatomy at rest, with
 u = a(t) H(x) + b(t) B(x); the radius grows by g(x) p(t - s/c): docs/vessel_model.md.
 """
 
