@@ -8,7 +8,8 @@ from synthetic_scans import marched, write_obj, y_tree
 
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.scan.extract import trunk
-from cathsim_dmc.anatomy.scan.importer import THINNEST, import_scan
+from cathsim_dmc.anatomy.scan.growth import THINNEST
+from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.left_out import left_out, said
 from cathsim_dmc.anatomy.scan.lumen import enlargement, guess_units
 from cathsim_dmc.anatomy.scan.ways import Ways
