@@ -15,6 +15,7 @@ from cathsim_dmc.analysis.force_statistics import FIGURES, EpisodeForces, Statis
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.cli import agents as commands
 from cathsim_dmc.cli import task_options
+from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.randomisation import Randomisation
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -96,6 +97,22 @@ def test_evaluation_repeats_and_is_json(tmp_path):
     assert forces["sum"]["mean"]["sd"] == pytest.approx(np.std(sums, ddof=1))
     low, high = written["summary"]["success_ci95"]
     assert low <= written["summary"]["success"] <= high
+
+
+def test_objects_among_the_options_are_written_as_texts(tmp_path):
+    own = dataclasses.replace(DEVICES["steerable_5f"], name="own")
+    options = {"effects": [Effect()], "device": own, "randomisation": True}
+
+    def make_env(*args, task_kwargs, **kwargs):
+        return synthetic_env.make_env(*args, **kwargs)
+
+    given = {"make_env": make_env, "task_kwargs": options, "out_dir": tmp_path}
+    result = evaluate("random", "reach", 2, **given)
+    assert result.settings["task_kwargs"] == options
+    written = json.loads((tmp_path / "evaluation.json").read_text())
+    assert "Effect" in written["settings"]["task_kwargs"]["effects"][0]
+    assert "name='own'" in written["settings"]["task_kwargs"]["device"]
+    assert written["episodes"][1]["conditions"]["device"] == "own"
 
 
 def test_the_varied_protocol_has_distinct_conditions():

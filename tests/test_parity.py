@@ -107,6 +107,26 @@ def test_partial_resets_are_equal(anatomy):
             pair.reset_some([index // 6 % SIMULATIONS])
 
 
+@pytest.mark.parametrize("diverged", [False, True])
+def test_a_reset_leaves_the_figures_of_other_simulations(anatomy, diverged):
+    reward = {"distance": -1.0, "smoothness": -1.0, "force": -1.0}
+    options = {"anatomy": anatomy, "goal": "bca", "reward": reward}
+    batch = BatchSimulation(suite.make_task("navigate", **options), 2, num_threads=1)
+    batch.reset()
+    first, second = actions(2)
+    batch.step(first)
+    if diverged:
+        batch.batch.qvel[1] = np.nan
+    before = batch.step(second)
+    after = batch.reset(np.array([0]))
+    assert (after.errors[1] is not None) == diverged
+    assert diverged or before.info()["reward_smoothness"][1] < 0
+    for name, value in before.info().items():
+        assert after.info()[name][1] == value[1], name
+    assert after.outcome.reward[1] == before.outcome.reward[1]
+    assert after.terminated.tolist() == [False, diverged]
+
+
 def test_randomised_episodes_are_equal():
     # The wall of the phantom is met at once.
     pair = Pair(

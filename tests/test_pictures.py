@@ -222,19 +222,22 @@ def test_the_fluoroscopy_of_a_state_shows_where_the_head_is(pushed):
         (TASK, {"randomisation": {"view": [4, 5], "gain": [0.85, 0.9]}}),
         ("simple1_lcca_pair", {}),
         (TASK, {"vessel": "living"}),
+        (TASK, {"fluoroscopy": {"view": "best", "biplane": "best", "size": 64}}),
     ],
 )
 def test_x_ray_pictures_show_what_the_task_observes(task, options):
-    options |= {"fluoroscopy": {"view": [30, 10], "size": 64}, "observation": "image"}
+    usual = {"fluoroscopy": {"view": [30, 10], "size": 64}, "observation": "image"}
+    options = usual | options
     env = suite.load("cathsim", task, {"random": 0, **options})
     forward = np.eye(env.action_spec().shape[0])[-2 if task.endswith("pair") else -1]
     episode = cathsim_dmc.record(env, lambda _: forward, seed=3, max_steps=8)
     image = env.task.observation["image"][0, ..., 0]
     np.testing.assert_array_equal(cathsim_dmc.fluoroscopy(env), image)
-    surface, own = env.task.scene.anatomy.surface, env.task.config.fluoroscopy
+    surface = env.task.scene.anatomy.surface
     moment = Moment.of_episode(episode, surface)
+    own = moment.x_ray.options
     assert np.abs(xray(moment, own).astype(int) - image).max() <= 1
-    film = xray_film(episode, surface, own)[-1]  # in the contrast of a screen
+    film = xray_film(episode, surface, own)[-1, ..., 0]  # in the contrast of a screen
     assert np.corrcoef(film.ravel(), image.ravel())[0, 1] > 0.9999
     axes, turned = Picture().add_subplot(), moment.x_ray.deviation
     draw_fluoroscopy(axes, moment)

@@ -91,6 +91,15 @@ def test_neither_can_leave_its_base(environment):
     assert seen["device_insertion"].min() >= -depth
 
 
+def test_a_device_that_starts_outside_the_patient_stays_there():
+    given = {"lead": 0.1, "observation": "drives", "random": 0}
+    environment = suite.load("cathsim", "type1_lcca_pair", given)
+    before = environment.reset().observation["device_insertion"]
+    for push, way in ((0.0, 0.0), (-1.0, 0.0), (1.0, 2 * STEP)):
+        seen = run(environment, [0.0, 0.0, push, 0.0], 2)["device_insertion"]
+        assert seen[1] - before[1] == pytest.approx(way, abs=1e-4)
+
+
 def test_rotation_turns_the_shape_of_the_end(environment):
     """Where the wire lies free, its springs follow the rotation of its end."""
     environment.reset()

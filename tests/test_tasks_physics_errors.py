@@ -2,6 +2,7 @@ import contextlib
 import json
 import logging
 import types
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -11,6 +12,8 @@ from conftest import twin
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.agents.protocols import VARIED_RANGES
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.entities.devices import DEVICES
+from cathsim_dmc.physics.flow import FlowOptions
 from cathsim_dmc.physics.vessel import VesselOptions
 from cathsim_dmc.simulation import batch, error_files
 from cathsim_dmc.tasks import physics_errors, start
@@ -243,6 +246,11 @@ def test_objects_among_the_options_are_named(tmp_path):
     anatomy = phantoms.load("simple1")
     files = error_files.ErrorFiles(tmp_path, "navigate", {"anatomy": anatomy})
     assert not files._whole
+    # No mapping makes a device.
+    given = {"device": DEVICES["steerable_4f"], "vessel": VesselOptions(FlowOptions())}
+    files = error_files.ErrorFiles(tmp_path, "simple1_bca", given)
+    assert not files._whole and "steerable_4f" in files._options["device"]
+    assert files._options["vessel"]["flow"]["rate"] == 60.0
     files = error_files.ErrorFiles(tmp_path, "simple1_bca", {"effects": [object()]})
     assert not files._whole and "object" in files._options["effects"][0]
     files = error_files.ErrorFiles(tmp_path, "simple1_bca", {"rotation": True})
@@ -252,3 +260,6 @@ def test_objects_among_the_options_are_named(tmp_path):
 def test_numbers_of_numpy_are_options():
     given = {"max_steps": np.int64(3), "goal": np.array([1.0, 2.0, 3.0])}
     assert bounds.as_json(given) == ({"max_steps": 3, "goal": [1.0, 2.0, 3.0]}, {})
+    given = {"fluoroscopy": {"size": np.array([32, 48])}, "anatomy": Path("scans/a")}
+    read = {"fluoroscopy": {"size": [32, 48]}, "anatomy": str(Path("scans/a"))}
+    assert bounds.as_json(given) == (read, {})

@@ -402,6 +402,18 @@ def test_coaxial_devices_with_another_lead_are_another_task():
         others.restore(mine.snapshot())
 
 
+def test_blood_that_flows_is_no_blood_at_rest():
+    batches = [
+        BatchSimulation(suite.make_task("simple1_bca", vessel=each), 1, num_threads=1)
+        for each in ("silicone", {"wall": True, "flow": True})
+    ]
+    for batch in batches:
+        batch.reset()
+    for mine, other in (batches, batches[::-1]):
+        with pytest.raises(ValueError, match="other options: it .*same .* vessel"):
+            mine.restore(other.snapshot())
+
+
 def test_simulations_are_kept_and_restored_in_ascending_order(task):
     batch = BatchSimulation(task(), 3, num_threads=1)
     batch.reset()

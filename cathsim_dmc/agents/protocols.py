@@ -136,7 +136,8 @@ def _conditions(
         for name, value in dataclasses.asdict(episode).items()
         if value is not None
     }
-    return {"device": options.get("device"), **where, **values}
+    device = options.get("device")
+    return {"device": getattr(device, "name", device), **where, **values}
 
 
 def stratified(

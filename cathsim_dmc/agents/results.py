@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, STATISTICS
 from cathsim_dmc.analysis.intervals import success_interval
@@ -109,7 +110,8 @@ class EvaluationResult:
         return result
 
     def to_dict(self) -> dict[str, Any]:
-        """Return identity, summary and every episode as JSON-able values."""
+        """Return identity, summary and every episode, JSON-able; objects as texts."""
+        options = bounds.as_texts(self.settings.get("task_kwargs", {}))
         drawn = [{"conditions": dict(one)} for one in self.conditions]
         drawn = drawn or [{}] * len(self.seeds)
         played = zip(self.seeds, self.episodes, drawn, strict=True)
@@ -121,7 +123,7 @@ class EvaluationResult:
             "task": self.task,
             "policy": self.policy,
             "seed": self.seeds[0],
-            "settings": dict(self.settings),
+            "settings": {**self.settings, "task_kwargs": options},
             "distinct": self.distinct,
             "summary": self.summary(),
             "episodes": episodes,

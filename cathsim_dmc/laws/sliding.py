@@ -258,14 +258,16 @@ def advance(before, step, limits, target, lead):
     """Writes the target insertions (N, K) of the devices and (N,) of the chain, m.
 
     The devices move from `before` (N, K) by `step` (N, K) within `limits` (least,
-    most), m. The chain cannot retract behind its start.
+    most), m. A device that starts behind them is not drawn back further. The chain
+    cannot retract behind its start.
     """
     count, devices = before.shape
     least, most = limits
     for i in range(count):
         leader = 0
         for k in range(devices):
-            target[i, k] = min(max(before[i, k] + step[i, k], least), most)
+            back = min(least, before[i, k])
+            target[i, k] = min(max(before[i, k] + step[i, k], back), most)
             if target[i, k] > target[i, leader]:
                 leader = k
         lead[i] = max(target[i, leader], 0.0)

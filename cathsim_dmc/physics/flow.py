@@ -72,12 +72,14 @@ class Flow(StillBlood):
         radius: (N, L), radius of the lumen around each link, m; 0 for none.
     """
 
-    state = ("_wave_speed", "radius", "_link_radii")
+    state = ("radius", "_link_radii")
     radius: np.ndarray
 
     def __init__(self, options: FlowOptions | None, moving: Moving | None = None):
         """Takes the options, None for no flow, and the effect that moves vessels."""
         self._options, self._moving = options, moving
+        if options is not None:
+            self.state += ("_wave_speed",)
 
     def bind(self, world: World) -> None:
         """Takes the simulations, and the radii of the links from the model."""

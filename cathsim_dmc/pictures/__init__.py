@@ -119,9 +119,9 @@ def fluoroscopy(env: Any, *, seed: int = 0, **options: Any) -> np.ndarray:
     from cathsim_dmc.pictures.moment import Moment, xray
     from cathsim_dmc.recording.recorder import navigation_of
 
-    base = navigation_of(env).config.fluoroscopy
-    _check(options, vars(base))
-    return xray(Moment.of(env), dataclasses.replace(base, **options), seed)
+    _check(options, vars(navigation_of(env).config.fluoroscopy))
+    moment = Moment.of(env)
+    return xray(moment, dataclasses.replace(moment.x_ray.options, **options), seed)
 
 
 def _check(options: Iterable[str], known: Iterable[str]) -> None:

@@ -156,7 +156,7 @@ def x_ray_meta(task: Any) -> dict[str, Any]:
     """Returns ``meta['x_ray']``, see `XRayRecord`."""
     shadows = [vars(shadow).items() for shadow in task.rollout.shadows]
     return {
-        "options": asdict(task.config.fluoroscopy),
+        "options": asdict(task.rollout.case().fluoroscopy),
         "deviation": asdict(task.rollout.deviations[0]),
         "devices": [{k: v for k, v in one if k != "points"} for one in shadows],
     }

@@ -5,7 +5,6 @@
 
 import contextlib
 import dataclasses
-import json
 import logging
 import os
 import uuid
@@ -126,9 +125,8 @@ class ErrorFiles:
     ):
         """Takes the task's name and options, from which a replay makes it."""
         self.folder, self._task = Path(folder), task
-        self._options, objects = bounds.as_json(options or {})
-        self._options |= json.loads(json.dumps(objects, default=repr))
-        self._whole = not objects
+        self._options = bounds.as_texts(options or {})
+        self._whole = not bounds.as_json(options or {})[1]
 
     def before(self, rollout: Rollout) -> Snapshot:
         """The state of all simulations before a control step."""

@@ -12,7 +12,9 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.imaging import views
 from cathsim_dmc.imaging.angiograph import Angiograph
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.chain_fields import write_still
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
@@ -63,9 +65,14 @@ class Case:
             setattr(model.stat, name, value)
 
     @functools.cached_property
+    def fluoroscopy(self) -> FluoroscopyOptions:
+        """Options of the machine; angles replace "best"."""
+        return views.settled(self.scene.anatomy.surface, self._fluoroscopy)
+
+    @functools.cached_property
     def angiograph(self) -> Angiograph:
         """Angiography machine that images this anatomy."""
-        return Angiograph(self.scene.anatomy.surface, self._fluoroscopy)
+        return Angiograph(self.scene.anatomy.surface, self.fluoroscopy)
 
 
 def compile_together(

@@ -160,8 +160,9 @@ class Rollout(Restorable):
         self._choose_objectives()
         self.steps[indices] = 0
         # New arrays, because those returned before must not change.
-        self._action = self._previous_action = self._action.copy()
-        self._action[indices] = 0.0
+        self._action = self._action.copy()
+        self._previous_action = self._previous_action.copy()
+        self._action[indices] = self._previous_action[indices] = 0.0
 
     def _choose_objectives(self) -> None:
         """Selects the objectives and goals of the simulations' anatomies."""
@@ -255,7 +256,11 @@ class Rollout(Restorable):
         for objective, rows in self.objectives:
             shortest[rows] = objective.path_distance(self.resting.head[rows])
         self._shortest[indices] = shortest[indices]
-        self._errors = (None,) * len(self.steps)
+        begun = set(indices.tolist())
+        self._errors = tuple(
+            None if index in begun else error
+            for index, error in enumerate(self._errors)
+        )
         step = self._step(indices, begins=True)
         observations.check(step.observation, self._specs)
         self._open[indices] = False
@@ -322,7 +327,7 @@ class Rollout(Restorable):
         ended = outcome.success | self.progress.given_up
         if failed is not None:
             ended |= failed
-        ended &= False if begins else self.steps > 0
+        ended &= self.steps > 0
         return Step(
             observation=observation,
             outcome=outcome,
