@@ -181,9 +181,12 @@ def _refuse_special(path: str | os.PathLike[str]) -> None:
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """Return the UTF-8 text of a file; ValueError for a device or a pipe."""
+    """Return the UTF-8 text of a file, with or without a byte order mark of Windows.
+
+    ValueError for a device or a pipe.
+    """
     _refuse_special(path)
-    return Path(path).read_text(encoding="utf-8")
+    return Path(path).read_text(encoding="utf-8-sig")
 
 
 @contextlib.contextmanager

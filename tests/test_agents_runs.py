@@ -203,3 +203,10 @@ def test_a_start_that_fails_leaves_no_folder(tmp_path):
     with pytest.raises(ValueError, match="no such task"):
         run(small_ppo(), tmp_path / "run", make_env=broken)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_whose_length_cannot_change_says_why(tmp_path):
+    run(small_ppo(anneal=True), tmp_path)
+    with pytest.raises(ConfigError, match="learning rate of this run falls") as error:
+        run(small_ppo(anneal=True, total_frames=2_048), tmp_path, resume=True)
+    assert "total_frames" not in str(error.value).split("may change")[1]

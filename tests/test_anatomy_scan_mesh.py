@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from skimage.measure import marching_cubes
 from synthetic_scans import marched, write_obj, y_tree
 
 from cathsim_dmc.anatomy.parts import Surface
@@ -283,6 +284,26 @@ def test_a_hole_that_mending_makes_between_large_triangles_is_filled():
     assert surface.volume == pytest.approx(ball.volume, rel=0.1)
     (filled,) = (note for note in notes if "holes filled" in note)
     assert float(re.search(r"widest (\S+) mm", filled)[1]) > 8.0
+
+
+def test_shared_edges_of_a_dense_surface_are_cut_before_it_is_decimated():
+    # Radii of whole voxels: the surface is pinched where branches leave the trunk.
+    x, y, z = np.mgrid[-12:60:1.0, -12:13:1.0, 0:200:1.0]
+
+    def tube(start, end, radius):
+        way = np.subtract(end, start)
+        off = np.stack([x, y, z], axis=-1) - start
+        along = np.clip(off @ way / (way @ way), 0.0, 1.0)
+        return np.linalg.norm(off - along[..., None] * way, axis=-1) - radius
+
+    trunk = tube((0, 0, 12), (0, 0, 188), 10)
+    thin, wide = tube((0, 0, 80), (48, 0, 116), 4), tube((0, 0, 130), (48, 0, 172), 5)
+    vertices, faces, _, _ = marching_cubes(np.minimum(trunk, np.minimum(thin, wide)), 0)
+    surface, notes, _ = mend("pinched", 1e-3 * vertices, faces[:, ::-1])
+    assert any("shared by more than two" in note for note in notes)
+    assert any("decimated" in note for note in notes)
+    before = 1e-9 * abs(volume(vertices, faces))
+    assert surface.volume == pytest.approx(before, rel=1e-3)
 
 
 def thick(rims):

@@ -22,7 +22,7 @@ from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.ends import free_ends
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.places import place_goals
-from cathsim_dmc.anatomy.scan.tree import grow_tree
+from cathsim_dmc.anatomy.scan.tree import _separation, grow_tree
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
@@ -476,3 +476,24 @@ def test_the_aorta_has_its_radius(arch_scan, computed):
     error = (line.radii - near.radius)[inner]
     assert np.median(np.abs(error)) < 0.2e-3, np.median(error)
     assert np.median(near.distance[inner]) < 0.4e-3
+
+
+def test_curves_that_run_side_by_side_do_not_part_at_their_beginning():
+    """Two ways of voxels up one trunk, 1 mm apart, diverge by rounding alone."""
+    z = np.arange(0.0, 100e-3, 1e-3)
+    trunk = np.stack([np.zeros_like(z), np.zeros_like(z), z], axis=1)
+    beside = trunk + np.stack([1e-3 + 1e-6 * np.arange(100), 0 * z, 0 * z], axis=1)
+    out = beside[-1] + np.linspace(0.0, 50e-3, 50)[1:, None] * (0.8, 0.0, 0.6)
+    curve = np.concatenate([beside, out])
+
+    def depth(points):
+        """In a trunk of 10 mm and the branch that leaves it, of 4 mm radius."""
+        of_branch = np.linalg.norm(
+            np.cross(points - beside[-1], (0.8, 0, 0.6)), axis=-1
+        )
+        of_trunk = np.hypot(points[..., 0], points[..., 1])
+        return np.maximum(10e-3 - of_trunk, 4e-3 - of_branch)
+
+    other = np.concatenate([trunk, trunk[-1] + trunk[1:]])
+    at = _separation(curve, depth(curve), other, depth)
+    assert 98 <= at <= 102

@@ -247,3 +247,13 @@ def test_the_file_of_the_docs_builds():
     tree = parse_tree(json.loads(text))
     for access in tree.inlets:
         assert [*tree.build(access).goals] == ["bca", "other"]
+
+
+def test_a_file_of_windows_is_read_and_what_is_no_json_is_named(tmp_path):
+    path = tmp_path / "tree.json"
+    text = json.dumps(content(), indent=1).replace("\n", "\r\n")
+    path.write_text(text, encoding="utf-8-sig", newline="")
+    assert read_tree(path).name == "helix"
+    path.write_text("vessels:\n")
+    with pytest.raises(ValueError, match="cannot be read as JSON.*tree of centrelines"):
+        read_tree(path)

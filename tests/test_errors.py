@@ -1,7 +1,9 @@
 """Bad input: each error says what was given and lists what is allowed."""
 
+import copy
 import dataclasses
 import os
+import pickle
 import signal
 
 import numpy as np
@@ -248,3 +250,39 @@ def test_arguments_of_another_kind_are_named_before_any_work(call, message, tmp_
     with pytest.raises(ValueError, match=message):
         call(make_episode(), tmp_path / "new.gif")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("way", [pickle.dumps, copy.copy, copy.deepcopy])
+def test_what_simulates_is_neither_pickled_nor_copied(environment, three, way):
+    for one in (environment, environment.task, three):
+        with pytest.raises(
+            TypeError, match=f"{type(one).__name__} cannot be .*restore"
+        ):
+            way(one)
+    assert len(pickle.loads(pickle.dumps(environment.snapshot()))) == 1
+
+
+def test_a_spec_has_bounds_for_each_action(environment):
+    """As those of dm_control: `uniform(spec.minimum, spec.maximum)` is an action."""
+    spec = environment.action_spec()
+    action = np.random.default_rng(0).uniform(spec.minimum, spec.maximum)
+    assert action.shape == spec.shape
+    environment.step(action)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("outer_radius", 0.889 / 2, "outer_radius of device 'own'.*at most 0.01 m"),
+        ("linear_density", 4.0, "linear_density of device 'own'.*1e-3 kg/m"),
+    ],
+)
+def test_a_device_in_other_units_is_refused(field, value, words):
+    wire = devices.get("wire_035_glide")
+    with pytest.raises(ValueError, match=words):
+        dataclasses.replace(wire, name="own", **{field: value})
+
+
+def test_an_arc_in_degrees_is_refused():
+    with pytest.raises(ValueError, match="angle is 45.*12.5664 rad"):
+        devices.Arc(3e-3, 45.0)

@@ -29,6 +29,10 @@ def test_only_recordings_are_opened(recording, tmp_path):
     other.write_text("hello")
     with pytest.raises(ValueError, match="not a whole Rerun recording"):
         check_recording(other)
+    arrays = tmp_path / "e.npz"
+    arrays.write_bytes(b"PK")
+    with pytest.raises(ValueError, match="the viewer opens .*e.rrd"):
+        check_recording(arrays)
 
 
 def test_no_display_is_an_error_that_names_the_way_out(recording, monkeypatch):

@@ -195,10 +195,15 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
         # With another algorithm nearly all settings differ.
         if "algorithm" in changed:
             changed = {"algorithm": changed["algorithm"]}
+        may = sorted(config.resumable & set(vars(config)) - set(changed))
+        annealed = "total_frames" in changed and vars(config).get("anneal")
+        why = (
+            " The learning rate of this run falls over its length." if annealed else ""
+        )
         raise ConfigError(
-            f"{run} cannot be resumed with other settings ({_differing(changed)}). "
-            "Resume with the run's own, or start a new run in another directory. These "
-            f"may change: {sorted(config.resumable & set(vars(config)))}."
+            f"{run} cannot be resumed with other settings ({_differing(changed)})."
+            f"{why} Resume with the run's own, or start a new run in another "
+            f"directory. These may change: {may}."
         )
     checkpoint.require_sizes()
     return checkpoint

@@ -46,8 +46,15 @@ class TreeFile:
 def read_tree(path: str | os.PathLike[str]) -> TreeFile:
     """Read a tree file; ValueError names an invalid entry."""
     try:
-        return parse_tree(json.loads(files.read_text(path)))
-    except (ValueError, RecursionError) as error:  # of JSON, or of its entries
+        content = json.loads(files.read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(
+            f"{path} cannot be read as JSON in UTF-8: {error}. It must be a tree of "
+            "centrelines (docs/anatomy_files.md)."
+        ) from error
+    try:
+        return parse_tree(content)
+    except (ValueError, RecursionError) as error:  # of its entries
         raise ValueError(f"{path}: {error}") from error
 
 

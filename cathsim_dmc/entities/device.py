@@ -10,6 +10,8 @@ from cathsim_dmc.imaging import materials
 from cathsim_dmc.imaging.device import Shadow
 
 _MOST_LINKS = 200
+THICKEST = 10e-3  # m, outer radius; sheaths of aortic valves have half of it
+DENSEST = 22.6e3  # kg/m³, osmium
 # Frequency at which a damper has the loss factor of the material, Hz; that of the first
 # mode of a free tip of 0.2 m in blood.
 LOSS_FREQUENCY = 1.0
@@ -55,7 +57,8 @@ class Arc:
 
     def __post_init__(self):
         bounds.number("radius", self.radius, positive=True)
-        bounds.number("angle", self.angle)
+        turns = 4 * math.pi  # a pigtail has less
+        bounds.number("angle", self.angle, -turns, turns, "rad")
 
     @property
     def length(self) -> float:
@@ -111,8 +114,10 @@ class Device:
     def __post_init__(self):
         bounds.instance("name", self.name, str)
         of_device = f"of device {self.name!r}"
-        for name in ("outer_radius", "linear_density", "tip_length"):
+        for name in ("linear_density", "tip_length"):
             bounds.number(f"{name} {of_device}", getattr(self, name), positive=True)
+        radius = f"outer_radius {of_device}"
+        bounds.number(radius, self.outer_radius, 0.0, THICKEST, "m", positive=True)
         bounds.whole(f"tip_links {of_device}", self.tip_links, 1, _MOST_LINKS)
         for name in ("shaft", "tip"):
             bounds.instance(f"{name} {of_device}", getattr(self, name), Section)
@@ -121,6 +126,11 @@ class Device:
         lumen = f"inner_radius {of_device}"
         if bounds.number(lumen, self.inner_radius, 0.0) >= self.outer_radius:
             bounds.refuse(lumen, self.inner_radius, "less than its outer_radius")
+        solid = math.pi * (self.outer_radius**2 - self.inner_radius**2)
+        if self.linear_density > DENSEST * solid:
+            most = f"{DENSEST * solid:.2g} kg/m (1 g/m = 1e-3 kg/m)"
+            densest = f"at most {most}, what its section weighs of the densest metal"
+            bounds.refuse(f"linear_density {of_device}", self.linear_density, densest)
         others = "attenuation", "marker_attenuation", "marker_length"
         for name in ("friction_ratio", "loss_factor", *others):
             bounds.number(f"{name} {of_device}", getattr(self, name), 0.0)

@@ -27,6 +27,11 @@ def check_recording(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no recording at {path}")
+    if path.suffix == ".npz":
+        raise ValueError(
+            f"{path} holds the arrays of an episode; the viewer opens the recording "
+            f"beside them, {path.with_suffix('.rrd')}"
+        )
     with path.open("rb") as stream:
         begin = stream.read(len(_MAGIC))
         stream.seek(max(path.stat().st_size - len(_FOOTER) + _END, 0))

@@ -23,7 +23,7 @@ from cathsim_dmc.tasks import rehearsal
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
-from cathsim_dmc.tasks.snapshot import Snapshot
+from cathsim_dmc.tasks.snapshot import NotCopied, Snapshot
 from cathsim_dmc.tasks.step import Step
 
 # Hooks that composer calls on a task. The batch steps the rollout instead, so it
@@ -46,7 +46,7 @@ if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
     os.register_at_fork(after_in_child=_keep_in_fork)
 
 
-class BatchSimulation:
+class BatchSimulation(NotCopied):
     """N simulations of one task.
 
     A simulation whose episode has ended is to be reset before the next step. Without a

@@ -6,10 +6,10 @@ import dm_env
 import numpy as np
 from dm_control import composer
 
-from cathsim_dmc.tasks.snapshot import Snapshot
+from cathsim_dmc.tasks.snapshot import NotCopied, Snapshot
 
 
-class Environment(composer.Environment):
+class Environment(NotCopied, composer.Environment):
     """`composer.Environment` that compiles once and runs physics steps in one loop.
 
     Composer compiles at construction and once more at the first reset. The second

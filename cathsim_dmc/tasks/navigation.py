@@ -25,13 +25,13 @@ from cathsim_dmc.tasks.objectives import Cannulation, Objective, Shiftable
 from cathsim_dmc.tasks.observation_kind import OPENGL, FrameObservable, Sizes
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.scene import Scene
-from cathsim_dmc.tasks.snapshot import Snapshot
+from cathsim_dmc.tasks.snapshot import NotCopied, Snapshot
 from cathsim_dmc.tasks.step import Step, info_types
 
 _ONLY = np.zeros(1, dtype=int)  # number of the one simulation
 
 
-class Navigation(composer.Task):
+class Navigation(NotCopied, composer.Task):
     """Composer's hooks over a `Rollout` of one simulation.
 
     Action: [-1, 1]^A with A = 21 for the published device: the tip motors from
@@ -205,8 +205,8 @@ class Navigation(composer.Task):
         return dm_env.specs.BoundedArray(
             shape=(len(names),),
             dtype=np.float64,
-            minimum=-1.0,
-            maximum=1.0,
+            minimum=np.full(len(names), -1.0),
+            maximum=np.full(len(names), 1.0),
             name="\t".join(names),
         )
 

@@ -31,6 +31,17 @@ _WORDS = 624  # of a RandomState
 _KINDS = "fiubU"
 
 
+class NotCopied:
+    """Base of simulations, which hold a compiled model: TypeError for pickle and copy."""
+
+    def __reduce_ex__(self, protocol):
+        raise TypeError(
+            f"{type(self).__name__} cannot be pickled or copied; make one where it is "
+            "needed, by a function that another process is given, and put it to this "
+            "state by restore(snapshot()): a snapshot can be pickled"
+        )
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Snapshot:
     """State of K simulations of a task, random states and images included.

@@ -36,6 +36,7 @@ _OF_WALL = (
     "The surface was taken for that of a thick wall, and cut at its rims: export the "
     "lumen alone, without wall, flanges and connectors. If it has none: "
 )
+_OF_CUT = ", where triangles that meet in one edge or pierce each other were cut out"
 _AGAIN = "Smooth or remesh that place, or export the segmentation again."
 
 
@@ -56,6 +57,7 @@ def mend(name: str, vertices: np.ndarray, faces: np.ndarray) -> Mended:
     work = _Work(name, vertices, faces)
     work.merge()
     work.keep_one_part()
+    work.cut_non_manifold()  # while triangles are small, so that holes are
     work.decimate()
     work.cut_non_manifold()
     work.orient()
@@ -213,8 +215,9 @@ class _Work:
             elif wide > widest:
                 raise ValueError(
                     f"{self.name} is not closed: a hole {mm(wide):.1f} mm wide in "
-                    f"the side of a vessel at {shown(middle)} (at most "
-                    f"{mm(widest):.2g} mm are filled). "
+                    f"the side of a vessel at {shown(middle)}"
+                    f"{_OF_CUT if cut else ''} (at most {mm(widest):.2g} mm are "
+                    "filled). "
                     f"{_OF_WALL if self._rims else ''}Fill holes (3D Slicer: Surface "
                     "Toolbox, Fill holes), then export again."
                 )

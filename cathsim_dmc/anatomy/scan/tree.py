@@ -20,6 +20,7 @@ TAIL_RADIUS = 1.1e-3
 END_TRIM = 8e-3  # m, most that is cut off before a blind end
 TRUNKS = ("rsa", "lsa")  # keep the part shared with others, such as vertebral arteries
 STEMS = ("bca", "lcca", "rcca")  # keep the part shared with unnamed vessels
+PARTING = 0.01  # least growth of their distance by arc length where curves part
 MIN_RADIUS = 0.1e-3  # m, least radius of a centreline that touches the wall
 BCA = "bca"  # the common trunk of the right branches
 # Branches of which the brachiocephalic artery is the trunk.
@@ -103,8 +104,9 @@ def _separation(
     end = int(walled.argmax()) if walled.any() else len(curve)
     together = np.nonzero(~apart[:end])[0]
     first = min(int(together[-1]) + 1, len(curve) - 2) if len(together) else 0
-    # Walks back to where the two still coincide.
-    while first and distance[first] > max(0.5e-3, distance[first - 1]):
+    # Walks back to where the two still coincide, perhaps side by side.
+    least = PARTING * STEP
+    while first and distance[first] > max(0.5e-3, distance[first - 1] + least):
         first -= 1
     return min(first, len(curve) - 3)
 
