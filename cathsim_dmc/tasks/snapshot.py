@@ -32,7 +32,7 @@ _KINDS = "fiubU"
 
 
 class NotCopied:
-    """Base of simulations, which hold a compiled model: TypeError for pickle and copy."""
+    """Base class of simulations: pickling and copying raise TypeError."""
 
     def __reduce_ex__(self, protocol):
         raise TypeError(

@@ -26,9 +26,9 @@ PAIR_TASK = "type1_bca_pair"
 
 INTRODUCTION = f"""# Observations
 
-This page lists what a policy can observe: entries with shape, type, range and unit, the
-options of images and cameras, and what can be randomised. A name or a list of names
-selects the observation:
+This page lists all observations, with the shape, type, range and unit of each entry,
+the options of fluoroscopy and cameras, and the quantities that can be randomised. A
+name or a list of names selects the observation:
 
 ```python
 from cathsim_dmc import suite
@@ -42,14 +42,16 @@ env = suite.load("cathsim", "{TASK}", task_kwargs={{
 - **Frames.** The world frame is that of the patient (LPS): +x to the patient's left, +y
   posterior, +z superior. Joints and links run from proximal to distal.
 - **Time.** Positions and velocities of joints are those at the end of the control step,
-  wall forces its means, all other values those of its last physics step.
-- **Tip frame.** Its origin is the head, the distal end; z lies along the head, x and y
-  along the hinges of the last link.
-- **Length.** A task simulates what can leave the sheath (`working_length`, 0.14 to
-  0.44 m). Observations show a device of {COMMON_LENGTH:g} m, so their shapes depend
-  on the device and `shaft_link` alone: behind the simulated links the device is
-  straight and moves with its base, its hinges are 0 and nothing touches it. Of a longer
-  device they show the distal part.
+  wall forces are means over the control step, all other values are those of its last
+  physics step.
+- **Tip frame.** The origin is the head, the distal end of the device; z points along
+  the last link, x and y along its hinges.
+- **Length.** A task simulates the part of the device that can leave the sheath
+  (`working_length`, 0.14 to 0.44 m). Observations describe a device of
+  {COMMON_LENGTH:g} m, so their shapes depend only on the device and `shaft_link`. The
+  part proximal of the simulated links is straight, without contacts, and moves with the
+  base; its hinge angles are 0. Of a longer device, observations contain the distal
+  part.
 
 Shapes are those of `{TASK}`. `docs/scripts/observations.py` writes this page.
 """
@@ -58,14 +60,14 @@ COAXIAL = f"""
 ## Coaxial devices
 
 Tasks with the suffix `_wire` or `_pair` add these entries to `internal`, `tracking` and
-`route`, and the first two to `tracking_2d`. The first two are also an observation of
-their own, `drives`, and the others `devices`. Shapes are those of `{PAIR_TASK}`:
+`route`, and the first two to `tracking_2d`. The first two are also available as the
+observation `drives`, the others as `devices`. Shapes are those of `{PAIR_TASK}`:
 
 {{table}}
 
-`route_coaxial` has the entries of `route` and, in place of those, what does not depend
-on where the anatomy lies in the world. `route_retry` and `route_turns` are observations
-of their own; `route_turns` needs `route_retry`, whose attempt it belongs to:
+`route_coaxial` has the entries of `route` and, in place of those above, the first four
+of this table, independent of the world frame. `route_retry` and `route_turns` are
+separate observations; `route_turns` requires `route_retry`, for the present attempt:
 
 {{relative}}
 """
@@ -73,8 +75,8 @@ of their own; `route_turns` needs `route_retry`, whose attempt it belongs to:
 VESSEL = """
 ## Living vessels
 
-`vessel` observes a vessel with flow, a compliant wall or motion, which the option
-`vessel` of a task makes ([living vessel](vessel.md)):
+The observation `vessel` requires a vessel with flow, a compliant wall or motion, set by
+the task's option `vessel` ([living vessel](vessel.md)):
 
 {table}
 """
@@ -94,37 +96,38 @@ C-arm follow those of the first.
 ![Views and modes](images/observation_views.png)
 
 `biplane` has the entries of `route`, reconstructed (`cathsim_dmc/imaging/biplane.py`)
-from what an angiography suite has:
+from data that are available in an angiography suite:
 
-- *live images and mask*: the device is what a live image shows and the mask image of
-  the empty vessel does not; the marker at its tip is dark in both planes, and the shaft
-  is followed from there;
+- *live images and mask*: the difference between a live image and the mask image of the
+  empty vessel shows the device; the marker at its tip is dark in both planes, and the
+  shaft is traced from there;
 - *roadmaps* of two planes with known geometry, and of a `third` view without live
-  images: the vessel is the set of points that all show inside, and the route through it
-  is found when an episode begins. `roadmap_errors` has the fields `noise`, `erosion`
-  and `gaps` (missing segments), in pixels and number, and `calibration`, the largest
-  error of the angles in degrees;
+  images: the vessel is the visual hull, the set of points inside the vessel in all
+  roadmaps; the route through it is found at the start of an episode. `roadmap_errors`
+  has the fields `noise` and `erosion` in pixels, `gaps` (number of missing segments)
+  and `calibration`, the largest error of the angles in degrees;
 - *goal marker* in both planes;
-- *drive*: the last action, and the roll of the handle, by which the frame of the tip is
-  known.
+- *drive*: the last action, and the roll of the handle, from which the frame of the tip
+  is computed.
 
-Through roadmaps with errors, whose hull is thin and broken in narrow branches, the
-route goes on across gaps; it is centred on what the views together show round it, and
-the lumen is pooled along it. By how much a head is out of it counts in radii of 10 mm
-at least. With errors of 0.5 (noise) and 0.25 pixels (erosion) on
-three roadmaps (60°, −30°, AP), towards the LCCA from the groin, 20 draws on each
-phantom (*outside*: share of the last 60 mm of the true line that is farther out of the
-lumen of the route than the memory of attempts allows; *aside*: mean distance of the
-true line in the branch from the route):
+With errors in the roadmaps the hull is thin and broken in narrow branches. The route
+then continues across gaps, is centred in the region that all views show as vessel, and
+the radius of the lumen is smoothed along it. The deviation of the head from the lumen
+is relative to a radius of at least 10 mm. The table has 20 draws on each phantom,
+towards the LCCA from the groin, with errors of 0.5 (noise) and 0.25 pixels (erosion) on
+three roadmaps (60°, −30°, AP). *Outside* is the fraction of the last 60 mm of the true
+centreline that is farther out of the lumen of the route than the memory of attempts
+tolerates; *distance* is the mean distance of the true centreline in the branch from the
+route:
 
-| | type1 | type2 | source |
+| quantity | type1 | type2 | source |
 |---|---|---|---|
 | outside | 1.9 % | 0.8 % | 27 November 2026, commit 545a44d |
-| outside, without centring, pooling and this radius | 20 % | 33 % | the same |
-| aside, mm | 1.1 | 1.4 | the same |
-| aside, mm, without centring | 2.2 | 3.5 | the same |
-| routes that leave the vessel by more than 1 mm | 2 | 0 | the same |
-| the same routes without centring and pooling | 2 | 4 | the same |
+| outside, without centring, smoothing and least radius | 20 % | 33 % | the same |
+| distance, mm | 1.1 | 1.4 | the same |
+| distance, mm, without centring | 2.2 | 3.5 | the same |
+| number of routes that leave the vessel by more than 1 mm | 2 | 0 | the same |
+| the same number without centring and smoothing | 2 | 4 | the same |
 
 A cannulation of the left common carotid artery by the scripted expert:
 
@@ -134,10 +137,10 @@ A cannulation of the left common carotid artery by the scripted expert:
 ENDOLUMINAL = """
 ## Endoluminal views
 
-`endoluminal` and `endoluminal_distance` see a right angle ahead of the device, without
-OpenGL: rays are traced through the lumen, at rest or moving. The option
-`endoluminal_size` sets their size. The device itself is not seen, and an open end of
-the lumen is closed.
+`endoluminal` and `endoluminal_distance` are views from the head along its axis, with a
+field of view of a right angle, without OpenGL: rays are traced through the lumen, at
+rest or moving. The option `endoluminal_size` sets their size. The device itself is not
+shown, and open ends of the lumen appear closed.
 
 ![From the aorta to a branch: grey levels and distances](images/endoluminal.png)
 """
@@ -151,20 +154,20 @@ a GPU), `osmesa` (software) or `glfw` (with a display) before Python starts.
 
 {table}
 
-The channels of a camera follow those of the one before. "tip" looks from the head along
-its axis over a right angle, as endoluminal views do, and the device is not seen. A
-batch draws its simulations one after the other. Tasks with several anatomies or a
-vessel that moves are refused.
+The channels of the cameras follow each other. "tip" looks from the head along its axis
+with a field of view of a right angle, as in endoluminal views, and does not show the
+device. A batch renders its simulations one after the other. Tasks with several
+anatomies or a moving vessel are refused.
 """
 
 RANDOMISATION = """
 ## Domain randomisation
 
-Randomisation is off by default. `task_kwargs={"randomisation": True}` draws from the
-default ranges at every reset, a mapping from its own. A range is `[low, high]` of a
-uniform distribution, or a `dm_control.composer.variation.Variation`. All draws, quantum
-noise included, come from the environment's random state; single and batched
-environments draw the same values.
+Randomisation is off by default. With `task_kwargs={"randomisation": True}` every reset
+draws from the default ranges, with a mapping from the ranges that it gives. A range is
+`[low, high]` of a uniform distribution, or a `dm_control.composer.variation.Variation`.
+All draws, including quantum noise, come from the environment's random state; single and
+batched environments draw the same values.
 
 {table}
 """

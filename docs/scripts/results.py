@@ -45,13 +45,15 @@ these trainings were not repeated.
 INTRODUCTION = f"""\
 # Results
 
-Success and force of trained agents beside those of the publication (Jianu et al.).
+This page compares success and force of trained agents with the publication (Jianu et
+al.).
 
 {BEFORE}
-Every policy acts deterministically in 30 episodes with their own seeds, or in one on
-each of the 98 test arches, by the published rule: 2,000 control steps at most, success
-within 8 mm of the goal and inside the target branch. Agents have the preset `tuned`, or
-`tuned_image`, unless their row says otherwise ([settings](training.md)).
+Every policy acts deterministically in 30 episodes with different seeds, or in one
+episode on each of the 98 test arches, by the published rule: 2,000 control steps at
+most, success within 8 mm of the goal and inside the target branch. Agents have the
+preset `tuned`, or `tuned_image`, unless their row states another
+([settings](training.md)).
 [Results in detail](results_detail.md) has all columns, seeds and times of training;
 `python docs/scripts/results.py` writes both pages from `results/`.
 """
@@ -59,11 +61,11 @@ within 8 mm of the goal and inside the target branch. Agents have the preset `tu
 FAILURES = """\
 ## What fails
 
-- The episodes of a task differ only by 1 mm of the start, so 100 % says nothing of
-  other conditions: [robustness](robustness.md) and the [leaderboard](leaderboard.md)
-  have distinct ones. Most rows have one seed.
+- The episodes of a task differ only by 1 mm of the start, so a success of 100 % does
+  not extend to other conditions: [robustness](robustness.md) and the
+  [leaderboard](leaderboard.md) have distinct conditions. Most rows have one seed.
 - Simulator, walls and force readings of the publication differ ([physics](physics.md)):
-  rates can be compared, forces only in their order of magnitude.
+  success rates can be compared, forces only in their order of magnitude.
 """
 
 SUCCESS = """\
@@ -81,9 +83,9 @@ FORCE = """\
 Cells show ours / published, in mN, ± deviation over episodes
 ([definitions](forces.md)): *mean* is the sum over all contacts, mean over all steps;
 *contact* is the largest contact, mean over the steps with contact, nearest to the
-published f_mean; *largest* is the largest contact of an episode at the end of any step,
-the published f_max, and depends on the physics step ([peaks](forces.md#peaks)).
-*Steps* is the length of the episodes.
+published f_mean; *largest* is the largest contact of an episode, in the step where it
+is largest, nearest to the published f_max. Both are means over a control step, except
+in rows with † (end of a control step). *Steps* is the length of the episodes.
 """
 
 DETAIL = f"""\
