@@ -9,7 +9,7 @@ from dm_control import composer
 from cathsim_dmc.tasks.snapshot import NotCopied, Snapshot
 
 
-class Environment(NotCopied, composer.Environment):
+class Environment(composer.Environment, NotCopied):
     """`composer.Environment` that compiles once and runs physics steps in one loop.
 
     Composer compiles at construction and once more at the first reset. The second

@@ -31,7 +31,7 @@ from cathsim_dmc.tasks.step import Step, info_types
 _ONLY = np.zeros(1, dtype=int)  # number of the one simulation
 
 
-class Navigation(NotCopied, composer.Task):
+class Navigation(composer.Task, NotCopied):
     """Composer's hooks over a `Rollout` of one simulation.
 
     Action: [-1, 1]^A with A = 21 for the published device: the tip motors from
