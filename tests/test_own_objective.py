@@ -172,6 +172,7 @@ def judged():
         ({"reward": NUMBERS.astype(object)}, "reward"),
         ({"terms": None}, "terms=None"),
         ({"terms": {"near": 0.0}}, "near 0.0"),
+        ({"terms": {"near": 0.5}, "reward": 0.5}, "near 0.5"),  # their sum is no array
         ({"terms": {}}, r"the terms \[\], not \['near'\]"),
         ({"terms": {"far": NUMBERS}}, r"the terms \['far'\], not \['near'\]"),
     ],

@@ -10,7 +10,7 @@ from PIL import Image
 from recording_samples import make_tube, same
 
 import cathsim_dmc
-from cathsim_dmc import suite
+from cathsim_dmc import agents, suite
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.physics.effects import Effect
@@ -25,6 +25,7 @@ from cathsim_dmc.pictures.recorded import write, xray_film
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_colours, force_scale, force_text
+from cathsim_dmc.simulation.torchrl import BatchedEnv
 
 TASK = "simple1_bca"
 
@@ -475,3 +476,16 @@ def test_a_record_keeps_the_options_of_its_task():
     env = suite.load("cathsim", "simple1_bca", task_kwargs=options)
     episode = cathsim_dmc.record(env, "push", seed=1)
     assert episode.meta["task_kwargs"] == {"friction": 0.1, "max_steps": 2}
+
+
+def test_policies_batches_and_episodes_are_shown_by_what_they_are(pushed):
+    env, episode = pushed
+    assert repr(episode) == (
+        f"<Episode of {TASK!r}, seed {episode.seed}, {episode.steps} control steps, "
+        f"{episode.termination}>"
+    )
+    policy = agents.load_policy("push")
+    assert repr(policy) == "<Push 'push' for any task, reads nothing>"
+    batch = BatchedEnv(TASK, 2)
+    assert repr(batch) == f"BatchedEnv({TASK!r}, 2, device='cpu')"
+    batch.close()

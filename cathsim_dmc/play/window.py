@@ -123,7 +123,7 @@ class FluoroscopyWindow:
 
 
 def _planes(task: Any) -> angiograph.Planes:
-    options = task.config.fluoroscopy
+    options = task.rollout.case().fluoroscopy  # with the angles that a policy sees
     rows, columns = options.resolution
     factor = max(1, round(SIZE / max(rows, columns)))
     options = dataclasses.replace(options, size=(rows * factor, columns * factor))

@@ -52,6 +52,11 @@ class Policy:
     task_kwargs: Mapping[str, Any] | None = None
     num_actions: int | None = None
 
+    def __repr__(self) -> str:
+        """Name, task and observation of the policy."""
+        task, reads = self.task or "any task", self.observation or "nothing"
+        return f"<{type(self).__name__} {self.name!r} for {task}, reads {reads}>"
+
     def reset(self, view: View, which: np.ndarray) -> None:
         """Begin new episodes; called after the simulations were reset.
 

@@ -5,7 +5,7 @@ It holds world-frame arrays and a JSON dictionary, and needs neither scene nor M
 
 import json
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -75,21 +75,21 @@ class Episode:
 
     task: str
     seed: int | None
-    meta: dict[str, Any] = field(repr=False)
-    time: np.ndarray = field(repr=False)
-    qpos: np.ndarray = field(repr=False)
-    catheter: np.ndarray = field(repr=False)
-    body_pos: np.ndarray = field(repr=False)
-    body_quat: np.ndarray = field(repr=False)
-    action: np.ndarray = field(repr=False)
-    reward: np.ndarray = field(repr=False)
-    insertion: np.ndarray = field(repr=False)
-    wall_force_sum: np.ndarray = field(repr=False)
-    wall_force_max: np.ndarray = field(repr=False)
-    push_force: np.ndarray = field(repr=False)
-    contact_step: np.ndarray = field(repr=False)
-    contact_position: np.ndarray = field(repr=False)
-    contact_force: np.ndarray = field(repr=False)
+    meta: dict[str, Any]
+    time: np.ndarray
+    qpos: np.ndarray
+    catheter: np.ndarray
+    body_pos: np.ndarray
+    body_quat: np.ndarray
+    action: np.ndarray
+    reward: np.ndarray
+    insertion: np.ndarray
+    wall_force_sum: np.ndarray
+    wall_force_max: np.ndarray
+    push_force: np.ndarray
+    contact_step: np.ndarray
+    contact_position: np.ndarray
+    contact_force: np.ndarray
 
     def __post_init__(self) -> None:
         if not isinstance(self.task, str) or not self.task:
@@ -116,6 +116,13 @@ class Episode:
                 f"contact_step must not decrease and lie in [0, {self.steps}), got "
                 f"{steps}"
             )
+
+    def __repr__(self) -> str:
+        """Task, seed, length and end of the episode."""
+        return (
+            f"<Episode of {self.task!r}, seed {self.seed}, {self.steps} control steps, "
+            f"{self.termination}>"
+        )
 
     @property
     def steps(self) -> int:

@@ -95,6 +95,11 @@ class BatchedEnv(EnvBase):
             done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape
         )
 
+    def __repr__(self) -> str:
+        """Task, number of simulations and device."""
+        (count,) = self.batch_size
+        return f"BatchedEnv({self._made[0]!r}, {count}, device={str(self.device)!r})"
+
     def snapshot(self, indices: np.ndarray | None = None) -> Snapshot:
         """The state of some or all simulations; see `BatchSimulation.snapshot`."""
         return self.simulation.snapshot(indices)

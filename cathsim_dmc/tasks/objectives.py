@@ -127,9 +127,9 @@ def judge(
         if (*outcome.terms,) != names:
             _refuse(objective, f"the terms {[*outcome.terms]}, not {[*names]}")
         for name, value, kinds, into in (
-            ("reward", outcome.reward, "fiu", reward),
-            ("success", outcome.success, "b", success),
             *((name, outcome.terms[name], "fiu", terms[name]) for name in names),
+            ("reward", outcome.reward, "fiu", reward),  # often their sum
+            ("success", outcome.success, "b", success),
         ):
             if type(value) is not np.ndarray or value.dtype.kind not in kinds:
                 _refuse(objective, f"{name} {bounds.shown(value)}")

@@ -232,7 +232,7 @@ class _Work:
         if filled:
             wide, where = max(filled)
             self.notes.append(
-                f"{len(filled)} holes filled, the widest {mm(wide):.1f} mm at {where}"
+                f"holes filled: {len(filled)}, the widest {mm(wide):.1f} mm at {where}"
             )
         if self._ends:
             note = f"{self._ends} open vessel ends capped"
