@@ -39,16 +39,17 @@ NAMES = {"internal": "Internal", "image": "Image", "sequential": "Sequential"}
 BEFORE = """\
 † marks figures of trainings before version 0.3. The drive, the sheath, the armature,
 the wall and the judged force (now the mean over a control step) have changed since;
-these trainings were not repeated.
+these trainings were not repeated. Their forces are those at the end of a control step.
+
 """
 
-INTRODUCTION = f"""\
+INTRODUCTION = """\
 # Results
 
 This page compares success and force of trained agents with the publication (Jianu et
 al.).
 
-{BEFORE}
+{before}\
 Every policy acts deterministically in 30 episodes with different seeds, or in one
 episode on each of the 98 test arches, by the published rule: 2,000 control steps at
 most, success within 8 mm of the goal and inside the target branch. Agents have the
@@ -84,17 +85,17 @@ Cells show ours / published, in mN, ± deviation over episodes
 ([definitions](forces.md)): *mean* is the sum over all contacts, mean over all steps;
 *contact* is the largest contact, mean over the steps with contact, nearest to the
 published f_mean; *largest* is the largest contact of an episode, in the step where it
-is largest, nearest to the published f_max. Both are means over a control step, except
-in rows with † (end of a control step). *Steps* is the length of the episodes.
+is largest, nearest to the published f_max. Both are means over a control step. *Steps*
+is the length of the episodes.
 """
 
-DETAIL = f"""\
+DETAIL = """\
 # Results in detail
 
 All columns of [results](results.md) for each task, with seeds, worst seed and times of
 training.
 
-{BEFORE}
+{before}\
 Cells show ours / published. Success counts the episodes of all seeds, *worst* those of
 the worst seed; episodes in their own arches have Wilson's 95 % interval.
 Forces are in mN, ± deviation over episodes: see [results](results.md#force).
@@ -138,7 +139,9 @@ def read_all(directory):
 def pages(results, broken, cells, directory):
     """Text of both pages by name; draws their figures beside them."""
     table = arranged(results, cells)
-    main, detail = [INTRODUCTION], [DETAIL]
+    kinds = [found for labels in table.values() for found in labels.values()]
+    before = BEFORE if any(marked("", found) for found in kinds) else ""
+    main, detail = ([text.format(before=before)] for text in (INTRODUCTION, DETAIL))
     if results:
         main_figures, further_figures = drawn(table, directory)
         main += [failures(table), successes(table), force_tables(table)]
