@@ -1,15 +1,17 @@
 import dataclasses
 import json
+import types
 
 import numpy as np
 import pytest
 import synthetic_env
 import torch
 from dm_control.composer.variation import distributions
+from tensordict import TensorDict
 
 from cathsim_dmc import suite
-from cathsim_dmc.agents import evaluate, policies, protocols
-from cathsim_dmc.agents.episodes import EpisodeOutcome
+from cathsim_dmc.agents import evaluate, evaluation, policies, protocols
+from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.analysis.force_statistics import FIGURES, EpisodeForces, Statistics
 from cathsim_dmc.analysis.intervals import success_interval
@@ -17,6 +19,7 @@ from cathsim_dmc.cli import agents as commands
 from cathsim_dmc.cli import task_options
 from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.physics.effects import Effect
+from cathsim_dmc.physics.forces import NAMES
 from cathsim_dmc.physics.randomisation import Randomisation
 from cathsim_dmc.simulation.batch import BatchSimulation
 
@@ -55,6 +58,84 @@ def test_each_seed_is_played_once_and_as_if_alone():
     # Lengths differ, so the quick environments had begun further episodes.
     assert len({episode.length for episode in together.episodes}) > 1
     assert together.successes == 6
+
+
+def test_only_the_first_episode_of_each_seed_counts():
+    """The first of four stands still; the others reach the goal again and again."""
+
+    def three_go(observation):
+        action = expert(observation)
+        if len(action) > 1:
+            action[0] = 0.0
+        return action
+
+    many = play(policy=three_go, episodes=4, seed=50).episodes
+    assert many[0].length == 40 and not many[0].success
+    for number, episode in enumerate(many[1:], 51):
+        (alone,) = play(policy=three_go, episodes=1, seed=number).episodes
+        assert (episode.length, episode.success) == (alone.length, True)
+        assert episode.reward == pytest.approx(alone.reward)
+        assert episode.length < 20  # so that another one ends
+
+
+def test_pieces_of_a_group_are_its_episodes_with_their_numbers():
+    plan = evaluation._Plan.of(expert, "reach", 5, 50, "published", None, None, None)
+    (group,) = plan.groups(None, None, synthetic_env.make_env, None)
+    pieces = group.pieces(2)
+    assert [len(piece.rows) for piece in pieces] == [2, 2, 1]
+    found = [one for piece in pieces for one in evaluation._play(piece, None)]
+    assert [one.env for one in found] == [0, 1, 2, 3, 4]
+    whole = evaluation._play(group, None)
+    assert [one.length for one in found] == [one.length for one in whole]
+
+
+def test_the_contacts_of_later_episodes_are_left_out():
+    """Those of simulations whose first episode has ended."""
+    rng = np.random.RandomState(0)
+    steps = [
+        types.SimpleNamespace(
+            present=rng.uniform(size=(3, 4)) < 0.6,
+            position=rng.normal(size=(3, 4, 3)), magnitude=rng.uniform(size=(3, 4)),
+        )
+        for _ in range(2)
+    ]  # fmt: skip
+    log, shown = evaluation.ContactLog(), iter(steps)
+    simulation = types.SimpleNamespace(contacts=lambda: next(shown))
+    env = types.SimpleNamespace(base_env=types.SimpleNamespace(simulation=simulation))
+    log(env, np.array([True, True, True]))
+    log(env, np.array([False, True, False]))
+    position, magnitude = log.contacts()
+    wanted = [*steps[0].magnitude[steps[0].present]]
+    wanted += [*steps[1].magnitude[1][steps[1].present[1]]]
+    np.testing.assert_array_equal(magnitude, wanted)
+    assert position.shape == (len(wanted), 3)
+
+
+def test_what_is_told_of_an_episode_is_of_its_own_environment():
+    """Two environments, of which the first ends after two steps and the second after
+    one; its next episode has not ended.
+    """
+
+    def rows(*values):
+        return torch.tensor(values)[..., None]
+
+    info = {name: rows([0.1, 0.2], [0.3, 0.4]) for name in NAMES}
+    info |= {
+        "success": rows([False, True], [False, False]),
+        "physics_error": rows([False, False], [True, False]),
+        "path_ratio": rows([1.1, 1.2], [1.3, 1.4]),
+    }
+    ends = rows([False, True], [True, False])
+    after = {"reward": rows([1.0, 2.0], [4.0, 8.0]), "done": ends, "terminated": ends}
+    steps = {"step_count": rows([0, 1], [0, 0]), "next": {**after, "info": info}}
+    second, first = EpisodeTracker(2).add(TensorDict(steps, [2, 2]))
+    assert (first.env, first.length, first.reward) == (0, 2, 3.0)
+    assert (second.env, second.length, second.reward) == (1, 1, 4.0)
+    assert (first.success, first.physics_error) == (True, False)
+    assert (second.success, second.physics_error) == (False, True)
+    assert [first.path_ratio, second.path_ratio] == pytest.approx([1.2, 1.3])
+    assert first.forces.max_force == pytest.approx(0.2)
+    assert second.forces.max_force == pytest.approx(0.3)
 
 
 def test_force_figures_are_those_of_the_steps():
@@ -315,6 +396,8 @@ def test_safe_success_counts_the_mean_force_of_every_control_step():
     result = EvaluationResult("reach", "x", (1, 2, 3), episodes, {})
     assert result.safe_success(0.5) == pytest.approx(1 / 3)
     assert result.safe_success(1.0) == pytest.approx(2 / 3)
+    exact = EvaluationResult("reach", "x", (1,), (episode(True, 0.5),), {})
+    assert exact.safe_success(0.5) == 1.0
     # A file that does not tell the mean is held to the peak, which is never less.
     older = EvaluationResult("reach", "x", (1,), (episode(True, None),), {})
     assert older.safe_success(0.5) == 0 and older.safe_success(1.0) == 1

@@ -4,6 +4,7 @@ import hashlib
 import importlib.util
 import json
 import shutil
+import types
 from html import unescape
 from pathlib import Path
 
@@ -331,3 +332,36 @@ def test_actions_of_other_episodes_are_refused(
     np.savez(path, **{**np.load(recorded[0]), **changed})
     with pytest.raises(ValueError, match=message):
         submission.submit(str(path), tmp_path / "one.json", **{"episodes": 4, **given})
+
+
+def test_actions_are_kept_up_to_the_ends_of_episodes_and_played_from_there(tmp_path):
+    """Two batches of two and one episodes; the last action goes on past the file."""
+    taken = np.random.RandomState(0).uniform(-1, 1, (3, 4, 7)).astype(np.float32)
+    shown = iter([*taken[:2].swapaxes(0, 1), *taken[2:, :3].swapaxes(0, 1)])
+    policy = types.SimpleNamespace(
+        name="mine", task="type1_bca", observation="internal", task_kwargs={},
+        num_actions=7, reset=lambda view, which: None, act=lambda _: next(shown),
+    )  # fmt: skip
+    recorder = submission._Recorder(policy)
+    views = [types.SimpleNamespace(num_simulations=count) for count in (2, 1)]
+    for view, steps in zip(views, (4, 3), strict=True):
+        recorder.reset(view, np.ones(view.num_simulations, bool))
+        for _ in range(steps):
+            recorder.act({})
+    lengths = 2, 4, 3
+    result = types.SimpleNamespace(
+        episodes=[types.SimpleNamespace(length=length) for length in lengths],
+        settings={"observation": "internal", "task_kwargs": {}},
+        policy="mine", task="type1_bca", seeds=(5, 6, 7),
+    )  # fmt: skip
+    recorder.write(tmp_path / "mine.npz", result)
+    player = submission.RecordedActions(tmp_path / "mine.npz")
+    wanted = taken.copy()
+    for row, length in enumerate(lengths):
+        wanted[row, length:] = 0.0
+    np.testing.assert_array_equal(player.actions, wanted)
+    assert (player.seeds, player.task) == ([5, 6, 7], "type1_bca")
+    for view, rows in zip(views, (slice(0, 2), slice(2, 3)), strict=True):
+        player.reset(view, np.ones(view.num_simulations, bool))
+        for step in (0, 1, 2, 3, 3, 3):
+            np.testing.assert_array_equal(player.act({}), wanted[rows, step])

@@ -157,3 +157,15 @@ def test_the_last_point_of_a_chunk_is_projected_as_alone(monkeypatch):
         alone = line.project_rows(points[count - 1])
         for one, other in zip(alone, many, strict=True):
             assert one.item() == other[-1]
+
+
+@pytest.mark.parametrize("factor", [0.4, 2.0])
+def test_a_tree_is_scaled_with_its_radii_and_ostia(factor):
+    plain, points = tree(), np.random.RandomState(0).uniform(-0.02, 0.08, (50, 3))
+    scaled = plain.scaled(factor)
+    for name, depth in plain.depths(points).items():
+        found = scaled.depths(factor * points)[name]
+        np.testing.assert_allclose(found, factor * depth, atol=1e-12)
+        mouth, own = plain.vessel(name).mouth, scaled.vessel(name).mouth
+        np.testing.assert_allclose(own.position, factor * mouth.position)
+        assert own.radius == pytest.approx(factor * mouth.radius)

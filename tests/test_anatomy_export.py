@@ -153,3 +153,19 @@ def test_a_thin_wall_between_two_lumens_stays_out_of_both():
     anatomy = Anatomy.from_tree(tree, "two", goals={})
     found = export.fidelity(anatomy, export.wall_pieces(anatomy))
     assert not found["closed_to_5fr"] and found["intrusion_mm"]["p95"] < 0.4
+
+
+def test_deviations_are_summed_up_in_millimetres():
+    lengths = np.random.RandomState(0).permutation(np.arange(101)) * 1e-3
+    assert export._summary(lengths) == {"mean": 50.0, "p95": 95.0, "max": 100.0}
+
+
+def test_capped_ends_are_wall_and_the_inlet_is_none(tube):
+    points, inward = export._wall_places(tube)
+    assert sorted(end.open for end in tube.ends) == [False, True]
+    for end in tube.ends:
+        away = points - end.position
+        flat = np.abs(away @ end.direction) < 0.1e-3
+        flat &= np.linalg.norm(away, axis=1) < 0.7 * end.radius
+        assert (flat.sum() > 50) == (not end.open)
+        assert (inward[flat] @ end.direction < -0.9).all()

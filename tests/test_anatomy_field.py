@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
@@ -275,3 +276,19 @@ def test_points_that_are_not_finite_have_no_depth():
     found, slope = ball(points), ball.gradient(points)
     assert found[0] > 0.0 and np.isnan(found[1:]).all()
     assert slope[0, 2] == pytest.approx(-1.0, abs=0.1) and np.isnan(slope[1:]).all()
+
+
+def test_a_surface_goes_on_as_a_tube_beyond_its_open_end():
+    mesh = trimesh.creation.cylinder(4e-3, 0.04, sections=64)
+    surface = Surface(mesh.vertices, mesh.faces)
+    entry = End("tube", [0, 0, -0.02], [0, 0, -1], 4e-3, True)
+    closed = End("tube", [0, 0, 0.02], [0, 0, 1], 4e-3, False)
+    depth = SurfaceDepth(surface, [entry, closed])
+    aside = np.array([0.0, 2e-3, 5e-3])
+    places = np.zeros((3, 3))
+    places[:, 0] = aside
+    for height in (0.0, -0.023):
+        places[:, 2] = height
+        np.testing.assert_array_equal(depth(places) > 0.0, aside < 4e-3)
+    places[:, 2] = 0.023
+    assert (depth(places) < 0.0).all()

@@ -9,8 +9,8 @@ from synthetic_scans import y_tree
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import Anatomy, phantoms
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.parts import FileFrame, Goal
-from cathsim_dmc.anatomy.reach import least_ahead
+from cathsim_dmc.anatomy.parts import FileFrame, Goal, Inlet
+from cathsim_dmc.anatomy.reach import least_ahead, unreachable
 from cathsim_dmc.cli.task_options import TaskOptions
 from cathsim_dmc.tasks import objectives, placement
 
@@ -70,6 +70,21 @@ def moved(anatomy):
     return replace(anatomy, inlet=inlet)
 
 
+def test_a_route_begins_at_an_inlet_within_its_vessel(anatomy):
+    entered = moved(anatomy)
+    goal = anatomy.tree.vessel("left").centreline.at(30e-3).position
+    route = entered.route(entered.goal_at(place(anatomy, "left", 30e-3)))
+    np.testing.assert_allclose(route.points[0], entered.inlet.position, atol=1e-9)
+    np.testing.assert_allclose(route.points[-1], goal, atol=1e-9)
+
+
+def test_a_branch_begins_at_its_ostium(anatomy):
+    """Its centreline before it lies in the parent, however near to the wall."""
+    ostium = anatomy.tree.vessel("left").ostium
+    assert anatomy.goal_at(place(anatomy, "left", ostium - 0.3e-3)).vessel == "trunk"
+    assert anatomy.goal_at(place(anatomy, "left", ostium + 0.3e-3)).vessel == "left"
+
+
 def test_a_task_takes_a_place_as_its_goal(anatomy):
     own = place(anatomy, "right", 30e-3).tolist()
     task = suite.make_task("navigate", anatomy=anatomy, goal=own, random=0)
@@ -83,6 +98,33 @@ def test_a_task_takes_a_place_as_its_goal(anatomy):
         "navigate", anatomy=anatomy, goal=near, random=0, goal_radius=5e-3
     )
     assert given.objective.goal_radius == 5e-3
+
+
+def test_a_goal_beyond_a_fork_is_reached_by_the_branch_that_the_inlet_passes():
+    """The branch leaves 5 mm ahead of the inlet; the twig forks off higher up."""
+
+    def line(start, end, radius):
+        share = np.linspace(0.0, 1.0, 41)[:, None]
+        way = np.subtract(end, start)
+        return Centreline(start + share * way, np.full(41, radius))
+
+    aorta = line([0, 0, 0.055], [0, 0, 0.2], 8e-3)
+    branch = line([0, 0, 0.05], [0.06, 0, 0.11], 4e-3)
+    twig = line([0.04, 0, 0.09], [0.04, 0.05, 0.09], 2e-3)
+    ostium = 0.01 * 2**0.5
+    vessels = (
+        Vessel("aorta", aorta),
+        Vessel("branch", branch, "aorta", ostium),
+        Vessel("twig", twig, "branch", 4e-3),
+    )
+    tree = VesselTree({one.name: one for one in vessels})
+    start = Inlet("aorta", aorta.points[0], [0, 0, 1.0], 8e-3)
+    goals = {
+        name: Goal(name, name, tree.vessel(name).centreline.at(0.03).position, 0.03)
+        for name in ("branch", "twig")
+    }
+    found = unreachable(Anatomy("fork", tree, start, goals))
+    assert found == {"branch leaves aorta 5 mm past the inlet": ["branch", "twig"]}
 
 
 @pytest.mark.parametrize("text", ["1.5,-2,30", "[1.5, -2, 30]", "(1.5,-2,30)"])

@@ -69,6 +69,8 @@ def test_bends_and_angles_of_a_half_ring():
     turn = math.radians(found["ascending_turn_deg"])
     assert turn == pytest.approx(level, abs=0.02)
     assert found["diameters"]["ascending"] == 20.0
+    up = 50 + 40 * level  # mm, along the axis to the BCA
+    assert found["bend_radius_mm"] == pytest.approx(up / turn, rel=0.01)
     bca = found["branches"]["bca"]
     assert bca["take_off_deg"] == bca["lean_deg"] == 0.0
     offset = 40 * (1 - math.cos(1.0))
@@ -76,6 +78,30 @@ def test_bends_and_angles_of_a_half_ring():
     assert bca["diameter_mm"] == 6.0 and bca["tortuosity"] == 1.0
     # Along the arch is +x, the patient's left: 90 degrees from the sagittal plane.
     assert found["plane_deg"] == pytest.approx(90, abs=0.5)
+
+
+def test_an_aorta_that_only_rises_is_as_high_as_its_end():
+    """It narrows from 24 to 16 mm; branches leave it level, at 60 and 80 mm."""
+
+    def straight(start, way, first, last):
+        share = np.linspace(0.0, 1.0, 201)[:, None]
+        radii = first + share[:, 0] * (last - first)
+        return Centreline(np.array(start) + share * way, radii)
+
+    aorta = straight([0, 0, 0], [0, 0, 0.2], 12e-3, 8e-3)
+    vessels = {"aorta": Vessel("aorta", aorta)}
+    for name, height, way in (
+        ("bca", 0.06, [0.06, 0, 0]),
+        ("lcca", 0.08, [0, 0.06, 0]),
+    ):
+        line = straight([0, 0, height], way, 3e-3, 3e-3)
+        vessels[name] = Vessel(name, line, "aorta", 12e-3 - 0.02 * height)
+    found = measures.measure(VesselTree(vessels))
+    assert found["drop"] == pytest.approx((200 - 60) / 6)
+    # At the branches; half-way up to the first, and from the last to the end.
+    wanted = {"ascending": 30, "bca": 60, "lcca": 80, "descending": 140}
+    wanted = {name: 24 - 8 * height / 200 for name, height in wanted.items()}
+    assert found["diameters"] == pytest.approx(wanted, abs=0.01)
 
 
 def test_a_branch_that_leans_back_and_upstream_is_measured_along_its_own_lumen():

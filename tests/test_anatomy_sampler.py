@@ -1,5 +1,6 @@
 """Random arches: repeatable, of the type asked for, distributed as the tables say."""
 
+import contextlib
 import math
 from itertools import combinations
 
@@ -117,6 +118,17 @@ def test_necks_differ_and_are_repeated():
         check_septa(tree)
 
 
+def test_arteries_of_a_neck_begin_towards_their_sides():
+    """Those of the right go to the right (-x); the vertebral ones back and up."""
+    for seed in arch.arch_set("neck")[:4]:
+        first = {each.name: each.first for each in seed.parameters().neck}
+        assert max(first[name][0] for name in ("rcca", "rsa", "rva")) <= 0.0
+        assert first["lva"][0] > 0.0
+        for name in ("rva", "lva"):
+            _, back, up = first[name]
+            assert 0.0 < back < up
+
+
 @pytest.mark.parametrize(
     "name", ["neck", pytest.param("test_neck", marks=pytest.mark.slow)]
 )
@@ -136,6 +148,40 @@ def test_an_arch_without_a_bca_has_no_neck():
     tree = arch_tree(arch.sample(np.random.RandomState(0), "II", variant="aberrant"))
     with pytest.raises(ValueError, match="this one has aorta, rcca"):
         neck.sample_neck(np.random.RandomState(0), tree)
+
+
+@pytest.fixture(scope="module")
+def thousand():
+    """Parameters as drawn, before they are corrected or refused."""
+    random, drawn = np.random.RandomState(0), []
+    while len(drawn) < 1000:
+        with contextlib.suppress(ValueError):
+            drawn.append(sampler._draw(random, 1.5, "normal"))
+    return drawn
+
+
+def test_the_widest_ostia_have_two_millimetres_between_them(thousand):
+    wall = [one.lcca_lsa_spacing - one.lcca.radius - one.lsa.radius for one in thousand]
+    assert min(wall) == pytest.approx(2e-3)
+    wall = [one.bca_lcca_spacing - one.bca.radius - one.lcca.radius for one in thousand]
+    assert min(wall) > 2e-3
+
+
+def test_what_has_no_table_is_drawn_with_the_spread_that_is_assumed(thousand):
+    for name, spread, unit in (
+        ("plane_rotation", sampler.PLANE_ROTATION, math.radians(1.0)),
+        ("plane_tilt", (0.0, 6.0), math.radians(1.0)),
+        ("descending_bend", (0.0, 5.0), math.radians(1.0)),
+        ("bow", (0.0, 3e-3), 1.0),
+        ("sway", (4e-3, 3e-3), 1.0),
+        ("arch_radius", (34e-3, 3.4e-3), 1.0),
+    ):
+        values = [getattr(one, name) / unit for one in thousand]
+        mean, deviation = spread
+        assert np.mean(values) == pytest.approx(mean, abs=0.12 * deviation), name
+        assert np.std(values) == pytest.approx(deviation, rel=0.1), name
+    lean = [math.degrees(one.lsa.lean) for one in thousand]
+    assert np.mean(lean) == pytest.approx(5.0, abs=1.5)
 
 
 def test_unknown_kinds_list_the_known():

@@ -6,13 +6,20 @@ import numpy as np
 import pytest
 from synthetic_scans import marched, write_markup, write_obj, y_tree
 
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.parts import Goal, Inlet, Surface
 from cathsim_dmc.anatomy.scan import importer
 from cathsim_dmc.anatomy.scan.ends import free_ends
 from cathsim_dmc.anatomy.scan.extract import plan_inlet, trunk
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.left_out import left_out
-from cathsim_dmc.anatomy.scan.places import opened_at_inlet, place_goals
+from cathsim_dmc.anatomy.scan.places import (
+    describe,
+    opened_at_inlet,
+    passable_length,
+    place_goals,
+)
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
@@ -194,3 +201,26 @@ def test_an_import_without_a_goal_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(importer, "place_goals", lambda *arguments: {})
     with pytest.raises(ValueError, match=r"no goal.*--inlet X Y Z\), such as \("):
         import_scan(mesh, units="mm")
+
+
+def test_what_a_branch_is_like_counts_from_its_ostium_on():
+    """Within its parent the lumen is not that of the branch."""
+    share = np.linspace(0.0, 1.0, 101)[:, None]
+    trunk = Centreline([0, 0, 0.1] * share, np.full(101, 8e-3))
+    radii = np.full(101, 3e-3)
+    radii[:60], radii[2], radii[70:80], radii[95:] = 6e-3, 2.2e-3, 2e-3, 0.7e-3
+    line = Centreline([0, 0, 0.05] + [0.1, 0, 0] * share, radii)
+    branch = Vessel("arm", line, "trunk", 58e-3)
+    tree = VesselTree({"trunk": Vessel("trunk", trunk), "arm": branch})
+    assert passable_length(branch, 1e-3) == pytest.approx(95e-3)
+    assert passable_length(branch, 2.5e-3) == pytest.approx(70e-3)
+    start = Inlet("trunk", trunk.points[0], [0, 0, 1.0], 8e-3)
+    goal = Goal("arm", "arm", line.at(90e-3).position, 90e-3)
+    box = Surface(np.eye(3), np.array([[0, 1, 2]]))
+    found = describe(Anatomy("a", tree, start, {"arm": goal}, scan=box), 1e-3)
+    assert found["vessels"]["arm"] == {
+        "parent": "trunk", "length_mm": 100.0, "ostium_mm": 58.0,
+        "median_radius_mm": 3.0, "passable_mm": 95.0,
+    }  # fmt: skip
+    way = {"vessel": "arm", "route_mm": 140.0, "narrowest_radius_mm": 2.0}
+    assert found["goals"]["arm"] == way

@@ -7,11 +7,14 @@ import pytest
 from synthetic_scans import marched, write_obj, y_tree
 
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.parts import Inlet, Surface
+from cathsim_dmc.anatomy.scan import units
 from cathsim_dmc.anatomy.scan.extract import trunk
 from cathsim_dmc.anatomy.scan.growth import THINNEST
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.left_out import left_out, said
 from cathsim_dmc.anatomy.scan.lumen import enlargement, guess_units
+from cathsim_dmc.anatomy.scan.places import resized
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
@@ -129,6 +132,26 @@ def test_small_lumens_are_enlarged():
     assert enlargement(3e-3, 3e-6) == pytest.approx(4.0)
     assert enlargement(2e-3, 50e-6) == pytest.approx(2.0)  # or it would take long
     assert enlargement(float("nan"), 1e-6) == 1.0
+
+
+def test_what_is_said_of_an_enlarged_lumen_has_the_size_of_the_patient():
+    with units.file_frame(units.to_lps("cm", "RAS"), "cm", 4.0):
+        assert units.mm(0.02) == pytest.approx(5.0)
+        assert units.shown(np.array([0.02, -0.04, 0.08])) == "(-0.5, 1.0, 2.0) cm"
+    assert units.mm(0.02) == 20.0
+
+
+def test_an_inlet_is_made_smaller_with_its_lumen():
+    tree = y_tree()
+    inlet = Inlet("trunk", [0.0, 0.0, 0.02], [0.0, 0.0, 1.0], 6e-3)
+    sheet = Surface(np.eye(3), np.array([[0, 1, 2]]))
+    found, small, surface = resized(tree, inlet, sheet, 0.25)
+    np.testing.assert_allclose(small.position, [0.0, 0.0, 0.005])
+    np.testing.assert_allclose(small.direction, inlet.direction)
+    assert small.radius == pytest.approx(1.5e-3)
+    np.testing.assert_allclose(surface.vertices, 0.25 * np.eye(3))
+    length = tree.root.centreline.length
+    assert found.root.centreline.length == pytest.approx(0.25 * length)
 
 
 def test_the_thinnest_device_is_that_of_the_library():

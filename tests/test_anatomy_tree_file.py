@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from cathsim_dmc.anatomy import Anatomy
-from cathsim_dmc.anatomy.builder import VesselPlace
+from cathsim_dmc.anatomy.builder import VesselPlace, default_goals
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 from cathsim_dmc.anatomy.tree_file import parse_tree, read_tree
 from cathsim_dmc.validation.wall import field_error
@@ -92,6 +93,16 @@ def test_spline_is_the_curve_and_the_ostium_is_on_the_wall():
     assert origin.distance < 1e-6
 
 
+def test_radii_of_a_branch_within_its_parent_are_ignored():
+    wide = content()
+    wide["vessels"]["side"]["radii_mm"][:2] = [8.0, 8.0]  # 0 and 6 mm from the start
+    found, plain = (
+        smooth_tree(parse_tree(each).curves).vessel("side").centreline
+        for each in (wide, content())
+    )
+    np.testing.assert_allclose(found.radii, plain.radii, atol=1e-6)
+
+
 def test_smoothing_takes_away_scatter_of_the_measurement():
     points, angle = helix(41)
     noise = np.random.default_rng(0).normal(0.0, 0.2, points.shape)
@@ -140,6 +151,26 @@ def test_from_tree_sets_a_goal_in_each_branch():
     )
     assert again.tree is anatomy.tree
     assert list(again.goals) == ["x"]
+
+
+def test_a_goal_lies_before_the_fork_of_its_branch_and_before_its_end():
+    def straight(start, way):
+        share = np.linspace(0.0, 1.0, 41)[:, None]
+        return Centreline(np.array(start) + share * way, np.full(41, 2e-3))
+
+    lines = {
+        "trunk": (straight([0, 0, 0], [0, 0, 0.1]), None),
+        "arm": (straight([0, 0, 0.05], [0.08, 0, 0]), "trunk"),
+        "twig": (straight([0.02, 0, 0.05], [0, 0.03, 0]), "arm"),
+        "stub": (straight([0, 0, 0.08], [0, 0.011, 0]), "trunk"),
+    }
+    vessels = {
+        name: Vessel(name, line, parent, 2e-3 if parent else 0.0)
+        for name, (line, parent) in lines.items()
+    }
+    found = default_goals(VesselTree(vessels))
+    places = {name: place.arc_length for name, place in found.items()}
+    assert places == pytest.approx({"arm": 20e-3, "twig": 25e-3})
 
 
 def change(path, value):

@@ -16,6 +16,7 @@ import pytest
 from cathsim_dmc import bridge, suite
 from cathsim_dmc.bridge import fit, messages, serving
 from cathsim_dmc.bridge.driver import Driver, connect
+from cathsim_dmc.bridge.records import milliseconds
 
 PERIOD = 0.02
 WAIT = 20.0  # s, for what must happen, on a busy machine
@@ -162,6 +163,51 @@ def test_too_much_force_stops_the_device(side):
     assert found.end == "force_limit" and len(robot.taken) == 5 and robot.stops
     assert done["end"] == ("force_limit" if side == "device" else "stopped")
     assert done["force"] == 2.0 == found.force
+
+
+@pytest.mark.parametrize("side", ["device", "driver"])
+def test_a_pull_counts_as_a_push_does(side):
+    robot = Robot(steps=100, force=lambda count: -2.0 if count == 3 else 0.1)
+    served = Served(robot, force_limit=1.5 if side == "device" else None, lockstep=True)
+    own = bridge.DriveOptions(
+        watchdog=WAIT, warm_up=0, force_limit=None if side == "device" else 1.5
+    )
+    found = bridge.drive(push, served.address, options=own)
+    (done,) = served.joined()
+    assert found.end == "force_limit" and len(robot.taken) == 3
+    assert done["force"] == 2.0 == found.force
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "float64"])
+def test_arrays_come_out_of_a_message_as_they_went_in(dtype):
+    array = np.random.RandomState(0).randint(0, 255, (2, 3, 4)).astype(dtype)
+    frame = messages.pack({"kind": "hello", "x": messages.to_json(array)})
+    sent = json.loads(frame[4:])["x"]
+    found = messages.to_array("x", sent, array.shape, dtype)
+    np.testing.assert_array_equal(found, array, strict=True)
+
+
+@pytest.mark.parametrize(("factor", "same"), [(1.04, True), (1.1, False), (0.5, False)])
+def test_scales_are_compared_relative_to_their_size(factor, same):
+    """However small they are in their unit: 4 mm/s is not 2 mm/s."""
+    entry = {"name": "push", "unit": "m/s", "scale": 4e-3, "low": -1.0, "high": 1.0}
+    wanted = fit.Interface(0.04, [entry], [])
+    given = {**entry, "scale": factor * 4e-3}
+    found = fit.meanings(wanted, {"action": [given], "observation": []})
+    assert (not found) == same
+    late = {"period": factor * 0.04, "action": [entry], "observation": []}
+    assert (not fit.meanings(wanted, late)) == same
+
+
+def test_durations_are_told_in_milliseconds():
+    found = milliseconds(np.random.RandomState(0).permutation(101) * 1e-3)
+    assert found == {"p50": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
+    assert milliseconds([]) is None
+    served = Served(Robot())
+    driven = bridge.drive(push, served.address, options=SLOW)
+    served.joined()
+    # Between two states, on a busy machine.
+    assert 0.1 * PERIOD < 1e-3 * driven.period["p50"] < 100 * PERIOD
 
 
 def test_a_device_stops_when_its_driver_falls_silent():
@@ -756,6 +802,29 @@ def test_a_shipped_policy_drives_its_task_as_it_plays_it(cathsim, shared_environ
     assert code == 2 and "type1_lcca" in told
 
 
+def test_the_seeds_of_episodes_that_a_command_drives_count_up(
+    cathsim, monkeypatch, tmp_path
+):
+    from cathsim_dmc.agents.policies import FunctionPolicy
+    from cathsim_dmc.cli import bridging
+
+    def still(observation):
+        return np.zeros((1, 2))
+
+    policy = FunctionPolicy(still)
+    monkeypatch.setattr(bridging.agents, "load_policy", lambda *_: policy)
+    robot = Robot(steps=2)
+    served = Served(robot, episodes=3, lockstep=True)
+    code, out, err = cathsim(
+        *("drive", "mine", "--connect", served.address, "--episodes", 3, "--seed", 7),
+        *("--watchdog", WAIT, "--warm-up", 1, "--json", "--log", tmp_path / "log"),
+    )
+    assert code == 0, err
+    served.joined()
+    assert robot.seeds == [7, 8, 9] and len(json.loads(out)["episodes"]) == 3
+    assert (tmp_path / "log").read_text().count('"sent"') == 6
+
+
 def test_a_simulated_device_measures_as_a_load_cell_does(shared_environment):
     """The mean over a period, by which the suite judges, not its last moment."""
     env = shared_environment("femoral_type1_lcca", observation="tracking", max_steps=15)
@@ -766,6 +835,7 @@ def test_a_simulated_device_measures_as_a_load_cell_does(shared_environment):
     measured = env.task.wall_force
     assert force["largest"] == measured.mean_max != measured.max
     assert force["sum"] == measured.mean_sum > 0.0
+    assert force["push"] == env.task.readings.push_force != 0.0
 
 
 def test_a_port_that_is_taken_is_refused_before_anything_compiles(cathsim, monkeypatch):

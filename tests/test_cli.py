@@ -1,6 +1,8 @@
 """The command line: what it prints, where, and with which exit code."""
 
 import dataclasses
+import importlib
+import inspect
 import io
 import json
 import re
@@ -10,20 +12,28 @@ import subprocess
 import sys
 import time
 import types
+from pathlib import Path
 
 import pytest
 from conftest import TASKS
+from recording_samples import make_episode
 
 from cathsim_dmc import __version__, cli, suite
 from cathsim_dmc.agents import LEARNERS, Checkpoint
 from cathsim_dmc.agents.checkpoint import checkpoints_in
+from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.policies import FunctionPolicy
+from cathsim_dmc.analysis.force_statistics import EpisodeForces, Statistics
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy.arch.arch import ArchSeed
 from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.bridge import ServeOptions
 from cathsim_dmc.cli import agents as commands
-from cathsim_dmc.cli import checks, options, task_options, training
+from cathsim_dmc.cli import checks, options, result_tables, task_options, training
 from cathsim_dmc.cli import phantoms as cli_phantoms
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.image_set import ImageSetOptions
+from cathsim_dmc.validation import wall
 from cathsim_dmc.validation.checks import Check, Report
 
 # What works.
@@ -222,6 +232,24 @@ def test_an_evaluation_reports_each_episode(cathsim):
         assert device in row and " 0.2 " in row, row  # s, five control steps
 
 
+@pytest.mark.parametrize(
+    ("kind", "end"),
+    [("success", "goal reached"), ("physics_error", "physics error"),
+     ("given_up", "given up"), (None, "out of time")],
+)  # fmt: skip
+def test_a_report_says_how_an_episode_ended(kind, end):
+    states = {name: name == kind for name in ("success", "physics_error")}
+    states["terminated"] = kind is not None
+    forces = EpisodeForces(mean_sum=Statistics(0.1, 0.2, 0.75))
+    episode = EpisodeOutcome(
+        env=0, reward=1.0, length=50, forces=forces, path_ratio=1.5, **states
+    )
+    row = result_tables._outcome(7, {"arch": 3, "device": "wire"}, episode)
+    assert (row["seed"], row["arch"], row["device"]) == ("7", "3", "wire")
+    assert (row["end"], row["time, s"], row["path ratio"]) == (end, "2.0", "1.50")
+    assert (row["mean force, mN"], row["largest sum, N"]) == ("100", "0.75")
+
+
 def test_an_evaluation_keeps_the_options_that_a_policy_was_trained_with(monkeypatch):
     policy = FunctionPolicy(lambda observation: observation, "trained")
     policy.task, policy.task_kwargs = "type1_bca", {"rotation": True, "friction": 0.1}
@@ -236,6 +264,152 @@ def test_an_evaluation_keeps_the_options_that_a_policy_was_trained_with(monkeypa
     with pytest.raises(InterruptedError):
         commands.evaluate("trained", options=task_options.TaskOptions(goal="lcca"))
     assert seen == {"rotation": True, "friction": 0.1, "goal": "lcca"}
+
+
+OUT = Path("OUT")
+# A command, the function that it ends in, and what that is to be given.
+HANDED_ON = [
+    (
+        "play simple1_bca --out OUT --seed 5 --episodes 2 --speed 3 --hands gamepad "
+        "--max-steps 7",
+        "play:play",
+        {"task": "simple1_bca", "out": OUT, "seed": 5, "episodes": 2, "speed": 3.0,
+         "hands": "gamepad", "task_kwargs": {"max_steps": 7}, "policy": None},
+    ),
+    (
+        "demos simple1_bca --out OUT --seed 5 --episodes 2 --noise 0.2 --threads 1 "
+        "--observation internal force --max-steps 7",
+        "agents:record_demonstrations",
+        {"episodes": 2, "observation": ("internal", "force"), "seed": 5, "noise": 0.2,
+         "task_kwargs": {"max_steps": 7}, "num_threads": 1},
+    ),
+    (
+        "eval push --task simple1_bca --out OUT --seed 5 --episodes 2 --threads 1 "
+        "--protocol varied --simulation-device cuda:1 --max-steps 7",
+        "agents:evaluate",
+        {"task": "simple1_bca", "episodes": 2, "seed": 5, "protocol": "varied",
+         "task_kwargs": {"max_steps": 7}, "num_threads": 1, "out_dir": OUT,
+         "simulation_device": "cuda:1", "on_cluster": False, "start": None},
+    ),
+    (
+        "submit push --out OUT.json --task type1_bca --episodes 2 --threads 1",
+        "agents.submission:submit",
+        {"policy": "push", "task": "type1_bca", "episodes": 2, "num_threads": 1},
+    ),
+    (
+        "export type1_bca --out OUT --seed 5 --wall prisms --max-steps 7",
+        "cli.exporting:write_mjcf",
+        {"seed": 5, "wall": "prisms", "task_kwargs": {"max_steps": 7}},
+    ),
+    (
+        "export pretrained:type1_bca --out OUT --task type1_lcca --seed 5",
+        "cli.exporting:write_onnx",
+        {"task": "type1_lcca", "task_kwargs": {}, "seed": 5},
+    ),
+    (
+        "export pretrained:type1_bca --out OUT",
+        "cli.exporting:write_onnx",
+        {"task": None, "seed": 1_000_000},
+    ),
+    (
+        "phantom generate type1 --out OUT --access descending",
+        "anatomy.phantoms:load",
+        {"name": "type1", "access": "descending"},
+    ),
+    (
+        "replay e.rrd --web --port 9191 --data-port 9292",
+        "recording.viewer:open_viewer",
+        {"path": Path("e.rrd"), "web": True, "port": 9191, "data_port": 9292},
+    ),
+    (
+        "dataset OUT --processes 2 --frames 5 --stride 3 --size 64 --seed 5",
+        "cli.recordings:write",
+        {"options": ImageSetOptions(frames=5, stride=3, size=64, seed=5),
+         "processes": 2, "on_cluster": False},
+    ),
+    (
+        "validate forces --mean 0.3 --sd 0.05 --margin 0.2",
+        "validation.force_sensors:compare_forces",
+        {"episode": None, "mean": 0.3, "sd": 0.05, "margin": 0.2},
+    ),
+    (
+        "phantom export type1 --out OUT.xml --wall prisms",
+        "anatomy.export:write_mjcf",
+        {"wall": "prisms"},
+    ),
+    (
+        "phantom generate II --out OUT --seed 5 --variant aberrant "
+        "--access descending",
+        "anatomy.arch.arch:build_seed",
+        {"seed": ArchSeed(5, "II", "aberrant"), "access": "descending"},
+    ),
+    (
+        "phantom import a.stl --out OUT --name own --units cm --frame RAS --axes ILA "
+        "--inlet 1 2 3 --heart 4 5 6 --rename a=b --centreline c.csv --label 3",
+        "cli.phantoms:import_scan",
+        {"centreline_paths": (Path("c.csv"),), "units": "cm", "mesh_frame": "RAS",
+         "axes": "ILA", "labels": (3,), "name": "own", "inlet": (1.0, 2.0, 3.0),
+         "heart": (4.0, 5.0, 6.0), "rename": {"a": "b"}, "device": None},
+    ),
+    (
+        "serve simple1_bca --port 0 --episodes 2 --lockstep --missed hold "
+        "--watchdog 0.5 --force-limit 0.7",
+        "bridge:serve",
+        {"options": ServeOptions(True, "hold", 0.5, 0.7), "episodes": 2},
+    ),
+    (
+        "record push --task simple1_bca --out OUT.rrd --seed 5 --max-steps 7",
+        "suite:load",
+        {"task_name": "simple1_bca", "task_kwargs": {"max_steps": 7, "random": 5}},
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("words", "place", "given"), HANDED_ON, ids=[row[1] for row in HANDED_ON]
+)
+def test_options_are_handed_on(cathsim, tmp_path, monkeypatch, words, place, given):
+    """To the function that does the work; what it does with them is tested there."""
+    name, function = place.split(":")
+    module, seen = importlib.import_module(f"cathsim_dmc.{name}"), {}
+    signature = inspect.signature(getattr(module, function))
+
+    def called(*arguments, **options):
+        bound = signature.bind(*arguments, **options)
+        bound.apply_defaults()
+        seen.update(bound.arguments)
+        raise SystemExit
+
+    monkeypatch.setattr(module, function, called)
+    monkeypatch.chdir(tmp_path)
+    cathsim(*words.split())
+    assert {key: seen.get(key, "not given") for key in given} == given
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_check_of_a_phantom_ends_with_the_code_of_its_report(
+    cathsim, monkeypatch, kept
+):
+    found = Report("x", [Check("a", 1.0, "", "", kept)], {"type1": {"measures": {}}})
+    monkeypatch.setattr(wall, "validate_anatomy", lambda anatomy: found)
+    assert cathsim("phantom", "check", "type1")[0] == (0 if kept else 1)
+
+
+@pytest.mark.parametrize(
+    ("words", "shown"), [((), True), (("--no-fluoroscopy",), False)]
+)
+def test_a_recording_has_x_ray_images_unless_they_are_left_out(
+    cathsim, tmp_path, monkeypatch, words, shown
+):
+    seen = []
+    monkeypatch.setattr(commands, "_played", lambda *_: (make_episode(), None))
+    monkeypatch.setattr(commands.recorded, "write", lambda *given: seen.append(given))
+    out = tmp_path / "e.rrd"
+    code, _, err = cathsim(
+        "record", "push", "--task", "simple1_bca", "--out", out, *words
+    )
+    assert code == 0, err
+    assert [given[2:] for given in seen] == [(out, shown)]
 
 
 TINY = (

@@ -156,6 +156,23 @@ def test_the_anatomy_chooses_the_views(anatomy):
         FluoroscopyOptions(view="best", biplane=(90, 0))
 
 
+def test_the_chosen_views_show_fewer_places_beside_the_vessel_than_others(anatomy):
+    """Places that both outlines hold and that lie 3 mm or more outside the lumen."""
+    low, high = anatomy.lumen.box
+    axes = [np.arange(a, b, 3e-3) for a, b in zip(low, high, strict=True)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    places = places[anatomy.lumen(places) < -3e-3]
+
+    def beside(view, biplane):
+        options = FluoroscopyOptions(view=view, biplane=biplane)
+        machine = Biplane(Angiograph(anatomy.surface, options).planes())
+        return int((machine.depth(places) > 0.5e-3).sum())
+
+    others = ((60, 0), (-30, 0)), ((0, 0), (90, 0)), ((45, 20), (-45, 20))
+    best = beside("best", "best")
+    assert all(beside(*each) > 1.1 * best for each in others)
+
+
 def test_a_device_ends_where_it_leaves_an_image(anatomy):
     options = FluoroscopyOptions(
         view=(60, 0), biplane=(-30, 0), magnification=2.0, contrast=False
@@ -167,3 +184,48 @@ def test_a_device_ends_where_it_leaves_an_image(anatomy):
     pixels, _ = planes[0].carm.project(found)
     assert 6 <= len(found) < 20
     assert (pixels > -1.0).all() and (pixels < planes[0].carm.resolution[0]).all()
+
+
+def test_planes_whose_angles_are_off_find_a_device_far_from_their_isocentre(planes):
+    """Their rays to it miss each other by more than those of true planes do."""
+    straight = np.linspace([0.0, 0.0, -0.05], [0.0, 0.0, 0.05], 50)
+    for aside in (-0.09, 0.09):
+        line = straight + planes[0].carm.isocentre + [aside, 0.0, 0.0]
+        image = images(planes, line)[0]
+        for seed in (5, 0):
+            off = Biplane(planes, errors=RoadmapErrors(calibration=5.0), seed=seed)
+            assert len(off.device(image)) > 12
+
+
+def test_radii_are_not_too_small_where_outlines_have_errors(anatomy, planes):
+    """The least of the distances to three outlines with errors is below its mean."""
+    options = FluoroscopyOptions(view=(60, 0), biplane=(-30, 0), third="AP")
+    third = Angiograph(anatomy.surface, options).third()
+    line = anatomy.route("lcca").resampled(1e-3).points[20:]
+    true, errors = Biplane(planes, third).radii(line), RoadmapErrors(noise=1.0)
+    found = [Biplane(planes, third, errors, n).radii(line) for n in range(4)]
+    assert np.mean(found - true) == pytest.approx(0.0, abs=0.7e-3)
+
+
+def test_both_ends_of_a_route_stay_where_it_is_centred(anatomy, planes):
+    machine = Biplane(planes, errors=RoadmapErrors(noise=0.5))
+    line = anatomy.route("lcca").resampled(1e-3).points[20:]
+    found = machine._centred(line)
+    np.testing.assert_array_equal(found[[0, -1]], line[[0, -1]])
+    assert np.linalg.norm(found - line, axis=1).max() > 0.5e-3
+
+
+def test_a_device_is_found_beside_a_short_line_that_is_darker(planes):
+    """The longer of two lines that leave the marker is the device."""
+    tip = np.array(planes[0].carm.isocentre)
+    line = tip + np.outer(np.linspace(0.1, 0.0, 40), [0.0, 0.0, -1.0])
+    other = tip + np.outer(np.linspace(0.0, 0.025, 10), [0.0, 0.0, 1.0])
+    shadows = [
+        Shadow(line[None], RADIUS, 150.0),
+        Shadow(other[None], RADIUS, 400.0, marker_mu=None),
+    ]
+    image = np.concatenate([plane.render(shadows) for plane in planes], axis=-1)
+    found = Biplane(planes).device(image[0])
+    assert len(found) > 12
+    assert np.linalg.norm(found[:, :2] - tip[:2], axis=1).max() < 3e-3
+    assert found[-1, 2] < tip[2] - 0.06

@@ -52,3 +52,28 @@ def test_points_behind_the_source_have_no_pixel():
     pixels, depth = carm.project([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     assert np.isnan(pixels[0]).all() and depth[0] < 0.0
     assert np.isfinite(pixels[1]).all()
+
+
+def test_the_matrix_of_an_oblong_image_is_its_projection():
+    arm = CArm(0.4, -0.2, 1.5, isocentre=(0.01, -0.02, 0.03), resolution=(40, 60))
+    points = np.random.RandomState(0).uniform(-0.1, 0.1, (20, 3))
+    pixels, depth = arm.project(points)
+    found = np.column_stack([points, np.ones(20)]) @ arm.matrix.T
+    np.testing.assert_allclose(found[:, 2], depth)
+    np.testing.assert_allclose(found[:, :2] / found[:, 2:], pixels)
+
+
+@pytest.mark.parametrize(
+    ("pixel", "shown"),
+    [((50, 20), True), ((20, 50), False), ((58.9, 38.9), True), ((59.1, 38), False),
+     ((0.1, 0.1), True), ((1, -0.1), False)],
+)  # fmt: skip
+def test_an_oblong_image_shows_what_is_between_its_corners(pixel, shown):
+    arm = CArm(resolution=(40, 60))
+    place = unproject(arm, np.array(pixel), 0.75)
+    assert arm.shows(place) == shown
+
+
+def test_the_isocentre_is_the_middle_of_the_box_around_points():
+    points = [[0.0, 0.0, 0.0], [0.01, 0.0, -0.01], [0.2, 0.1, -0.4]]
+    np.testing.assert_allclose(CArm().centred_on(points).isocentre, [0.1, 0.05, -0.2])

@@ -61,3 +61,18 @@ def test_rays_end_on_the_wall_of_a_moving_vessel():
     rest = arch.motion.to_rest(*warp[1:], met)
     _, growth = arch.motion.to_space(*warp[1:], rest)
     assert np.percentile(np.abs(arch.lumen(rest) + growth), 99) < 20e-6
+
+
+def test_a_wider_image_shows_more_on_both_sides():
+    """The vertical angle of the view is fixed."""
+    tube = rig.tube(0.2, RADIUS)
+    line = tube.tree.root.centreline
+    head = line.at(0.5 * line.length).position[None]
+    frame = np.linalg.qr(np.random.RandomState(0).normal(size=(3, 3)))[0][None]
+    square, wide = (
+        endoluminal.views([tube.lumen], [endoluminal.AT_REST], head, frame, size)
+        for size in ((SIZE, SIZE), (SIZE, SIZE + 16))
+    )
+    for one, other in zip(square, wide, strict=True):
+        np.testing.assert_array_equal(other[:, :, 8:-8], one)
+        assert (other[:, :, :8] != one[:, :, :8]).any()

@@ -204,3 +204,81 @@ def test_a_thin_device_shows_on_a_pixel_that_sees_enough_of_it(shift):
     shown = np.array([left, 1 - left]) * np.pi / 4 >= MASK_SHARE
     np.testing.assert_array_equal(np.flatnonzero(row), 15 + np.flatnonzero(shown))
     assert shown.tolist() == [shift < 0.3, shift > -0.3]
+
+
+def test_a_zoom_spreads_the_blur_of_the_detector_over_more_pixels():
+    """A black line is as wide as the point spread, in pixels of the zoomed image."""
+    usual = CArm(resolution=(9, 61))
+    for zoom in (1.0, 2.0):
+        arm, line = replace(usual, magnification=zoom), np.zeros((9, 61))
+        line[:, 30] = 1e3
+        scope = Fluoroscope(arm, line, line > 0, blur=1.2 * usual.pitch)
+        darker = scope.empty[4, 0] - scope.empty[4].astype(float)
+        spread = darker @ (np.arange(61) - 30.0) ** 2 / darker.sum()
+        assert np.sqrt(spread) == pytest.approx(1.2 * zoom, rel=0.06)
+
+
+def test_the_thin_end_of_a_chain_is_seen_beside_its_wide_base():
+    arm = CArm(resolution=(128, 128), magnification=8.0)
+    pixel = arm.pitch * arm.source_isocentre / arm.source_detector
+    scope = Fluoroscope(arm, np.zeros((128, 128)), np.zeros((128, 128), bool))
+    line = np.zeros((3, 3))
+    line[:, 0] = np.array([-40.0, 0.0, 40.0]) * pixel
+    radii = np.array([10.0, 1.5]) * pixel
+    mask = scope.device_mask([Shadow(line, radii)])
+    assert mask[:, 34].sum() == pytest.approx(20, abs=1)
+    assert mask[:, 94].sum() == pytest.approx(3, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("contrast", "iodine"), [(True, 15.0), (False, 0.0), (7.5, 7.5), (0.0, 0.0)]
+)
+def test_contrast_is_an_amount_of_iodine_or_whether_there_is_the_usual_one(
+    vessel, contrast, iodine
+):
+    options = FluoroscopyOptions(contrast=contrast, size=32)
+    (plane,) = angiograph.Angiograph(vessel, options).planes()
+    assert plane.contrast == iodine
+    dark = 1 - plane.signal.min()  # behind 60 mm of the ball
+    assert dark == pytest.approx(1 - np.exp(-0.758 * iodine * 0.06), abs=0.01)
+
+
+def test_all_planes_of_a_machine_are_off_by_its_own_angles(vessel):
+    options = FluoroscopyOptions(view=(60, 0), biplane=(-30, 10), third="LAO45")
+    machine, off = angiograph.Angiograph(vessel, options), Deviation(5, -3)
+    planes = *machine.planes(off), *machine.third(off)
+    angles = [(plane.carm.primary, plane.carm.secondary) for plane in planes]
+    np.testing.assert_allclose(np.rad2deg(angles), [(65, -3), (-25, 7), (50, -3)])
+
+
+def test_each_simulation_is_seen_by_its_own_machine(vessel, frames):
+    options = FluoroscopyOptions(size=32)
+    kinds = [
+        angiograph.Angiograph(each, options).planes()
+        for each in (vessel, ball([-0.03, 0.02, 0.0], 0.01))
+    ]
+    machines = [kinds[0], kinds[1], kinds[0]]
+    shadow = Shadow(frames[:3], RADIUS)
+    masks = angiograph.masks(machines, [shadow])
+    pixels = angiograph.pixels(machines, frames[:3])
+    states = [np.random.RandomState(k) for k in range(3)]
+    images = angiograph.images(machines, [shadow], states)
+    for k, own in enumerate(machines):
+        one = [shadow.of(np.array([k]))]
+        np.testing.assert_array_equal(masks[k], angiograph.masks([own], one)[0])
+        alone = angiograph.images([own], one, [np.random.RandomState(k)])
+        np.testing.assert_array_equal(images[k], alone[0])
+        wanted, _ = own[0].carm.project(frames[k])
+        np.testing.assert_array_equal(pixels[k, 0], wanted)
+    assert (masks[0, ..., 1] != masks[1, ..., 1]).any()
+
+
+def test_the_isocentre_goes_amid_the_places_that_the_middle_of_a_scan_misses():
+    options = FluoroscopyOptions()
+    scan, places = np.array([[0, 0, 0], [0.6, 0.1, 0.9]]), np.zeros((2, 3))
+    places[1] = 0.04, 0.02, 0.08
+    aimed = options.aimed(scan, places)
+    np.testing.assert_allclose(aimed.centre, [0.02, 0.01, 0.04])
+    assert options.aimed(0.2 * scan, places) is options  # all is shown already
+    fixed = replace(options, centre=(0.3, 0.0, 0.4))
+    assert fixed.aimed(scan, places) is fixed

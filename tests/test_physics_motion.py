@@ -6,6 +6,7 @@ import pytest
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy.motion import _along_aorta
 from cathsim_dmc.collision import fields
 from cathsim_dmc.laws import blood, heart
 from cathsim_dmc.physics.vessel import VesselOptions
@@ -23,6 +24,33 @@ def tube():
 def arch():
     """The smallest phantom."""
     return phantoms.load("simple1")
+
+
+def test_breathing_moves_the_branches_by_the_published_way_to_the_middle(arch):
+    """In inspiration down, to the front, and to the middle: of the LSA to the right."""
+    names, blood = list(arch.tree.vessels), arch.circulation
+    _, breath = _along_aorta(blood, arch.tree)
+    for name, size, side in (("bca", 12.0e-3, 1.0), ("lsa", 11.1e-3, -1.0)):
+        (way,) = np.unique(breath[blood.vessel == names.index(name)], axis=0)
+        assert np.linalg.norm(way) == pytest.approx(size)
+        np.testing.assert_allclose(way / size, [0.33 * side, -0.47, -0.82], atol=0.01)
+
+
+def test_the_heart_moves_the_root_and_breathing_the_aorta_as_far_as_published(arch):
+    """By 50 mm the heart's motion has faded as one deviation of a Gaussian does."""
+    blood = arch.circulation
+    root = blood.vessel == 0
+    way, line = blood.ways[root].mean(axis=1), arch.tree.root.centreline
+    heart, breath = (each[root] for each in _along_aorta(blood, arch.tree))
+    size = np.linalg.norm(heart, axis=1)
+    np.testing.assert_allclose(size, np.exp(-0.5 * (way / 50e-3) ** 2), rtol=1e-6)
+    np.testing.assert_allclose(heart[0] / size[0], [0.3, -0.3, -0.9], atol=0.01)
+    # Half-way up to the BCA, and at the end.
+    begin = blood.courses["bca"].begin
+    far = np.linalg.norm(breath, axis=1)
+    places = np.interp([0.0, begin / 4, begin / 2, line.length], way, far)
+    np.testing.assert_allclose(places[:3], 8.9e-3, rtol=0.02)
+    assert places[3] == pytest.approx(4.9e-3, rel=0.05)
 
 
 def test_the_radius_follows_the_pulse_which_travels(tube):

@@ -9,6 +9,7 @@ from conftest import twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.laws.compliance import Material, stiffness
 from cathsim_dmc.laws.contact import COMPLIANT
@@ -41,6 +42,41 @@ def run(task, count, threads):
     steps = [(batch.step(action), batch.batch.qpos.copy()) for _ in range(STEPS)]
     velocities = [step.observation["blood_velocity"] for step, _ in steps]
     return np.array([qpos for _, qpos in steps]), np.array(velocities)
+
+
+def line(start, end, wide, narrow):
+    """A straight centreline that narrows, from a place to another."""
+    share = np.linspace(0.0, 1.0, 41)[:, None]
+    radii = wide + share[:, 0] * (narrow - wide)
+    return Centreline(start + share * np.subtract(end, start), radii)
+
+
+@pytest.mark.parametrize("against", [False, True])
+def test_blood_comes_to_a_place_by_the_way_from_the_heart(against):
+    """Vessels at right angles; the aorta's points run with the blood or against it."""
+    aorta = line([0, 0, 0], [0, 0, 0.2], 12e-3, 9e-3)
+    if against:
+        aorta = Centreline(aorta.points[::-1], aorta.radii[::-1])
+    arm = line([0, 0, 0.08], [0.1, 0, 0.08], 5e-3, 4e-3)
+    thin = line([0.04, 0, 0.08], [0.04, 0.06, 0.08], 3e-3, 2e-3)
+    vessels = Vessel("aorta", aorta), Vessel("arm", arm, "aorta", 11e-3)
+    tree = VesselTree(
+        {one.name: one for one in (*vessels, Vessel("thin", thin, "arm", 5e-3))}
+    )
+    blood = Circulation.of(tree)
+    np.testing.assert_allclose(blood.ways, np.abs(blood.ends).sum(axis=-1), atol=1e-9)
+    assert blood.radius == pytest.approx(12e-3)
+    # By Murray's law the ends divide the blood as the cubes of 9, 4 and 2 mm do.
+    cubes, x, z = 9**3 + 4**3 + 2**3, blood.ends[:, 0, 0], blood.ends[:, 0, 2]
+    wanted = np.select(
+        [blood.vessel == 2, blood.vessel == 1, z < 0.079],
+        [2**3, 4**3 + 2**3 * (x < 0.039), cubes], 9**3,
+    )  # fmt: skip
+    sign = np.where((blood.vessel == 0) & against, -1.0, 1.0)
+    near = np.abs(blood.ends.mean(axis=1)[:, [0, 2]] - [0.04, 0.08]) < 3.1e-3
+    clear = ~(near[:, 0] & (blood.vessel == 1) | near[:, 1] & (blood.vessel == 0))
+    found = (sign * blood.shares.mean(axis=1))[clear]
+    np.testing.assert_allclose(found, wanted[clear] / cubes, rtol=1e-9)
 
 
 def test_flow_is_alike_in_both_paths_and_on_any_threads(living):

@@ -7,16 +7,17 @@ import sys
 import numpy as np
 import pytest
 from PIL import Image
-from recording_samples import make_tube, same
+from recording_samples import make_episode, make_tube, same
 
 import cathsim_dmc
 from cathsim_dmc import agents, suite
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.forces import PEAK_NOTE
-from cathsim_dmc.pictures import curves, recorded
-from cathsim_dmc.pictures.anatomies import Picture
+from cathsim_dmc.pictures import animation, curves, recorded
+from cathsim_dmc.pictures.anatomies import Picture, draw_anatomy
 from cathsim_dmc.pictures.animation import animate
 from cathsim_dmc.pictures.figure import draw_fluoroscopy, scene_figure
 from cathsim_dmc.pictures.moment import Moment, on_screen, xray
@@ -53,6 +54,10 @@ def test_forces_are_those_of_the_task(pushed):
     assert len(readout) == last.sum() > 0
     assert readout.wall_sum == episode.wall_force_sum[-1]
     assert readout.push_force == episode.push_force[-1]
+    assert readout.push_torque == env.task.readings.push_torque != readout.push_force
+    np.testing.assert_array_equal(readout.load_cell, env.task.readings.load_cell)
+    # What bears a force is pressed in.
+    assert (readout.penetration > 0.0).all() and readout.penetration.max() < 1e-3
     text = repr(readout)
     assert f"{1e3 * readout.wall_max:.2f} mN" in text
     assert f"{1e3 * readout.wall_mean_sum:.2f}" in text
@@ -91,9 +96,25 @@ def test_an_episode_is_plotted_over_time(pushed):
     np.testing.assert_allclose(
         bottom.lines[0].get_ydata(), 1e3 * np.array(episode.meta["distance"])
     )
+    np.testing.assert_allclose(bottom.lines[1].get_ydata(), 8.0)  # radius of the goal
     assert TASK in figure.get_suptitle() and "truncated" in figure.get_suptitle()
     with pytest.raises(TypeError, match="Episode.load.*str"):
         cathsim_dmc.plot("episode.npz")
+
+
+def test_each_of_coaxial_devices_has_its_curve():
+    ends = np.linspace([0.1, 0.08], [0.12, 0.09], 7)
+    series = {"rotation": [0.0] * 7, "tip_rotation": [0.0] * 7, "radius": 1e-3}
+    devices = [
+        {"name": name, "insertion": way.tolist(), **series}
+        for name, way in zip(("wire", "catheter"), ends.T, strict=True)
+    ]
+    episode = make_episode()
+    meta = {**episode.meta, "devices": devices}
+    _, axes, _ = cathsim_dmc.plot(dataclasses.replace(episode, meta=meta)).axes
+    assert [line.get_label() for line in axes.lines] == ["wire", "catheter"]
+    found = [line.get_ydata() for line in axes.lines]
+    np.testing.assert_allclose(found, 1e3 * ends.T)
 
 
 def test_phases_are_what_the_base_does(pushed):
@@ -387,6 +408,16 @@ def test_a_function_of_the_observation_is_recorded(pushed, tmp_path, suffix):
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
+def test_a_seed_is_that_of_a_random_policy_too(pushed):
+    env, _ = pushed
+    first, again, other = (
+        cathsim_dmc.record(env, "random", seed=seed, max_steps=2).action
+        for seed in (3, 3, 4)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).all()
+
+
 def test_the_frames_of_a_film_differ_where_the_device_moves(pushed, tmp_path):
     env, episode = pushed
     surface = env.task.scene.anatomy.surface
@@ -397,6 +428,52 @@ def test_the_frames_of_a_film_differ_where_the_device_moves(pushed, tmp_path):
         frames.append(np.asarray(film.convert("RGB"), dtype=int))
     assert film.info["duration"] > 1000  # the last one stays
     assert np.abs(frames[0] - frames[-1]).max() > 100
+
+
+def test_a_short_film_takes_two_seconds_and_a_rest(tmp_path, monkeypatch):
+    def frames(episode, surface, width, steps):
+        return (np.full((64, 64, 3), 50 * number, np.uint8) for number in steps)
+
+    monkeypatch.setattr(animation, "_frames", frames)
+    film = Image.open(animate(make_episode(4), make_tube(), tmp_path / "a.gif"))
+    times = []
+    for number in range(film.n_frames):
+        film.seek(number)
+        times.append(film.info["duration"])
+    assert sum(times[:-1]) == 4 * 400 and times[-1] == 1500  # equal ones are one
+
+
+def test_the_contacts_of_a_state_are_those_of_the_step_that_leads_to_it():
+    counts = np.array([2, 0, 3])
+    meta = {"goal_position": [0.0, 0.0, 0.0], "goal_radius": 8e-3}
+    episode = make_episode(3, counts=counts)
+    episode = dataclasses.replace(episode, meta=episode.meta | meta)
+    for state, rows in enumerate(([], [0, 1], [], [2, 3, 4])):
+        moment = Moment.of_episode(episode, make_tube(), state)
+        np.testing.assert_array_equal(moment.position, episode.contact_position[rows])
+        np.testing.assert_array_equal(moment.force, episode.contact_force[rows])
+        np.testing.assert_array_equal(moment.device, episode.catheter[state])
+        assert len(moment.path) == state + 1
+
+
+def test_the_cursor_of_a_film_stands_at_the_time_of_the_state(pushed, monkeypatch):
+    env, episode = pushed
+    drawn, draw = [], animation._draw_force
+
+    def kept(axes, episode):
+        drawn.append((axes, draw(axes, episode)))
+        return drawn[-1][1]
+
+    monkeypatch.setattr(animation, "_draw_force", kept)
+    steps = np.array([0, episode.steps // 2, episode.steps])
+    surface, places = env.task.scene.anatomy.surface, []
+    for _ in animation._frames(episode, surface, 200, steps):
+        places.append(drawn[0][1].get_xdata()[0])
+    np.testing.assert_allclose(places, 0.04 * steps)
+    time, force = drawn[0][0].lines[0].get_data()
+    np.testing.assert_allclose(time, 0.04 * np.arange(1, episode.steps + 1))
+    largest = np.array(episode.meta["wall_force_mean_max"])
+    np.testing.assert_allclose(force, 1e3 * largest)
 
 
 @pytest.mark.parametrize(
@@ -462,6 +539,56 @@ def test_tasks_and_anatomies_say_what_they_are(pushed):
     assert len(repr(anatomy)) < 300
     for text in ("simple1", "bca, lcca", "inlet in aorta"):
         assert text in repr(anatomy)
+
+
+def test_a_figure_shows_forces_along_themselves_and_tells_them(pushed):
+    moment = Moment.of(pushed[0])
+    moment = dataclasses.replace(
+        moment,
+        position=moment.device[[5, 9]] + [0.0, 0.01, 0.0],
+        force=np.array([[0.03, 0.01, 0.04], [-0.1, 0.0, 0.05]]), force_scale=0.2,
+    )  # fmt: skip
+    figure = scene_figure(moment, views=("front",), fluoroscopy=False, pixels=200)
+    axes, bar = figure.axes
+    goal, arrows = axes.patches[0], next(c for c in axes.collections if hasattr(c, "U"))
+    assert goal.radius == pytest.approx(1e3 * moment.goal_radius)
+    # From the front, x is to the right and z up; the largest is 22 mm long in space.
+    way = 1e3 * (moment.position - moment.goal)[:, [0, 2]]
+    np.testing.assert_allclose(arrows.XY - goal.center, way, atol=1e-6)
+    wanted = moment.force[:, [0, 2]] * 22 / np.linalg.norm(moment.force[1])
+    np.testing.assert_allclose(np.column_stack([arrows.U, arrows.V]), wanted)
+    assert bar.get_ylim() == (0.0, 200.0) and "mN" in bar.get_ylabel()
+    sizes = np.linalg.norm(moment.force, axis=1)
+    told = f"2 contacts, {force_text(sizes.sum())} in all, {force_text(sizes[1])} the"
+    assert told in figure.get_suptitle()
+
+
+def test_the_ring_in_the_fluoroscopy_has_the_size_of_the_goal(pushed):
+    moment, axes = Moment.of(pushed[0]), Picture().add_subplot()
+    own = on_screen(moment.x_ray.options)
+    draw_fluoroscopy(axes, moment)
+    (arm,) = own.carms(moment.rest.vertices)
+    ends = moment.goal + moment.goal_radius * np.array([-arm.axes[0], arm.axes[0]])
+    left, right = arm.project(ends)[0]
+    ring = axes.patches[0]
+    np.testing.assert_allclose(ring.center, (left + right) / 2)
+    assert 2 * ring.radius == pytest.approx(right[0] - left[0])
+
+
+@pytest.mark.parametrize(("view", "plane"), [("front", (0, 2)), ("left", (1, 2))])
+def test_the_arrow_at_the_inlet_points_into_the_lumen(view, plane):
+    anatomy, axes = phantoms.load("type1", access="descending"), Picture().add_subplot()
+    draw_anatomy(axes, anatomy, view)
+    arrow = next(text for text in axes.texts if text.arrow_patch is not None)
+    way = np.subtract(arrow.xy, arrow.xyann)
+    np.testing.assert_allclose(way, 30 * anatomy.inlet.direction[[*plane]], atol=1e-6)
+    rings = {tuple(np.round(ring.center, 6)) for ring in axes.patches if not ring.fill}
+    goals = {
+        tuple(np.round(line.get_xydata()[0], 6))
+        for line in axes.lines
+        if line.get_marker() == "."
+    }
+    assert goals <= rings and len(goals) == len(anatomy.goals)
 
 
 def test_contacts_without_force_are_drawn(pushed, recwarn):

@@ -1,6 +1,7 @@
 """Playing by hand, with the keys of a screen that is not there."""
 
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -50,6 +51,25 @@ def test_whatever_is_pressed_the_action_is_one(keys):
         np.testing.assert_array_equal(action, action.astype(np.float32))
 
 
+@pytest.mark.parametrize("kind", [{"tip_joints": 2, "rotation": True}, {"devices": 2}])
+def test_opposite_keys_do_the_opposite(kind):
+    for one, other in (("w", "s"), ("a", "d"), ("Up", "Down"), ("Left", "Right")):
+        found = []
+        for key in (one, other):
+            hands = Controls(**kind)
+            hands.press(key)
+            found.append(hands.action(STEP))
+        np.testing.assert_array_equal(found[0], -found[1])
+        assert found[0].any()
+
+
+def test_both_hands_move_a_single_device():
+    for key, wanted in {"Up": [1, 0], "w": [1, 0], "a": [0, 1], "Left": [0, 1]}.items():
+        hands = Controls(devices=1)
+        hands.press(key)
+        np.testing.assert_array_equal(hands.action(STEP), wanted)
+
+
 def test_a_person_steers_in_the_fluoroscopy_window(monkeypatch, tmp_path):
     keys = [
         *held("w", 2, 10),
@@ -94,6 +114,55 @@ def test_a_bar_shows_the_largest_contact(
     shown.show(env.task)
     length, drawn = screen.bars[-1]
     assert length == pytest.approx(share * (window._PANEL - 28)) and drawn == colour
+
+
+def test_the_panel_says_what_is_measured():
+    force = WallForce(0.9, 0.8, 0.7, 0.6, mean_sum=0.5, mean_max=0.4)
+    readings = types.SimpleNamespace(
+        centreline=np.zeros((3, 3)), head=np.array([0.0, 0.03, 0.04]),
+        insertion=0.012, push_force=-0.25,
+    )  # fmt: skip
+    task = types.SimpleNamespace(
+        readings=readings, wall_force=force, devices=None, goal_position=np.zeros(3),
+        scene=types.SimpleNamespace(goal=types.SimpleNamespace(name="bca")),
+        config=types.SimpleNamespace(physics_timestep=2e-3),
+    )  # fmt: skip
+    lines = {name: text.strip() for name, text in window.lines_of(task)}
+    assert lines == {
+        "goal": "bca", "distance": "50.0 mm", "inserted": "12.0 mm",
+        "push force": "-0.250 N", "wall force, sum": "0.500 N",
+        "largest contact": "0.400 N", "peak of 2 ms steps": "0.600 N",
+    }  # fmt: skip
+
+
+def test_the_goal_is_a_ring_of_its_size_in_both_planes(monkeypatch, shared_environment):
+    class Wide(Screen):
+        rings = []
+
+        def _canvas(self, *_, **options):
+            canvas = super()._canvas(**options)
+            canvas.create_oval = lambda box, **_: self.rings.append(box)
+            return canvas
+
+        def _picture(self, *, data, **_):
+            assert data.startswith(b"P5 1024 512 255 ")
+
+    monkeypatch.setitem(sys.modules, "tkinter", Wide([]))
+    view = {"view": (30, 0), "biplane": (-60, 0), "size": 64}
+    env = shared_environment("simple1_bca", fluoroscopy=view)
+    env.reset()
+    shown, goal = (
+        window.FluoroscopyWindow(env.task, Controls(10)),
+        env.task.goal_position,
+    )
+    shown.show(env.task)
+    for number, (ring, plane) in enumerate(zip(Wide.rings, shown._planes, strict=True)):
+        arm, radius = plane.carm, env.task.objective.goal_radius
+        places = goal + radius * np.array([-arm.axes[0], -arm.axes[1], *arm.axes[:2]])
+        (left, _), (_, top), (right, _), (_, bottom) = arm.project(places)[0]
+        beside = 512 * number
+        wanted = left + beside, top, right + beside, bottom
+        np.testing.assert_allclose(ring, wanted, atol=1e-6)
 
 
 def test_a_policy_is_watched_in_the_vessel_of_its_training(cathsim, monkeypatch):

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from test_play import STEP
 from test_play_coaxial import Screen, held
 
+from cathsim_dmc.physics.forces import WallForce
 from cathsim_dmc.play import hands, play, session, window
 from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.tasks.navigation import Navigation
 
 _AXES = {"leftx": 0, "lefty": 1, "rightx": 2, "righty": 3, "out": 4, "in": 5}
 _FULL = 32767
@@ -217,6 +220,20 @@ def test_a_spacemouse_does_what_the_keys_do(monkeypatch):
     assert hand._mouse.closed
 
 
+@pytest.mark.parametrize(
+    ("axis", "place", "motor"), [("roll", (0, -1), 0), ("pitch", (1, 0), 1)]
+)
+def test_a_tilt_towards_you_is_up_and_one_to_the_right_is_right(
+    monkeypatch, axis, place, motor
+):
+    """Turns are right-handed: about x (to the right), and about y (away from you)."""
+    turn = Rotation.from_rotvec(np.eye(3)[["roll", "pitch"].index(axis)] * 0.1)
+    np.testing.assert_array_equal(np.sign(turn.apply([0, 0, 1.0])[:2]), place)
+    mouse(monkeypatch, [{axis: 1.0}])
+    _, action = acted(hands.hand("spacemouse"), tip_joints=1, rotation=True)
+    np.testing.assert_allclose(action, STEP * np.eye(4)[motor], rtol=1e-6)
+
+
 def test_a_spacemouse_that_cannot_be_read_is_said(monkeypatch, cathsim):
     module = mouse(monkeypatch, [])
 
@@ -248,10 +265,13 @@ def test_an_episode_by_hand_is_recorded_and_felt(monkeypatch, tmp_path):
     screen = Screen([(20, "KeyPress", "Escape"), *held("Right", 2, 6)])
     monkeypatch.setitem(sys.modules, "tkinter", screen)
     monkeypatch.setattr(window, "_REPEAT", 0.0)
+    force = WallForce(0.9, 0.8, 0.7, 0.6, mean_sum=0.5, mean_max=0.4)
+    monkeypatch.setattr(Navigation, "wall_force", property(lambda _: force))
     (path,) = play("simple1_bca", tmp_path, speed=1e3, hands="gamepad")
     episode = Episode.load(path)
     assert (episode.action[1:, 20] == 0.5).all() and episode.action[-1, 1] > 0.0
     assert len(pusher.felt) >= episode.steps and pusher.closed
+    assert set(pusher.felt) == {0.4}
     assert "it pushes" in screen.said[0]
     with pytest.raises(ValueError, match="hands is 'feet'"):
         play("simple1_bca", hands="feet")
@@ -313,6 +333,18 @@ def test_episodes_of_a_hand_are_demonstrations(by_hand, tmp_path, cathsim, monke
         "--out", tmp_path / "run",
     )  # fmt: skip
     assert code == 0 and (tmp_path / "run" / "checkpoints").is_dir()
+
+
+def test_an_episode_is_repeated_with_the_end_that_it_had(by_hand):
+    """One reaches its goal, and its operator has stopped the other."""
+    from cathsim_dmc.recording.dataset import repeat_episodes
+
+    won, stopped = repeat_episodes(by_hand, "tracking")
+    steps = len(won.actions)
+    assert won.terminations == [False] * (steps - 1) + [True]
+    assert won.truncations == [False] * steps
+    assert stopped.terminations == [False] * 3
+    assert stopped.truncations == [False, False, True]
 
 
 def test_an_episode_that_leads_elsewhere_is_refused(by_hand, tmp_path):

@@ -32,6 +32,9 @@ def test_the_record_has_both_devices(recorded):
     episode, seen = recorded
     coaxial = CoaxialRecord.of(episode)
     assert coaxial.names == ("guidewire", "catheter")
+    # A wire of 0.035 inches in a catheter of 5 French, thirds of a millimetre.
+    wide = np.array([0.035 * 25.4e-3, 5e-3 / 3]) / 2
+    np.testing.assert_allclose(coaxial.radii, wide, rtol=0.02)
     assert coaxial.insertion.shape == (STEPS + 1, 2)
     for name in ("insertion", "rotation", "tip_rotation"):
         expected = [getattr(state, name) for state in seen]
@@ -61,6 +64,17 @@ def test_a_link_looks_like_what_is_outermost_in_its_middle():
     ends = np.array([[0.1, 0.086], [0.1, 0.084]])  # 14 and 16 mm of wire stand out
     record = CoaxialRecord(("wire", "catheter"), np.ones(2), ends, turns, turns)
     assert record.outermost(line).tolist() == [[1, 1, 1, 0], [1, 1, 0, 0]]
+
+
+def test_the_device_that_leads_has_no_gap_whichever_it_is():
+    """Ends lie on the chain, which is as long as the leading device."""
+    turns, line = np.zeros((3, 2)), np.zeros((3, 5, 3))
+    line[..., 2] = np.arange(5) * 10e-3
+    ends = np.array([[0.10, 0.09], [0.10, 0.10], [0.10, 0.115]])
+    record = CoaxialRecord(("wire", "catheter"), np.ones(2), ends, turns, turns)
+    np.testing.assert_allclose(record.gaps, [[0, 0.01], [0, 0], [0.015, 0]])
+    height = record.ends(line)[..., 2]
+    np.testing.assert_allclose(height, 0.04 - record.gaps)
 
 
 def test_the_rerun_file_has_both(recorded, tmp_path):

@@ -28,6 +28,13 @@ def test_save_and_load_return_the_same_bits(
     assert loaded.contact_counts.sum() == len(loaded.contact_step)
 
 
+def test_a_record_has_the_radii_of_its_links_or_those_of_a_5f_catheter():
+    meta = {**make_episode().meta, "catheter_radius": [1e-3, 1e-3, 1e-3, 0.4e-3]}
+    assert make_episode(meta=meta).radii.tolist() == meta["catheter_radius"]
+    # Five French are five thirds of a millimetre.
+    np.testing.assert_allclose(make_episode().radii, 5e-3 / 6, rtol=0.01)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [

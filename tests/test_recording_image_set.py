@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.imaging.carm import SOURCE_ISOCENTRE
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.thickness import surface_thickness
 from cathsim_dmc.recording import coco, image_set, sequences
@@ -17,6 +18,7 @@ from cathsim_dmc.tasks.step import Step
 OPTIONS = ImageSetOptions(
     sequences=2, frames=2, views=2, stride=4, size=128, anatomies=(1, 0, 0)
 )
+RANGES = sequences.PRIMARY, sequences.SECONDARY
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +77,48 @@ def test_keypoints_are_where_the_camera_matrix_puts_them_and_on_their_masks(rows
     assert tips.min(axis=1).max() < 1e-6
 
 
+def test_every_row_says_its_time_its_motion_and_its_angles(rows):
+    """Two motions, each of two frames a sixth of a second apart, before two C-arms."""
+    np.testing.assert_allclose(rows["time"], 4 * [0.16, 0.32])
+    assert rows["motion"].tolist() == 4 * [0] + 4 * [1]
+    assert rows["sequence"].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    x, y, z = rows["camera_matrix"][:, 2, :3].T  # from source to detector
+    angles = np.rad2deg([np.arctan2(x, -y), np.arcsin(z)]).T
+    np.testing.assert_allclose(rows["angles"], angles, atol=1e-4)
+    for low, high, found in zip(*np.array(RANGES).T, angles.T, strict=True):
+        assert np.ptp(found) > 1.0 and low <= found.min() <= found.max() <= high
+    force, torque = np.abs(rows["push_force"]).max(axis=0)
+    assert 1e-3 < force < 5.0 and torque < 0.05 * force  # N, N m
+
+
+def test_the_isocentre_lies_between_the_middle_of_the_lumen_and_the_tip(arch, rows):
+    """The tip in the second of two frames."""
+    matrix = rows["camera_matrix"]
+    source = -np.linalg.solve(matrix[..., :3], matrix[..., 3:])[..., 0]
+    isocentre = source + SOURCE_ISOCENTRE * matrix[:, 2, :3]
+    middle = np.mean(arch.lumen.box, axis=0)
+    way = np.repeat(rows["keypoints_3d"][1::2, 0], 2, axis=0) - middle
+    share = np.vecdot(isocentre - middle, way) / np.vecdot(way, way)
+    assert share.min() > 0.0 and share.max() < 1.0
+    np.testing.assert_allclose(isocentre, middle + share[:, None] * way, atol=1e-6)
+
+
+@pytest.mark.parametrize("iodine", [0.0, 8.0])
+def test_ostia_are_seen_in_contrast_alone(arch, iodine):
+    camera = sequences.Camera(arch, 64, np.zeros(3), np.random.RandomState(0))
+    camera.iodine = iodine
+    places = np.zeros((2, len(sequences.KEYPOINTS), 3)) + camera.arm.isocentre
+    places[1, 1], places[1, -1] = np.nan, 1.0
+    state = camera.seen(places)[..., 2]
+    ostium = sequences.SEEN if iodine else sequences.UNSEEN
+    assert (state[:, 0] == sequences.SEEN).all() and (state[0, 4:] == ostium).all()
+    assert state[1, 1] == state[1, -1] == sequences.ABSENT
+    shown = camera.before(arch)
+    assert (shown.contrast, shown.kerma, shown.gain) == (
+        iodine, camera.kerma, camera.gain
+    )  # fmt: skip
+
+
 def test_the_mask_is_where_the_device_changes_the_image(arch, states):
     random = np.random.RandomState(0)
     camera = sequences.Camera(arch, 128, states.shadows[0].points[0, 0, -1], random)
@@ -122,6 +166,20 @@ def test_a_device_whose_motions_all_fail_is_one_that_does_not_fit(arch, monkeypa
         sequences.simulate(arch, "bca", "glide", OPTIONS, [1])
 
 
+def test_a_motion_that_fails_once_is_left_out(arch, monkeypatch):
+    def fails(step):
+        calls.append(step)
+        return np.array([len(calls) == 1, False])
+
+    calls = []
+    monkeypatch.setattr(Step, "physics_error", property(fails))
+    options = dataclasses.replace(OPTIONS, stride=1)
+    states = sequences.simulate(arch, "bca", "glide_in_berenstein", options, [1])
+    assert states.kept.tolist() == [1] and len(calls) == 2
+    clip = next(sequences.frames_of(arch, states, options, [2]))
+    assert clip["motion"].tolist() == [1, 1]
+
+
 def test_a_vessel_that_moves_takes_its_mask_and_its_ostia_along(arch):
     options = dataclasses.replace(OPTIONS, vessel="living", views=1, frames=3, stride=6)
     states = sequences.simulate(arch, "bca", "steerable_5f", options, [3])
@@ -167,6 +225,16 @@ def test_labels_are_those_of_coco(path, rows):
         np.testing.assert_array_equal(decoded(mask.shape, text), mask)
         names = coco.CATEGORIES[one["category_id"] - 1]["keypoints"]
         assert len(one["keypoints"]) == 3 * len(names)
+        known = [state for state in one["keypoints"][2::3] if state > 0]
+        assert one["num_keypoints"] == len(known)
+
+
+def test_each_image_of_coco_has_its_camera_and_its_sequence(path, rows):
+    images = coco.labels(path, 0)["images"]
+    found = [image["camera_matrix"] for image in images]
+    np.testing.assert_allclose(found, rows["camera_matrix"], atol=1e-6)
+    assert [image["sequence"] for image in images] == rows["sequence"].tolist()
+    assert [image["row"] for image in images] == list(range(len(images)))
 
 
 def test_no_anatomy_is_in_two_splits(tmp_path):
@@ -177,6 +245,35 @@ def test_no_anatomy_is_in_two_splits(tmp_path):
         for other, those in sets[:number]:
             assert kind != other or not chosen & those
     assert len(shards) == 150
+
+
+def test_each_anatomy_has_draws_of_its_own_which_its_file_tells(tmp_path, monkeypatch):
+    simulated, written = [], []
+
+    def simulate(anatomy, goal, kit, options, seed):
+        simulated.append((anatomy, goal, kit, tuple(seed)))
+
+    def write(path, anatomy, states, options, seed, **about):
+        written.append((anatomy, about, tuple(seed)))
+        return 8
+
+    monkeypatch.setattr(sequences, "simulate", simulate)
+    monkeypatch.setattr(sequences, "write", write)
+    options = dataclasses.replace(OPTIONS, anatomies=(4, 2, 0))
+    for shard in image_set._shards(tmp_path, options):
+        image_set._simulate_shard(shard)
+    for (anatomy, goal, kit, _), (same, about, _) in zip(
+        simulated, written, strict=True
+    ):
+        assert anatomy is same and about["name"] == anatomy.name
+        assert (about["goal"], about["devices"]) == (goal, kit)
+        assert goal in anatomy.goals and goal != "descending"
+        first = anatomy.tree.root.centreline.points[0]
+        entered = np.allclose(anatomy.inlet.position, first, atol=1e-9)
+        assert about["access"] == ("ascending" if entered else "descending")
+    seeds = [row[-1] for row in (*simulated, *written)]
+    assert len(set(seeds)) == len(seeds) == 12
+    assert {about["access"] for _, about, _ in written} == {"ascending", "descending"}
 
 
 def test_a_set_is_resumed_and_refused_where_it_must_be(tmp_path, monkeypatch, path):

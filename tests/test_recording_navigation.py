@@ -10,6 +10,7 @@ from test_own_objective import advancing
 from cathsim_dmc import suite
 from cathsim_dmc.analysis.force_statistics import recorded_forces
 from cathsim_dmc.anatomy.arch.arch import ARCHES, build_arch
+from cathsim_dmc.recording import recorder
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.recording.rerun_log import write_rrd
@@ -32,8 +33,8 @@ def bend_and_push(timestep):
 
 @pytest.fixture(scope="module")
 def episode(env):
-    recorder = EpisodeRecorder(env, "navigate", {"goal": "bca"})
-    return recorder.record_episode(bend_and_push, seed=2, max_steps=STEPS)
+    made = EpisodeRecorder(env, "navigate", {"goal": "bca"})
+    return made.record_episode(bend_and_push, seed=2, max_steps=STEPS)
 
 
 def test_contacts_make_up_the_forces_of_the_task(env, episode):
@@ -84,9 +85,18 @@ def test_the_record_follows_the_simulation(env, episode):
     assert meta["versions"]["mujoco"] == mujoco.__version__
     radius = env.task.scene.catheter.device.outer_radius
     np.testing.assert_allclose(meta["catheter_radius"], radius)
+    assert meta["goal_radius"] == 8e-3
+    np.testing.assert_array_equal(meta["goal_position"], env.task.goal_position)
     assert set(meta["reward_terms"]) == set(env.task.objective.weights)
     link = meta["body_names"].index("catheter/link_2")
     np.testing.assert_array_equal(episode.catheter[:, 2], episode.body_pos[:, link])
+
+
+def test_sides_of_the_patient_are_told_where_they_are_known(env, monkeypatch):
+    here = env.task.scene.anatomy
+    assert EpisodeRecorder(env).present().meta["upright"] is True  # a phantom
+    monkeypatch.setattr(recorder, "is_upright", lambda anatomy: anatomy is not here)
+    assert EpisodeRecorder(env).present().meta["upright"] is False
 
 
 def test_a_seed_repeats_the_episode(env, episode):

@@ -15,11 +15,11 @@ from cathsim_dmc.pictures.moment import Moment
 from cathsim_dmc.pictures.recorded import xray_film
 from cathsim_dmc.recording import rerun_text
 from cathsim_dmc.recording.episode import TERMINATIONS, Episode
-from cathsim_dmc.recording.geometry import force_text
+from cathsim_dmc.recording.geometry import force_colours, force_text
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.recording.records import VesselRecord
 from cathsim_dmc.recording.rerun_log import write_rrd
-from cathsim_dmc.recording.rerun_scene import BodyGeom, arrow_scale
+from cathsim_dmc.recording.rerun_scene import BodyGeom, arrow_scale, link_colours
 
 STEPS = 6
 GOAL = (0.01, 0.0, 0.03)
@@ -169,6 +169,90 @@ def test_series_hold_the_values_of_the_episode(written):
     np.testing.assert_allclose(scalars("distance_mm")[:, 0], away)
 
 
+@pytest.fixture(scope="module")
+def coaxial(tmp_path_factory):
+    """An episode of a wire and the catheter that takes the lead, in flowing blood."""
+    path, rng = tmp_path_factory.mktemp("rrd") / "pair.rrd", np.random.default_rng(1)
+    line = np.zeros((STEPS + 1, 5, 3))
+    line[..., 2], turns = 0.01 * np.arange(5), ("rotation", "tip_rotation")
+    devices = [
+        {
+            "name": name,
+            "radius": radius,
+            "insertion": np.linspace(*ends, STEPS + 1),
+            **{kind: rng.normal(size=STEPS + 1) for kind in turns},
+        }
+        for name, radius, ends in (
+            ("wire", 0.4e-3, (0.12, 0.12)), ("catheter", 0.8e-3, (0.105, 0.125))
+        )
+    ]  # fmt: skip
+    names = "heart_phase", "breath_phase", "blood_speed", "indentation", "wall_work"
+    vessel = {name: rng.uniform(size=STEPS + 1) for name in names}
+    vessel["blood_velocity"], vessel["goal"] = rng.normal(size=(2, STEPS + 1, 3))
+    vessel |= {"lattice": [], "parameters": []}
+    means = {
+        f"wall_force_mean_{kind}": rng.uniform(size=STEPS) for kind in ("sum", "max")
+    }
+    episode = make_recorded()
+    meta = {**episode.meta, "devices": devices, "vessel": vessel, **means}
+    episode = dataclasses.replace(episode, catheter=line, meta=meta)
+    return episode, Recording(write_rrd(episode, make_tube(), path))
+
+
+def test_every_plot_is_in_its_unit(coaxial):
+    episode, recording = coaxial
+    meta, wanted = episode.meta, {}
+    for kind in ("sum", "max"):
+        at_the_end = getattr(episode, f"wall_force_{kind}")
+        wanted[f"force/wall_{kind}"] = 1e3 * at_the_end
+        mean = np.array(meta[f"wall_force_mean_{kind}"])
+        wanted[f"force/wall_mean_{kind}"] = 1e3 * mean
+    wanted["insertion_mm"] = 1e3 * episode.insertion
+    for one in meta["devices"]:
+        name = one["name"]
+        wanted[f"insertion_mm/{name}"] = 1e3 * np.array(one["insertion"])
+        wanted[f"rotation_deg/{name}"] = np.array(one["rotation"]) * 180 / np.pi
+        wanted[f"rotation_deg/{name}_end"] = np.array(one["tip_rotation"]) * 180 / np.pi
+    units = {"heart_phase": 1, "breath_phase": 1, "blood_speed": 1}  # m/s
+    units |= {"indentation": 1e3, "wall_work": 1e6}  # mm, µJ
+    for name, factor in units.items():
+        wanted[f"vessel/{name}"] = factor * np.array(meta["vessel"][name])
+    for entity, values in wanted.items():
+        found = np.array(recording.values(f"/series/{entity}", "Scalars:scalars"))
+        np.testing.assert_allclose(found[:, 0], values, rtol=1e-6, err_msg=entity)
+
+
+def test_blood_goal_and_devices_are_drawn_in_metres(coaxial):
+    episode, recording = coaxial
+    vessel = episode.meta["vessel"]
+    blood = recording.values("/world/blood", "Arrows3D:vectors")
+    # An arrow of 20 mm is a metre per second.
+    velocity = np.array(vessel["blood_velocity"])
+    np.testing.assert_allclose(np.array(blood)[:, 0], 0.02 * velocity, rtol=1e-5)
+    way = recording.values("/world/goal", "Transform3D:translation")
+    centre, size = (
+        np.array(recording.fixed("/world/goal", f"Ellipsoids3D:{name}")[0])
+        for name in ("centers", "half_sizes")
+    )
+    np.testing.assert_allclose(np.array(way)[:, 0] + centre, vessel["goal"], atol=1e-6)
+    np.testing.assert_allclose(size, episode.meta["goal_radius"])
+    radii = np.array(recording.values("/world/catheter", "Capsules3D:radii"))
+    # 15 mm of wire stand out at first, and none when the catheter has passed it.
+    np.testing.assert_allclose(radii[0], [0.8e-3, 0.8e-3, 0.8e-3, 0.4e-3], rtol=1e-5)
+    np.testing.assert_allclose(radii[-1], 0.8e-3, rtol=1e-5)
+
+
+def test_events_belong_to_the_states_that_they_lead_to():
+    far = np.array([0.1, 0.15, 0.07, 0.045, 0.03, 0.02, 0.05])
+    meta = {**make_episode().meta, "distance": far.tolist()}
+    counts = np.array([0, 0, 1, 0, 0, 0])
+    found = rerun_text.events(make_episode(STEPS, counts=counts, meta=meta))
+    rows = {text.split(",")[0]: row for row, text, _ in found}
+    assert rows["contact with the wall"] == rows["largest force"] == 3
+    assert rows["half of the distance to the goal"] == 3
+    assert rows["nearest to the goal"] == 5 and rows["end: success"] == STEPS
+
+
 def test_text_says_what_happens_when(written):
     episode, _, _, recording = written
     texts = [text[0] for text in recording.values("/events", "TextLog:text")]
@@ -216,6 +300,21 @@ def test_links_take_the_colour_of_what_they_press(written):
     assert (colours[0] == plain).all()  # nothing is known of the start
     touched = (colours != plain).any(axis=1)[1:]
     assert touched.tolist() == [bool(n) for n in episode.contact_counts]
+
+
+def test_the_link_next_to_a_contact_takes_its_colour():
+    line = np.zeros((3, 5, 3))
+    line[..., 2] = 0.01 * np.arange(5)
+    episode = make_episode(2, counts=np.array([2, 0]), catheter=line)
+    places = np.array([[1e-3, 0, 0.016], [1e-3, 0, 0.034]])
+    force = np.array([[0.04, 0, 0], [0, 0.01, 0]])
+    episode = dataclasses.replace(episode, contact_position=places, contact_force=force)
+    plain = np.full((3, 4, 3), 7, np.uint8)
+    found = link_colours(episode, plain)
+    # The scale ends at 50 mN, the least of its tops that holds both.
+    hot = force_colours(np.array([0.04, 0.01]), 0.05)
+    np.testing.assert_array_equal(found[1], [plain[0, 0], hot[0], plain[0, 0], hot[1]])
+    np.testing.assert_array_equal(found[[0, 2]], plain[:2])
 
 
 def test_bodies_carry_their_geoms(written):

@@ -84,6 +84,25 @@ def test_time_truncates_and_does_not_terminate():
         env.step(env.action_space.sample())
 
 
+def test_an_episode_that_had_ended_waits_for_a_reset_when_it_is_restored():
+    single = CathSimEnv("simple1_bca", max_steps=2)
+    many = CathSimVectorEnv(
+        2, "simple1_bca", num_threads=1, max_steps=2, autoreset_mode="Disabled"
+    )
+    for env in (single, many):
+        env.reset(seed=1)
+        env.step(env.action_space.sample())
+        running = env.snapshot()
+        assert np.all(env.step(env.action_space.sample())[3])
+        ended = env.snapshot()
+        env.reset()
+        env.restore(ended)
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.step(env.action_space.sample())
+        env.restore(running)
+        assert np.all(env.step(env.action_space.sample())[3])
+
+
 def _everywhere(objective):
     import dataclasses
 
@@ -97,6 +116,7 @@ def test_render_shows_the_image_of_the_episodes_machine():
     env = gymnasium.make(TASK, render_mode="rgb_array", **options)
     image = env.reset(seed=3)[0]["image"]
     np.testing.assert_array_equal(env.render(), np.repeat(image, 3, axis=-1))
+    assert env.metadata["render_fps"] == 25  # a control step takes 40 ms
 
 
 @pytest.mark.slow

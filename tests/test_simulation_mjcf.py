@@ -75,16 +75,24 @@ def test_what_success_is_stands_beside_the_scene(exported):
     np.testing.assert_array_equal(task["goal"]["position"], objective.goal)
     np.testing.assert_array_equal(task["branch"]["points"], objective.branch.points)
     assert task["branch"]["ostium"] == objective.ostium
+    # A steerable device of 5 French, thirds of a millimetre.
+    assert task["device_radius"] == pytest.approx(5e-3 / 6, rel=0.02)
+    assert 2 * task["tip_joints"] + 1 == len(task["actuators"]) == 21
+    assert task["max_steps"] == suite.make_task(TASK).config.max_steps
     assert task["substeps"] * 0.004 == pytest.approx(task["control_timestep"])
 
 
 @pytest.mark.slow
 def test_a_pair_is_written_as_its_chain_stands(tmp_path, cathsim):
     task, out = "simple1_lcca_pair", tmp_path / "pair"
-    code, told, _ = cathsim("export", task, "--out", out, "--seed", "2")
+    drawn = {"friction": [0.2, 0.2]}  # 0.037 otherwise
+    code, told, _ = cathsim(
+        *("export", task, "--out", out, "--seed", "2"),
+        *("--randomisation", json.dumps(drawn)),
+    )
     assert not code and told.strip() == str(out)
     model = mujoco.MjModel.from_xml_path(str(out / "scene.xml"))
-    bore = {"random": 2, "sheath_clearance": CLEARANCE}
+    bore = {"random": 2, "sheath_clearance": CLEARANCE, "randomisation": drawn}
     env = suite.load("cathsim", task, bore)
     env.reset()
     own, chain = env.physics.model.ptr, env.task.scene.catheter

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from conftest import SHORT_EPISODE
+from conftest import SHORT_EPISODE, twin
 from torchrl.envs import DMControlEnv
 from torchrl.envs.utils import check_env_specs
 
 from cathsim_dmc import suite
+from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.simulation.torchrl import BatchedEnv
 
 ENVS = 3
@@ -68,6 +69,22 @@ def test_batched_env(batched):
         assert info[name].shape == (ENVS, 1) and info[name].dtype == torch.float32
     for name in ("success", "physics_error"):
         assert info[name].dtype == torch.bool
+
+
+def test_figures_have_their_names(batched):
+    task = twin(batched.simulation.task)
+    simulation = BatchSimulation(task, ENVS, num_threads=1, seeds=4)
+    batched.set_seed(4)
+    state, own = batched.reset(), simulation.reset()
+    action = torch.zeros(ENVS, 21)
+    action[:, -1] = 1.0
+    for _ in range(3):
+        state = batched.step(state.set("action", action))["next"]
+        own = simulation.step(action.numpy())
+    for name, values in own.info().items():
+        found = state["info", name][:, 0].numpy()
+        np.testing.assert_array_equal(found, values.astype(found.dtype), name)
+    assert torch.equal(state["reward"][:, 0], torch.tensor(own.outcome.reward).float())
 
 
 def test_batched_seeds(batched):

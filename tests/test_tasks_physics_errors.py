@@ -220,6 +220,22 @@ def test_an_error_leaves_a_file_that_a_command_plays_again(
     assert code == 2 and "no file of a physics error" in err
 
 
+def test_a_file_holds_the_action_and_the_state_of_the_simulation_that_failed(tmp_path):
+    task = suite.make_task("simple1_bca")
+    simulation = batch.BatchSimulation(task, 3, num_threads=1, seeds=3)
+    simulation.error_files = error_files.ErrorFiles(tmp_path, "simple1_bca")
+    simulation.reset()
+    simulation.batch.qvel[1] = 1e12
+    before = simulation.snapshot()[1].arrays
+    action = np.linspace(-1.0, 1.0, 3 * simulation.num_actions).reshape(3, -1)
+    assert simulation.step(action).physics_error.tolist() == [False, True, False]
+    (path,) = tmp_path.glob("*.npz")
+    failed = error_files.PhysicsError.load(path)
+    np.testing.assert_array_equal(failed.action, action[1])
+    for name in ("rollout._errors", "rollout.steps"):
+        np.testing.assert_array_equal(failed.snapshot.arrays[name], before[name])
+
+
 def test_a_folder_keeps_the_last_few_errors_one_of_an_episode(
     tmp_path, monkeypatch, small_disk, caplog
 ):

@@ -1,6 +1,7 @@
 """Guidewires on a bench: a folder of measured wires, and their simulation."""
 
 import json
+import types
 
 import numpy as np
 import pytest
@@ -78,6 +79,38 @@ def test_the_command_gives_the_report(monkeypatch, capsys):
             validate(part, data=data)
 
 
+def test_an_angled_wire_has_its_best_turn_unless_an_operator_turned_it():
+    turns = np.arange(bench.TURNS)
+    rms = {"pushed": 4.0, "steered": 2.0, "led": 3.0, "laid": 1.0}
+
+    def result(value, count=1):
+        """A turn of 90 degrees is the best one."""
+        worse = 0.1 * np.abs(turns[:count] - 3 * (count > 1))
+        return bench.Result(value + worse, 2 * (value + worse))
+
+    experiment = types.SimpleNamespace(
+        compare=lambda wire, way, angles: result(rms[way], len(angles)),
+        centreline=lambda wire: result(9.0), nearest=lambda wire: result(8.0),
+        hull=lambda wire: result(7.0),
+    )  # fmt: skip
+    points = np.linspace([0, 0, 0], [0, 0, 0.1], 11)
+    wire = Wire("w", "angled", "arch", True, points, np.array([0, 0, 1.0]))
+    row = bench._row(experiment, wire, "test")
+    assert row["led"]["turn"] == pytest.approx(np.pi / 2)
+    assert row["inserted_mm"] == pytest.approx(100.0)
+    found = {check.name: check for check in bench._checks([row])}
+    values = {
+        way: found[f"angled wires, {way}: median RMS"].value
+        for way in ("pushed", "steered", bench.EITHER, "laid")
+    }
+    median = float(np.median(rms["steered"] + 0.1 * np.abs(turns - 3)))
+    assert values == {"pushed": 4.0, "steered": median, bench.EITHER: 3.0, "laid": 1.0}
+    name = "angled wires, pushed: median RMS"
+    assert not found[name].passed and found[f"{name}, test half"].value == 4.0
+    beaten = found[f"{name}, against the best baseline"]
+    assert beaten.passed and beaten.bound == "<= 7"
+
+
 def test_wires_that_fold_back_are_told():
     angle = np.linspace(0.0, 1.2 * np.pi, 60)
     bow = 0.01 * np.stack([1 - np.cos(angle), np.sin(angle), 0 * angle], axis=1)
@@ -102,6 +135,16 @@ def test_a_wire_has_its_weight_in_blood(folder):
     # The device lies along +z of its frame, across gravity.
     np.testing.assert_allclose(np.linalg.norm(weight), expected, rtol=0.01)
     assert abs(weight[2]) < 1e-9
+
+
+def test_sides_of_the_patient_are_six_directions(folder):
+    """The head is at -z, the left at +y and the back at +x in this phantom."""
+    down = bench_data.read(folder[0]).down
+    z, y, x = ("inferior", "superior"), ("left", "right"), ("posterior", "front")
+    for axis, names in enumerate((x, y, z)):
+        for name, sign in zip(names, (1.0, -1.0), strict=True):
+            np.testing.assert_array_equal(down[name], sign * np.eye(3)[axis])
+    assert not down["none"].any() and len(down) == 7
 
 
 def test_an_operator_pulls_back_and_turns_where_the_tip_is_astray(folder):

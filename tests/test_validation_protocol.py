@@ -24,6 +24,21 @@ def test_samples_of_the_reference_are_equivalent_to_it():
     assert not apart["equivalent"] and apart["mann_whitney_p"] < 1e-6
 
 
+def test_deviation_and_effect_size_are_those_of_a_sample():
+    found = protocol.compare(np.array([0.2, 0.3, 0.4, 0.5]), 0.4, 0.02)
+    assert found["sd"] == pytest.approx(0.1 * (5 / 3) ** 0.5)
+    pooled = ((0.01 * 5 / 3 + 0.02**2) / 2) ** 0.5
+    assert found["cohens_d"] == pytest.approx((0.35 - 0.4) / pooled)
+
+
+def test_the_drawn_density_is_one_in_all_and_ends_at_zero():
+    samples = np.abs(RNG.normal(0.0, 0.1, 300))
+    drawn = protocol.figure(samples, protocol.compare(samples))
+    force, density = drawn.axes[0].lines[0].get_data()
+    assert force[0] == 0.0
+    assert np.trapezoid(density, force) == pytest.approx(1.0, abs=0.02)
+
+
 def test_a_large_p_value_is_no_equivalence():
     # Four wild samples: no test finds a difference, nor shows equality.
     result = protocol.compare(np.array([0.1, 0.7, 0.3, 0.5]), margin=0.02)
@@ -76,6 +91,9 @@ def test_an_episode_gives_the_resultants_of_its_steps_with_contact():
     found = report.findings["protocol"]
     assert (found["count"], found["reference_mean"]) == (len(samples), 0.1)
     assert found["task"] == episode.task
+    other = force_sensors.compare_forces(episode, mean=0.1, sd=0.05, margin=0.03)
+    found = other.findings["protocol"]
+    assert (found["margin"], found["reference_sd"]) == (0.03, 0.05)
     json.dumps(report.as_dict())
 
 

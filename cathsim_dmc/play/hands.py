@@ -191,7 +191,7 @@ class SpaceMouse:
         leaning = {
             "w": state.y,
             "a": state.yaw,
-            "Up": -state.roll,
+            "Up": state.roll,
             "Right": state.pitch,
         }
         axes = {key: without_rest(value) for key, value in leaning.items()}
