@@ -282,7 +282,8 @@ def _smoothed(line: np.ndarray, width: float) -> np.ndarray:
 
     way = arc_lengths(line)
     line = interpolate(np.arange(0.0, way[-1], ROUTE_SPACING), way, line)
-    # The ends stay where they are: the line continues beyond them, point reflected.
+    # The line continues beyond its ends, point reflected, so that they stay in place.
+    # The last point of the line is not sampled (docs/limits.md).
     beyond = min(round(3 * width / ROUTE_SPACING), len(line) - 1)
     around = ((beyond, beyond), (0, 0))
     whole = np.pad(line, around, "reflect", reflect_type="odd")
