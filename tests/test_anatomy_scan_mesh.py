@@ -10,11 +10,17 @@ import trimesh
 from skimage.measure import marching_cubes
 from synthetic_scans import marched, write_obj, y_tree
 
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.lumen import guess_units, read_lumen, typical_radius
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
 from cathsim_dmc.anatomy.scan.repair import mend
-from cathsim_dmc.anatomy.scan.topology import decimated, edge_counts, without_slivers
+from cathsim_dmc.anatomy.scan.topology import (
+    crossings,
+    decimated,
+    edge_counts,
+    without_slivers,
+)
 from cathsim_dmc.anatomy.scan.units import upright
 
 DATA = Path(__file__).parent / "data"
@@ -351,6 +357,13 @@ def test_decimation_glues_nothing_together(seed):
     assert len(faces) <= 1500 and (edge_counts(faces)[1] == 2).all()
     size = [np.linalg.norm(each, axis=1).mean() for each in (points, vertices)]
     assert size[0] == pytest.approx(size[1], rel=0.04)
+
+
+def test_decimation_makes_no_surface_intersect_itself():
+    surface = phantoms.load("type1").surface
+    points, faces = decimated(surface.vertices, surface.faces, 240)
+    assert len(faces) <= 240 and (edge_counts(faces)[1] == 2).all()
+    assert not len(crossings(points, faces)[0])
 
 
 def test_axes_turn_a_lying_scan(y_mesh, tmp_path):

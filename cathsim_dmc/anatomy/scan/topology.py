@@ -154,11 +154,13 @@ def decimated(
     if _is_manifold(faces) and not _is_manifold(fewer):
         import igl
 
-        # Ten times slower; it collapses no edge that would glue the surface together.
+        # Ten times slower; it collapses no edge that would glue the surface together,
+        # or, if the surface does not intersect itself, make it do so.
         points, fewer, *_ = igl.qslim(
             np.asfortranarray(vertices * scale),
             np.asfortranarray(faces, dtype=np.int32),
             count,
+            not len(crossings(vertices, faces)[0]),
         )
         points, fewer = merged(points / scale, np.asarray(fewer))
     return points, fewer
