@@ -60,6 +60,7 @@ def test_a_carotid_has_a_trunk_that_can_be_renamed(tmp_path):
         assert room == pytest.approx(between)
 
 
+@pytest.mark.slow
 def test_a_single_tube_is_a_trunk_with_a_goal(tmp_path):
     line = tube([(0, 0, 0), (8, 2, 30), (-4, 6, 60), (4, 0, 90)], [4, 4, 4, 4])
     anatomy, notes = imported(tmp_path, VesselTree({"v": Vessel("v", line)}), 1.2e-3)

@@ -14,7 +14,10 @@ def cylinder(radius=0.01, length=0.1):
     return VesselTree({"aorta": Vessel("aorta", line)})
 
 
-@pytest.mark.parametrize("name", ["type1", "type2", "simple1", "bovine"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param("type1", marks=pytest.mark.slow), "type2", "simple1", "bovine"],
+)
 def test_surface_is_closed_points_outwards_and_follows_the_lumen(name):
     anatomy = phantoms.load(name)
     found = anatomy.surface

@@ -28,6 +28,7 @@ def actions():
     return drawn
 
 
+@pytest.mark.slow
 def test_the_scene_moves_nearly_as_the_task(exported):
     """Without a field: convex pieces and boxes stand for wall and sheath."""
     task = json.loads((exported / "task.json").read_text())
@@ -68,6 +69,7 @@ def test_the_scene_moves_nearly_as_the_task(exported):
     assert model.sensor(task["sensors"]["load_cell"]).dim == 3
 
 
+@pytest.mark.slow
 def test_what_success_is_stands_beside_the_scene(exported):
     task = json.loads((exported / "task.json").read_text())
     objective = suite.make_task(TASK).objective

@@ -101,6 +101,7 @@ def test_platforms_start_stop_and_reverse_smoothly():
     assert len(found) == 9 and all(one.passed for one in found), found
 
 
+@pytest.mark.slow
 def test_the_sheath_clamps_a_device_at_its_mouth_and_passes_axial_forces_on():
     """A bore with play doubled the compliance; a bent one takes part of the force."""
     found = list(sheath.checks())
