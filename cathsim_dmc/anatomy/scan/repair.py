@@ -58,8 +58,7 @@ def mend(name: str, vertices: np.ndarray, faces: np.ndarray) -> Mended:
     work.merge()
     work.keep_one_part()
     work.cut_non_manifold()  # while triangles are small, so that holes are
-    work.decimate()
-    work.cut_non_manifold()
+    work.decimate()  # makes no edge with more than two triangles
     work.orient()
     work.keep_inner_surface()
     work.close()
