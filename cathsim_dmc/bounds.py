@@ -5,10 +5,8 @@ ValueError that names the argument, the value given and the values allowed.
 """
 
 import dataclasses
-import json
 import math
 import numbers
-import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn
@@ -373,41 +371,3 @@ def _allowed(
     if math.isinf(low) or above:
         return f"{kind}{above}, at most {most}{unit}"
     return f"{kind} from {least} to {most}{unit}"
-
-
-def as_json(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Splits options into JSON values and the objects that JSON cannot hold."""
-    plain, objects = dict[str, Any](), dict[str, Any]()
-    for name, value in given.items():
-        try:
-            plain[name] = json.loads(json.dumps(value, default=_as_plain))
-        except (TypeError, ValueError):
-            objects[name] = value
-    return plain, objects
-
-
-def as_texts(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns options as they are read from JSON, objects among them as texts."""
-    plain, objects = as_json(given)
-    return plain | json.loads(json.dumps(objects, default=repr))
-
-
-def _as_plain(value: Any) -> Any:
-    """Returns plain values that make an option again; TypeError if none do.
-
-    A mapping makes options, whose fields all have defaults, but no device or anatomy.
-    """
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    if not dataclasses.is_dataclass(value) or isinstance(value, type):
-        raise TypeError
-    if any(
-        field.default is field.default_factory is dataclasses.MISSING
-        for field in dataclasses.fields(value)
-    ):
-        raise TypeError
-    return dataclasses.asdict(
-        value, dict_factory=lambda pairs: {k: v for k, v in pairs if v is not None}
-    )

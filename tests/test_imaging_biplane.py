@@ -5,6 +5,7 @@ import pytest
 from test_imaging_device import RADIUS
 
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.imaging import biplane
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.biplane import TRACE_SPACING, Biplane
 from cathsim_dmc.imaging.device import Shadow
@@ -18,8 +19,8 @@ def anatomy():
 
 @pytest.fixture(scope="module")
 def planes(anatomy):
-    surface, (view, biplane) = anatomy.surface, ((60, 0), (-30, 0))
-    options = FluoroscopyOptions(view=view, biplane=biplane, roadmap=0.5)
+    surface = anatomy.surface
+    options = FluoroscopyOptions(view=(60, 0), biplane=(-30, 0), roadmap=0.5)
     return Angiograph(surface, options).planes()
 
 
@@ -213,6 +214,17 @@ def test_both_ends_of_a_route_stay_where_it_is_centred(anatomy, planes):
     found = machine._centred(line)
     np.testing.assert_array_equal(found[[0, -1]], line[[0, -1]])
     assert np.linalg.norm(found - line, axis=1).max() > 0.5e-3
+
+
+@pytest.mark.parametrize("length", [0.4e-3, 30.2e-3, 30.7e-3])
+def test_both_ends_of_a_line_stay_where_it_is_smoothed(length):
+    ends = np.array([[0.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
+    line = ends * length
+    for _ in range(9):
+        line = biplane._smoothed(line, 2e-3)
+    np.testing.assert_allclose(line[[0, -1]], ends * length, atol=1e-5)
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    assert 0.35e-3 < steps.min() <= steps.max() < 1.1e-3
 
 
 def test_a_device_is_found_beside_a_short_line_that_is_darker(planes):

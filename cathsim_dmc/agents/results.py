@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import bounds
+from cathsim_dmc import json_options
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, STATISTICS
 from cathsim_dmc.analysis.intervals import success_interval
@@ -111,7 +111,7 @@ class EvaluationResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return identity, summary and every episode, JSON-able; objects as texts."""
-        options = bounds.as_texts(self.settings.get("task_kwargs", {}))
+        options = json_options.as_texts(self.settings.get("task_kwargs", {}))
         drawn = [{"conditions": dict(one)} for one in self.conditions]
         drawn = drawn or [{}] * len(self.seeds)
         played = zip(self.seeds, self.episodes, drawn, strict=True)

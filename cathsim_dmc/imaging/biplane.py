@@ -281,10 +281,10 @@ def _smoothed(line: np.ndarray, width: float) -> np.ndarray:
     from scipy.ndimage import gaussian_filter1d
 
     way = arc_lengths(line)
-    line = interpolate(np.arange(0.0, way[-1], ROUTE_SPACING), way, line)
+    number = max(round(way[-1] / ROUTE_SPACING), 1) + 1
+    line = interpolate(np.linspace(0.0, way[-1], number), way, line)
     # The line continues beyond its ends, point reflected, so that they stay in place.
-    # The last point of the line is not sampled (docs/limits.md).
-    beyond = min(round(3 * width / ROUTE_SPACING), len(line) - 1)
+    beyond = round(3 * width / ROUTE_SPACING)
     around = ((beyond, beyond), (0, 0))
     whole = np.pad(line, around, "reflect", reflect_type="odd")
     smooth = gaussian_filter1d(whole, width / ROUTE_SPACING, axis=0)

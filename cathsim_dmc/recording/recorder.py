@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from dm_control.rl import control
 
-from cathsim_dmc import __version__, bounds
+from cathsim_dmc import __version__, bounds, json_options
 from cathsim_dmc.anatomy.scan.aorta import is_upright
 from cathsim_dmc.physics.forces import NAMES
 from cathsim_dmc.recording.episode import Episode
@@ -83,7 +83,7 @@ class EpisodeRecorder:
         self._env, self._task = env, navigation_of(env)
         self._task_name = task_name or type(env.task).__name__
         if task_kwargs is None:
-            task_kwargs, _ = bounds.as_json(self._task.options)
+            task_kwargs, _ = json_options.split(self._task.options)
         self._task_kwargs = bounds.options("task_kwargs", task_kwargs)
 
     def record_episode(

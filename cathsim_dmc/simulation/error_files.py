@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import bounds, files, suite
+from cathsim_dmc import bounds, files, json_options, suite
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.snapshot import (
@@ -125,8 +125,8 @@ class ErrorFiles:
     ):
         """Takes the task's name and options, from which a replay makes it."""
         self.folder, self._task = Path(folder), task
-        self._options = bounds.as_texts(options or {})
-        self._whole = not bounds.as_json(options or {})[1]
+        self._options = json_options.as_texts(options or {})
+        self._whole = not json_options.split(options or {})[1]
 
     def before(self, rollout: Rollout) -> Snapshot:
         """The state of all simulations before a control step."""

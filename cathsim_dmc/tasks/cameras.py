@@ -153,15 +153,3 @@ class Cameras:
             geom.rgba[3] = 1.0
             if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid in self._links:
                 geom.pos[:] = _OUT_OF_SIGHT
-
-
-def opened(
-    model: mujoco.MjModel,
-    options: CameraOptions,
-    names: Sequence[str],
-    links: np.ndarray,
-    resized: bool,
-) -> Cameras | None:
-    """Returns the cameras that observations of these names need; None without need."""
-    kinds = [kind for kind in KINDS if kind in names]
-    return Cameras(model, options, kinds, links, resized) if kinds else None

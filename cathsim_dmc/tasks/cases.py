@@ -6,7 +6,8 @@ that of the first anatomy, and writes them into that model, so all bindings stay
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import cast
 
 import mujoco
 import numpy as np
@@ -18,7 +19,7 @@ from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.chain_fields import write_still
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.objectives import Objective
+from cathsim_dmc.tasks.objectives import Objective, Shiftable
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.start import StartPosture
 
@@ -73,6 +74,34 @@ class Case:
     def angiograph(self) -> Angiograph:
         """Angiography machine that images this anatomy."""
         return Angiograph(self.scene.anatomy.surface, self.fluoroscopy)
+
+
+def objectives_of(
+    cases: Sequence[Case], drawn: np.ndarray, shift: np.ndarray | None = None
+) -> tuple[list[tuple[Objective, np.ndarray | slice]], np.ndarray]:
+    """Returns the objectives of N simulations, and their goals.
+
+    Args:
+        drawn: (N,) int, number of each simulation's case.
+        shift: (N,), shifts of the goals along their branches, m; None for none.
+
+    Returns:
+        objectives: Each with the rows of its simulations.
+        goals: (N, 3) m, in the vessel at rest, world frame.
+    """
+    found: list[tuple[Objective, np.ndarray | slice]] = []
+    goals = np.empty((len(drawn), 3))
+    numbers = np.unique(drawn)
+    for number in numbers:
+        objective, rows = cases[number].objective, slice(None)
+        if len(numbers) > 1:
+            rows = np.flatnonzero(drawn == number)
+        if shift is not None:
+            # Navigation has checked that it can be shifted.
+            objective = cast(Shiftable, objective).shifted(shift[rows])
+        found.append((objective, rows))
+        goals[rows] = objective.goal
+    return found, goals
 
 
 def compile_together(

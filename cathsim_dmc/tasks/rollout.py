@@ -13,7 +13,6 @@ import numpy as np
 from numpy.random import RandomState
 
 from cathsim_dmc import bounds
-from cathsim_dmc.imaging import endoluminal
 from cathsim_dmc.imaging.angiograph import Deviation, Planes
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.physics import forces
@@ -23,24 +22,19 @@ from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import ModelIndex, Readings, merged, part
 from cathsim_dmc.physics.single_device import SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, Stepper
-from cathsim_dmc.tasks import cameras, observations, physics_errors
-from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks import observations, physics_errors
+from cathsim_dmc.tasks.cases import Case, objectives_of
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors
-from cathsim_dmc.tasks.objectives import (
-    Measurement,
-    Objective,
-    Shiftable,
-    judge,
-    straight,
-)
+from cathsim_dmc.tasks.objectives import Measurement, judge, straight
 from cathsim_dmc.tasks.observation_kind import Frame, Observation
 from cathsim_dmc.tasks.progress import Progress
 from cathsim_dmc.tasks.restorable import Restorable, describe
 from cathsim_dmc.tasks.retry import Memory
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.tasks.tracking_noise import TrackingNoise
+from cathsim_dmc.tasks.views import Views
 
 _LOG = logging.getLogger(__name__)
 
@@ -117,12 +111,7 @@ class Rollout(Restorable):
         self.progress = Progress(self._names, cases, count, config.give_up)
         self._chain = CommonChain(scene.catheter, config.shaft_link)
         self._sensors = ImageSensors(self._names, cases[0], count, self._chain)
-        self._cameras = cameras.opened(
-            model, config.cameras, self._names, self.index.geoms, scene.catheter.coaxial
-        )
-        inside = [name.startswith("endoluminal") for name in self._names]
-        self._has_endoluminal = any(inside)
-        self._has_views = self._cameras is not None or self._has_endoluminal
+        self._views = Views(self._names, config, model, scene, self.index.geoms)
         self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
@@ -166,19 +155,10 @@ class Rollout(Restorable):
 
     def _choose_objectives(self) -> None:
         """Selects the objectives and goals of the simulations' anatomies."""
-        self.objectives: list[tuple[Objective, np.ndarray | slice]] = []
-        self.resting_goal = np.empty((len(self._case_of), 3))
-        numbers = np.unique(self._case_of)
-        for number in numbers:
-            objective, rows = self._cases[number].objective, slice(None)
-            if len(numbers) > 1:
-                rows = np.flatnonzero(self._case_of == number)
-            if self._config.randomisation.goal_shift is not None:
-                # Navigation has checked that it can be shifted.
-                shiftable = cast(Shiftable, objective)
-                objective = shiftable.shifted(self._goal_shift[rows])
-            self.objectives.append((objective, rows))
-            self.resting_goal[rows] = objective.goal
+        shifted = self._config.randomisation.goal_shift is not None
+        shift = self._goal_shift if shifted else None
+        found = objectives_of(self._cases, self._case_of, shift)
+        self.objectives, self.resting_goal = found
 
     def _draw(self, index: int, random_state: RandomState) -> None:
         """Draws one simulation's episode and lays its device in the start posture."""
@@ -353,8 +333,12 @@ class Rollout(Restorable):
             sensors.capture(
                 rows, begins, points, self.shadows, handles, random, self.around, last
             )
-        if self._has_views and len(rows):
-            for name, view in self._views(rows).items():
+        if self._views.wanted and len(rows):
+            scenes = [self.case(index).scene for index in rows]
+            found = self._views.see(
+                rows, scenes, self._stepper, self.readings, self.moving
+            )
+            for name, view in found.items():
                 sensors.hold(name, view, rows)
         seen = self._at_rest(state) if self._tracking.deviation else self.resting
         self.progress.see(rows, begins, self._case_of, seen, sensors.images)
@@ -364,22 +348,6 @@ class Rollout(Restorable):
             ahead, devices, self.vessel, self.progress.seen(state),
         )  # fmt: skip
         return observations.observe(self._names, frame)
-
-    def _views(self, indices: np.ndarray) -> dict[str, np.ndarray]:
-        """Endoluminal and camera images of some simulations (K,), by name."""
-        moving, state, seen = self.moving, self.readings, {}
-        if self._cameras is not None:
-            seen = self._cameras.see(indices, self._stepper, state)
-        if not self._has_endoluminal:
-            return seen
-        grey, distance = endoluminal.views(
-            [self.case(index).scene.anatomy.lumen for index in indices],
-            [moving.warp(i) if moving else endoluminal.AT_REST for i in indices],
-            state.head[indices],
-            state.head_frame[indices],
-            self._config.endoluminal_size,
-        )
-        return {**seen, "endoluminal": grey, "endoluminal_distance": distance}
 
     def _derive(self, indices: np.ndarray) -> Step:
         for index in indices.tolist():

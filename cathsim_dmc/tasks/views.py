@@ -1,0 +1,80 @@
+"""Views of the cameras and from the head, of N simulations."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.imaging import endoluminal
+from cathsim_dmc.physics.motion import Moving
+from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.physics.stepper import Stepper
+from cathsim_dmc.tasks.cameras import KINDS, Cameras
+from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.scene import Scene
+
+
+class Views:
+    """Renders the views that observations ask for.
+
+    Attributes:
+        wanted: Whether any observation asks for a view.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        config: NavigationConfig,
+        model: mujoco.MjModel,
+        scene: Scene,
+        links: np.ndarray,
+    ):
+        """Prepares the views for observations of these names.
+
+        Args:
+            links: Numbers of the geoms of the device.
+
+        Raises:
+            ValueError: if a camera needs OpenGL, which does not start.
+        """
+        self._size = config.endoluminal_size
+        self._inside = any(name.startswith("endoluminal") for name in names)
+        self._cameras: Cameras | None = None
+        if kinds := [kind for kind in KINDS if kind in names]:
+            resized = scene.catheter.coaxial
+            self._cameras = Cameras(model, config.cameras, kinds, links, resized)
+        self.wanted = self._inside or self._cameras is not None
+
+    def see(
+        self,
+        rows: np.ndarray,
+        scenes: Sequence[Scene],
+        stepper: Stepper,
+        readings: Readings,
+        moving: Moving | None,
+    ) -> dict[str, np.ndarray]:
+        """Renders the views of some simulations.
+
+        Args:
+            rows: (K,) numbers of these simulations, K > 0.
+            scenes: Their K scenes.
+            stepper: Stepper of all N simulations.
+            readings: State of the devices of all N simulations.
+            moving: Effect that moves the vessels; None if they rest.
+
+        Returns:
+            Images (K, ...) by name, see `Cameras.see` and `endoluminal.views`.
+        """
+        seen: dict[str, np.ndarray] = {}
+        if self._cameras is not None:
+            seen = self._cameras.see(rows, stepper, readings)
+        if not self._inside:
+            return seen
+        grey, distance = endoluminal.views(
+            [scene.anatomy.lumen for scene in scenes],
+            [moving.warp(i) if moving else endoluminal.AT_REST for i in rows],
+            readings.head[rows],
+            readings.head_frame[rows],
+            self._size,
+        )
+        return {**seen, "endoluminal": grey, "endoluminal_distance": distance}
