@@ -74,25 +74,26 @@ class FluoroscopyOptions:
     """Set-up of the angiography suite.
 
     Attributes:
-        view: name of a view, or (primary, secondary) angle in degrees; "best" for
-            those that tell most about the anatomy, then of `biplane`, too.
-        biplane: the same for a second C-arm, or None for a single plane.
-        third: the same for a third roadmap, which the route of the observation
-            `biplane` is found in, too; None for two.
+        view: name of a view, or (primary, secondary) angle in degrees. "best", then
+            for `biplane` as well, selects the pair of views of this anatomy with the
+            fewest ambiguous places.
+        biplane: view of a second C-arm; None for a single plane.
+        third: view of a third roadmap, in which the observation `biplane` also seeks
+            its route; None for two roadmaps.
         roadmap_errors: `RoadmapErrors`, or a mapping of its fields.
         size: pixels along a side of the image, or (rows, columns).
         magnification: electronic zoom.
-        centre: isocentre (3,), world frame, m; None for the middle of the lumen, or, of
-            a scan so large that this misses inlet or goal, for the middle of these.
+        centre: isocentre (3,), world frame, m. None for the middle of the lumen, or for
+            the middle between inlet and goal if that view would miss one of them.
         contrast: iodine in the lumen, kg/m³ (mg/ml); True for the usual concentration,
             False for none.
-        noise: whether quanta are counted. The noise comes from the environment's
-            source of randomness.
-        kerma: air kerma at the detector per frame, Gy; more is less noise.
-        gain: share of full white given to plain tissue.
+        noise: whether images have quantum noise, drawn from the environment's random
+            state.
+        kerma: air kerma at the detector per frame, Gy; the noise decreases with it.
+        gain: grey level of plain tissue as a fraction of white.
         blur: standard deviation of the detector's point spread, m.
-        roadmap: opacity of the vessel laid over the live image, 0 for none; usually
-            with `contrast=False`.
+        roadmap: opacity of the roadmap over the live image, 0 for none; usually with
+            `contrast=False`.
         source_detector: distance of source and detector, m.
         source_isocentre: distance of source and isocentre, m.
         detector_size: width of the detector, m.

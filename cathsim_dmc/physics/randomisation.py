@@ -80,22 +80,22 @@ class Randomisation:
     A range is `(low, high)` of a uniform distribution, or a composer Variation.
 
     Attributes:
-        friction: Coulomb coefficient of an uncoated device on the wall; a hydrophilic
-            one has its `friction_ratio` of it.
+        friction: Coulomb coefficient of an uncoated device on the wall; that of a
+            hydrophilic device is this times its `friction_ratio`.
         stiffness: factor of EI and GJ; damping and steering torques follow, so that
             relaxation time and steering angles stay.
         loss: factor of the loss factor of the material.
         viscosity: factor of the viscosity of blood.
-        start_radius: of the ball in which the tip starts, m.
-        view: deviation of the C-arm's angles, degrees, rounded to whole ones.
+        start_radius: radius of the ball in which the tip starts, m.
+        view: deviation of the C-arm's angles, degrees, rounded to whole degrees.
         gain: factor of the image's gain.
         kerma: factor of the kerma, which sets the quantum noise if there is any.
-        goal_shift: of the goal along its branch, m, positive away from the ostium.
-        roll: of the device about its own axis, rad.
-        delay: least and longest delay of the action, whole control steps.
-        start_insertion: how much farther in than the task's own start an episode
-            begins, m, in steps of 5 mm; less in proportion where the farthest is more
-            than half of the way to the goal.
+        goal_shift: shift of the goal along its branch, m, positive away from the
+            ostium.
+        roll: rotation of the device about its own axis at the start, rad.
+        delay: shortest and longest delay of the action, whole control steps.
+        start_insertion: additional insertion at the start, m, in steps of 5 mm; scaled
+            down where its largest value is more than half of the way to the goal.
         tracking_noise: standard deviation of each coordinate of the tracked points,
             m, drawn anew in every control step.
     """

@@ -28,7 +28,8 @@ class CameraOptions:
     """Options of the observations `rgb` and `depth`.
 
     Attributes:
-        names: of the cameras: "top" as published, "side", and "tip", an endoscope.
+        names: names of the cameras: "top", the published view; "side"; "tip", an
+            endoscope.
         size: pixels along a side of the image, or (rows, columns).
     """
 

@@ -57,13 +57,13 @@ def _action(key: str) -> Entry:
 
 
 _PLACES = ", ".join(f"{1e3 * place:.4g}" for place in TRACKED_PLACES)
-_POINTS = f"{TRACKED_POINTS} points along the device, proximal to head"
+_POINTS = f"{TRACKED_POINTS} points along the device, from proximal to the head"
 _OPERATOR = (
     Entry(
         "tracking_insertion",
         1,
         "m",
-        "slide of the base, 0 at the start of the stroke; its stops are soft",
+        "position of the base, 0 at the start of its stroke; the stops are soft",
         -0.001,
     ),
     _action("tracking_action"),
@@ -82,28 +82,28 @@ def _operator(frame: Frame) -> Observation:
         "position",
         _joints,
         "m, rad",
-        "joints: slides of the base, its rotation, torsion, then the bending hinges; 0 "
-        "for those behind the simulated links",
+        "of the joints: slides and rotation of the base, torsion, then the bending "
+        "hinges; 0 for the hinges proximal of the simulated links",
     ),
-    Entry("velocity", _joints, "m/s, rad/s", "of the same joints"),
+    Entry("velocity", _joints, "m/s, rad/s", "of the same joints, in the same order"),
     Entry(
         "com_inertia",
         lambda sizes: 10 * sizes.links,
         "kg·m², kg·m, kg",
-        "10 numbers a link: inertia about the device's centre of mass (`cinert`)",
+        "10 numbers per link: inertia about the device's centre of mass (`cinert`)",
     ),
     Entry(
         "com_velocity",
         lambda sizes: 6 * sizes.links,
         "rad/s, m/s",
-        "6 numbers a link: rotation, translation (`cvel`)",
+        "6 numbers per link: angular, then linear velocity (`cvel`)",
     ),
-    Entry("actuator_force", _joints, "N, N·m", "of the motors, by joint"),
+    Entry("actuator_force", _joints, "N, N·m", "force of the motor of each joint"),
     Entry(
         "external_force",
         lambda sizes: 6 * sizes.links,
         "N·m, N",
-        "6 numbers a link: contact torque, contact force (`cfrc_ext`)",
+        "6 numbers per link: contact torque, then contact force (`cfrc_ext`)",
     ),
     joined=("drives", "devices"),
 )
@@ -122,7 +122,7 @@ def internal(frame: Frame) -> Observation:
 
 
 _shown(
-    _fluoroscopic("image", 1, "grey level", "fluoroscopy, dark = opaque, by plane"),
+    _fluoroscopic("image", 1, "grey level", "one channel per plane; dark is opaque"),
     held="past_0",
     needs=FLUOROSCOPY,
 )
@@ -133,7 +133,7 @@ _shown(
         "sequential",
         SEQUENCE_LENGTH,
         "grey level",
-        "three consecutive images, oldest first; equal after a reset",
+        "three consecutive images, oldest first; all the same after a reset",
     ),
     needs=FLUOROSCOPY,
 )
@@ -145,7 +145,9 @@ def sequential(frame: Frame) -> Observation:
 
 
 _shown(
-    _fluoroscopic("segmentation", 2, "0 or 255", "channels: device, vessel, by plane"),
+    _fluoroscopic(
+        "segmentation", 2, "0 or 255", "channels device and vessel, per plane"
+    ),
     held="masks",
     needs=FLUOROSCOPY,
 )
@@ -182,14 +184,14 @@ def _pixels(sizes: Sizes) -> int:
         "tracking_pixels",
         _pixels,
         "pixel",
-        f"{_POINTS}: column, row (plane by plane); pixel centres are whole numbers. "
-        "Those of each coaxial device follow",
+        f"{_POINTS}, then points along each coaxial device: column and row, plane by "
+        "plane; pixel centres have integer coordinates",
     ),
     Entry(
         "tracking_goal_pixels",
         lambda sizes: 2 * sizes.fluoroscopy.planes,
         "pixel",
-        "goal: column, row",
+        "column and row of the goal, plane by plane",
     ),
     *_OPERATOR,
     needs=FLUOROSCOPY,
@@ -210,7 +212,7 @@ route_observations.add_to(OBSERVATIONS)
 
 @OBSERVATIONS.row(
     Entry("goal_position", 3, "m", "centre of the goal, world frame"),
-    Entry("goal_from_head", 3, "m", "from the head to the goal, world frame"),
+    Entry("goal_from_head", 3, "m", "vector from the head to the goal, world frame"),
 )
 def goal(frame: Frame) -> Observation:
     """Position of the goal in the world frame, and relative to the head."""
@@ -226,14 +228,14 @@ def goal(frame: Frame) -> Observation:
         "wall_force",
         2,
         "N",
-        "on the wall: sum and largest contact, means over the control step",
+        "forces on the wall: sum, and largest contact; means over the control step",
         0,
     ),
     Entry(
         "push_force",
         2,
         "N, N·m",
-        "force and torque of the base on the device, positive forward",
+        "force and torque of the base on the device; a positive force pushes forward",
     ),
     Entry("load_cell", 3, "N", "force of the phantom on its support, world frame"),
 )
@@ -249,9 +251,11 @@ def force(frame: Frame) -> Observation:
 
 @OBSERVATIONS.row(
     Entry("heart_phase", 2, "1", "sine and cosine of the phase of the heart", -1, 1),
-    Entry("breath_phase", 2, "1", "sine and cosine of that of breathing", -1, 1),
-    Entry("blood_velocity", 3, "m/s", "of the blood at the head, world frame"),
-    Entry("indentation", 1, "m", "of the wall under the deepest contact", 0),
+    Entry("breath_phase", 2, "1", "sine and cosine of the phase of breathing", -1, 1),
+    Entry("blood_velocity", 3, "m/s", "velocity of the blood at the head, world frame"),
+    Entry(
+        "indentation", 1, "m", "indentation of the wall under the deepest contact", 0
+    ),
     needs=LIVING,
 )
 def vessel(frame: Frame) -> Observation:
@@ -269,17 +273,25 @@ def vessel(frame: Frame) -> Observation:
 
 
 for _key, _unit, _seen, _high, _dtype in (
-    ("endoluminal", "grey level", "wall lit by a lamp at the head", 255, np.uint8),
+    (
+        "endoluminal",
+        "grey level",
+        "image of the wall, lit from the head",
+        255,
+        np.uint8,
+    ),
     (
         "endoluminal_distance",
         "m",
-        "way to the wall along the ray of each pixel",
+        "distance to the wall along the ray of each pixel",
         FARTHEST_WALL,
         np.float32,
     ),
 ):
-    _seen += ", over a right angle from the head along its axis; right and down: x and "
-    _seen += "y of the tip frame"
+    _seen += (
+        "; field of view 90° about the axis of the head, x of the tip frame to the "
+    )
+    _seen += "right, y down"
     _shown(Entry(_key, lambda s: (*s.endoluminal, 1), _unit, _seen, 0, _high, _dtype))
 
 
@@ -287,7 +299,7 @@ for _key, _unit, _seen, _planes, _high, _dtype in (
     ("rgb", "colour level", "red, green, blue", 3, 255, np.uint8),
     ("depth", "m", "distance along the optical axis", 1, FARTHEST, np.float32),
 ):
-    _seen += " of each of MuJoCo's cameras, which show a vessel at rest"
+    _seen += ", of each of MuJoCo's cameras; they show the vessel at rest"
 
     def _size(sizes: Sizes, planes: int = _planes) -> tuple[int, ...]:
         return (*sizes.cameras.size, planes * len(sizes.cameras.names))
@@ -300,10 +312,12 @@ for _key, _unit, _seen, _planes, _high, _dtype in (
         "device_insertion",
         _devices,
         "m",
-        "of each device from the innermost outwards: way of its end, 0 where the "
-        "chain's end is at the start of the stroke",
+        "insertion of the end of each device, from the innermost outwards; 0 is the "
+        "place of the chain's end at the start of the stroke",
     ),
-    Entry("device_rotation", _devices, "rad", "of the rotary unit of each device"),
+    Entry(
+        "device_rotation", _devices, "rad", "angle of the rotary unit of each device"
+    ),
     needs=COAXIAL,
 )
 def drives(frame: Frame) -> Observation:
@@ -314,20 +328,20 @@ def drives(frame: Frame) -> Observation:
 
 
 @OBSERVATIONS.row(
-    Entry("device_tip_rotation", _devices, "rad", "of the end of each device"),
+    Entry("device_tip_rotation", _devices, "rad", "rotation of the end of each device"),
     Entry(
         "device_points",
         lambda sizes: 3 * sizes.devices * len(DEVICE_PLACES),
         "m",
         f"{len(DEVICE_PLACES)} points along each device, every "
-        f"{1e3 * DEVICE_PLACES[-2]:g} mm, proximal to its end, world frame",
+        f"{1e3 * DEVICE_PLACES[-2]:g} mm, from proximal to its end, world frame",
     ),
     Entry(
         "device_load",
         2,
         "N",
-        "axial force in the device that reaches farthest where it leaves the others, "
-        "and friction between the devices",
+        "axial force in the device that reaches farthest, at the place where it leaves "
+        "the others, and friction between the devices",
     ),
     needs=COAXIAL,
 )

@@ -32,12 +32,13 @@ _ALONE = 20e-3  # m, lead of a wire past a held branch before the catheter follo
 _SEEN_WAY, _SEEN_LEAD, _SEEN_ATTEMPTS, _MOST_LEAD = 20e-3, 20e-3, 4, 2.0
 RETRY_ENTRIES, COAXIAL_RETRY_ENTRIES = 11, 15
 SHOWN = (
-    "withdrawing, way left to withdraw / 20 mm, control steps without progress and "
-    "outside the route over those until a retry, retries so far / 4, three numbers of "
-    "which the look-ahead of the attempt is 1, whether the place of the head stays "
-    "near the last one, force of the base in N, given up; of coaxial devices whether "
-    "slack is taken up, its lead / 20 mm, 2 at most, cosine and sine of the offset "
-    "in direction"
+    "memory of the attempts: 1 while withdrawing; remaining withdrawal / 20 mm; "
+    "control steps without progress, and outside the tube of the route, each divided "
+    "by the number that begins a retry; number of retries / 4; look-ahead of the "
+    "attempt, one-hot (3); 1 in every second attempt, where the place of the head is "
+    "sought near its last one; force of the base, N; 1 after giving up. Coaxial "
+    "devices also have: 1 while slack is taken up; lead / 20 mm, at most 2; cosine "
+    "and sine of the offset in direction"
 )
 
 

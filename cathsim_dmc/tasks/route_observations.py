@@ -24,13 +24,16 @@ _actions, _devices = map(attrgetter, ("actions", "devices"))
 
 def _ahead(name: str, way: str) -> tuple[Entry, ...]:
     """Entries of a route ahead, whose names begin with `name`."""
-    places = f"every {1e3 * AHEAD[1]:g} mm from the place of the head on, tip frame"
+    places = f"every {1e3 * AHEAD[1]:g} mm from the head's place on it, tip frame"
     points, count = f"{len(AHEAD)} points of {way}, {places}", len(TRACKED_PLACES) - 1
-    device = "points along the device, proximal to the head and without it, tip frame"
-    out = "by how much the head is out of the lumen, in radii there; negative inside"
+    device = "points along the device, from proximal to before the head, tip frame"
+    out = "distance of the head outside the lumen, in radii of the lumen there; "
+    out += "negative inside"
     return (
         Entry(f"{name}_points", 3 * len(AHEAD), "m", points),
-        Entry(f"{name}_radii", len(AHEAD), "m", "of the lumen at these points", 0),
+        Entry(
+            f"{name}_radii", len(AHEAD), "m", "radii of the lumen at these points", 0
+        ),
         Entry(f"{name}_goal", 3, "m", "centre of the goal, tip frame"),
         Entry(f"{name}_device", 3 * count, "m", f"{count} {device}"),
         Entry(f"{name}_deviation", 1, "radius", out, -1),
@@ -82,9 +85,14 @@ def biplane_retry(frame: Frame) -> Observation:
 
 
 _PLACES_OF_ENDS = f"{len(DEVICE_PLACES)} points along each device, every "
-_PLACES_OF_ENDS += f"{1e3 * DEVICE_PLACES[-2]:g} mm, proximal to its end"
+_PLACES_OF_ENDS += f"{1e3 * DEVICE_PLACES[-2]:g} mm, from proximal to its end"
 _COAXIAL = (
-    Entry("route_gaps", _devices, "m", "by how much each device is behind the first"),
+    Entry(
+        "route_gaps",
+        _devices,
+        "m",
+        "distance of the end of each device behind that of the first",
+    ),
     Entry(
         "route_lines",
         lambda sizes: 3 * sizes.devices * len(DEVICE_PLACES),
@@ -95,9 +103,9 @@ _COAXIAL = (
         "route_sides",
         lambda sizes: 5 * sizes.devices,
         "1",
-        "of each device: cosine and sine of the rotation of its end, and the direction "
-        f"to the route {1e3 * SIDE_AHEAD:g} mm ahead of its end along the axes of the "
-        "device before its shaped end, turned with that",
+        "per device: cosine and sine of the rotation of its end, and the direction to "
+        f"the point of the route {1e3 * SIDE_AHEAD:g} mm ahead of its end, in the "
+        "frame of the device proximal of its shaped end, which turns with that end",
     ),
     Entry("route_load", 2, "N", "as `device_load`"),
 )
@@ -124,9 +132,9 @@ _TURNS = Entry(
     "route_turns",
     lambda sizes: 2 * sizes.devices,
     "rad",
-    "of each device: what its end is still to be turned by to the point of the route "
-    "that is pursued in the attempt, between -pi and pi, and the angle between the way "
-    "there and the device before its shaped end",
+    "per device: remaining rotation of its end towards the point of the route that the "
+    "present attempt pursues, between -pi and pi, and the angle between the direction "
+    "to this point and the device proximal of its shaped end",
     -np.pi,
     np.pi,
 )

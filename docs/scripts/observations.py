@@ -113,21 +113,7 @@ from data that are available in an angiography suite:
 With errors in the roadmaps the hull is thin and broken in narrow branches. The route
 then continues across gaps, is centred in the region that all views show as vessel, and
 the radius of the lumen is smoothed along it. The deviation of the head from the lumen
-is relative to a radius of at least 10 mm. The table has 20 draws on each phantom,
-towards the LCCA from the groin, with errors of 0.5 (noise) and 0.25 pixels (erosion) on
-three roadmaps (60°, −30°, AP). *Outside* is the fraction of the last 60 mm of the true
-centreline that is farther out of the lumen of the route than the memory of attempts
-tolerates; *distance* is the mean distance of the true centreline in the branch from the
-route:
-
-| quantity | type1 | type2 | source |
-|---|---|---|---|
-| outside | 1.9 % | 0.8 % | 27 November 2026, commit 545a44d |
-| outside, without centring, smoothing and least radius | 20 % | 33 % | the same |
-| distance, mm | 1.1 | 1.4 | the same |
-| distance, mm, without centring | 2.2 | 3.5 | the same |
-| number of routes that leave the vessel by more than 1 mm | 2 | 0 | the same |
-| the same number without centring and smoothing | 2 | 4 | the same |
+is relative to a radius of at least 10 mm ([measured routes](robustness.md#roadmaps)).
 
 A cannulation of the left common carotid artery by the scripted expert:
 
