@@ -123,7 +123,7 @@ class Capstan(NamedTuple):
         part = (self.travel // _PART).astype(int)
         sliding = range(round(_LEAD / _PART), part.max() + 1)
         deviations = [self.ratio[part == each].std() for each in sliding]
-        return float(max(deviations)) / self.mean
+        return float(np.max(deviations)) / self.mean
 
     def checks(self) -> Iterator[Check]:
         """Checks of the coefficient and the ripple.
@@ -211,14 +211,14 @@ def checks(pulled: list[Capstan]) -> Iterator[Check]:
         for load in LOADS:
             found = [slid(device, load, speed) for speed in SPEEDS]
             acting, ripples = zip(*found, strict=True)
-            worst = max(acting, key=lambda one: abs(one - FRICTION))
+            worst = acting[np.argmax(np.abs(np.subtract(acting, FRICTION)))]
             name = f"{what} sliding under {load:g} N"
             each = zip(acting, SPEEDS, strict=True)
             note = ", ".join(f"{one:.4f} at {1e3 * v:g} mm/s" for one, v in each)
             acts = f"{name}: friction that acts"
             yield Check.deviation(acts, worst, FRICTION, ACTING_BOUND, "", note)
             name += ": ripple of the pull"
-            yield Check.at_most(name, 100 * max(ripples), RIPPLE_BOUND, "%")
+            yield Check.at_most(name, 100 * float(np.max(ripples)), RIPPLE_BOUND, "%")
         name = f"{what} under {CREEP_LOAD:g} N, pulled sideways at half the limit: "
         yield Check.at_most(f"{name}creep", 1e3 * creep(device), CREEP_BOUND, "mm/s")
     name = f"device drawn round an arch under {TENSION:g} N: ripple of the force"

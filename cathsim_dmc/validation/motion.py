@@ -29,6 +29,7 @@ FLOW_BOUND = 1.0  # %
 FLOW_TIMES = (1.2, 2.3)  # s
 PLACES = (0.09, 0.13, 0.17)  # m along the tube
 RADIUS, _PROBE = 0.01, 5e-4  # m, of the tube and of probe spheres
+_PROBES = 40  # places on the wall of a phantom
 _HEART, _BREATHING, _SOFT = 5.5e-3, 1.0, 0.02
 _GRAVITY, _RIDE = 9.81, 2.0  # m/s²; s, duration of a ride
 
@@ -108,14 +109,17 @@ def diameters(anatomy: Anatomy) -> tuple[float, np.ndarray, np.ndarray]:
     return float(deviation), np.diff(rises), np.diff(PLACES) / course[6]
 
 
-def wall_place(anatomy: Anatomy, number: int = 40) -> float:
-    """Largest distance, m, between the measured and the prescribed wall."""
+def wall_place(anatomy: Anatomy) -> float:
+    """Largest distance, m, of the measured wall from the prescribed one.
+
+    It is NaN if a probe that should touch the wall is too far from it.
+    """
     course, lumen = parameters(_HEART, _BREATHING, _SOFT), anatomy.lumen
     random = np.random.RandomState(0)
     vertices, normals = anatomy.surface.vertices, anatomy.surface.normals
     open_ends = np.array([end.position for end in anatomy.ends])
     far = np.linalg.norm(vertices - open_ends[:, None], axis=-1).min(axis=0)
-    chosen = random.choice(np.flatnonzero(far > 0.02), number, replace=False)
+    chosen = random.choice(np.flatnonzero(far > 0.02), _PROBES, replace=False)
     inwards = -normals[chosen]
     at = vertices[chosen] + 3e-3 * inwards
     # The zero of the field along the normal.
@@ -131,7 +135,7 @@ def wall_place(anatomy: Anatomy, number: int = 40) -> float:
         normal = (beside - place) / np.linalg.norm(beside - place, axis=1)[:, None]
         places.append(place + (_PROBE - growth[:, None]) * normal)
     found = clearances(anatomy, course, times, np.array(places))
-    return float(np.nanmax(np.abs(found - _PROBE)))
+    return float(np.abs(found - _PROBE).max())
 
 
 def section_flow(anatomy: Anatomy, time: float) -> float:

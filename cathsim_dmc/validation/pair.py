@@ -238,7 +238,7 @@ def _shape_checks() -> Iterator[Check]:
     for label, cases in (("single", alone), ("pairs", pairs)):
         found = [(turned(n, g), f"{' in '.join(n)} {g}") for n, g in cases]
         for part, (what, bound, scale, unit) in enumerate(parts):
-            worst, note = max(found, key=lambda one, part=part: one[0][part])
+            worst, note = found[np.argmax([one[part] for one, _ in found])]
             name = f"unloaded shapes turned by 0 to 345°, {label}, {what}"
             yield Check.at_most(name, scale * worst[part], bound, unit, note)
     lengths = devices.Discretisation().link_lengths(devices.get("steerable_5f"))

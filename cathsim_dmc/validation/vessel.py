@@ -95,19 +95,19 @@ def volume_defect(anatomy: Anatomy) -> float:
     """Largest flow lost at a junction at any phase, relative to the largest inflow."""
     circulation, tree = anatomy.circulation, anatomy.tree
     beats = np.array([beat(phase) for phase in np.linspace(0.0, 1.0, 101)])
-    worst = 0.0
+    lost = []
     for course in circulation.courses.values():
         for place, taken in course.branches:
             before, after = course.share(np.array([place - 1e-9, place + 1e-9]))
-            worst = max(worst, np.abs((before - after - taken) * beats).max())
+            lost.append(np.abs((before - after - taken) * beats).max())
     for name, vessel in tree.vessels.items():
         if vessel.parent is not None:
             branches = circulation.courses[vessel.parent].branches[:, 1]
             entering = circulation.courses[name].share(np.zeros(1))[0]
-            worst = max(worst, np.abs(branches - entering).min())
+            lost.append(np.abs(branches - entering).min())
     entering = circulation.courses[tree.root.name].share(np.full(1, -1.0))[0]
     leaving = sum(course.outlet for course in circulation.courses.values())
-    return float(max(worst, abs(entering - 1), abs(leaving - 1)))
+    return float(np.max([*lost, abs(entering - 1), abs(leaving - 1)]))
 
 
 def profile() -> tuple[float, float]:
