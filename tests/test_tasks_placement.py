@@ -37,7 +37,7 @@ def test_frame_turns_z_into_any_direction(azimuth, height):
     inlet = Inlet("aorta", [0, 0, 0], axis, 0.0138)
     turned = dataclasses.replace(anatomy, inlet=inlet)
     # Whatever stands behind it.
-    with mock.patch.object(placement, "sheath_direction", lambda _: inlet.direction):
+    with mock.patch.object(placement, "sheath_direction", lambda *_: inlet.direction):
         placed = placement.place_device(
             turned, anatomy.goal("bca"), devices.STEERABLE_5F
         )
@@ -347,6 +347,24 @@ def test_the_depth_of_a_posture_is_that_of_its_contacts():
                 np.testing.assert_allclose(found, seen, atol=1.5e-4)
             deep.append(seen)
     assert (np.max(deep, axis=0) > 5e-4).all() and len(deep) > 200
+
+
+def test_a_device_with_more_play_in_the_sheath_stays_as_far_from_other_vessels():
+    """The sheath of `type3` passes its descending aorta, whose wall is 5 mm thick."""
+    anatomy = phantoms.load("type3")
+    behind = np.arange(0.015, placement.COMMON_LENGTH, 1e-3)[:, None]
+    for play in (0.0, 0.35e-3, 1e-3, 2e-3):
+        way = placement.sheath_direction(anatomy, play)
+        away = -anatomy.lumen(anatomy.inlet.position - behind * way).max()
+        assert away - play > 5.1e-3, play
+    narrow = placement.sheath_direction(anatomy, 0.35e-3)
+    np.testing.assert_array_equal(narrow, anatomy.inlet.direction)
+    place = anatomy, anatomy.goal("bca"), devices.STEERABLE_5F
+    with (
+        mock.patch.object(placement, "_LARGEST_TILT", 0.0),
+        pytest.raises(ValueError, match="sheath_clearance is 0.002 m.*give 0.00035 m"),
+    ):
+        placement.place_device(*place, play=2e-3)
 
 
 @pytest.mark.parametrize("given", [0.5, (0.5,), (0.5, 0.2), (0, 2), ("0", 1), (-1, 0)])

@@ -291,7 +291,9 @@ def test_the_sheath_is_tilted_past_an_aorta_that_bends_back():
 
 def test_a_device_that_has_settled_in_a_wall_is_refused(monkeypatch):
     monkeypatch.setattr(
-        placement, "sheath_direction", lambda anatomy: np.array(anatomy.inlet.direction)
+        placement,
+        "sheath_direction",
+        lambda anatomy, *_: np.array(anatomy.inlet.direction),
     )
     task = suite.make_task("arch_bca", pool=1, first=CROSSING)
     with pytest.raises(ValueError, match=r"come.* to rest .*before an episode begins"):
@@ -299,6 +301,6 @@ def test_a_device_that_has_settled_in_a_wall_is_refused(monkeypatch):
 
 
 def test_an_arch_that_no_sheath_fits_before_is_named(monkeypatch):
-    monkeypatch.setattr(placement, "sheath_direction", lambda anatomy: None)
+    monkeypatch.setattr(placement, "sheath_direction", lambda *_: None)
     with pytest.raises(ValueError, match=f"{names(0, 1)[0]}.*give another first"):
         suite.load_arches(pool=1)

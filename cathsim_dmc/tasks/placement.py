@@ -11,6 +11,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.anatomy.reach import least_ahead, unreachable
 from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.sheath import CLEARANCE
 from cathsim_dmc.tasks.config import WORKING_LENGTHS
 
 # The steerable tip starts free of the sheath wherever the way to the first branching
@@ -28,8 +29,9 @@ _BASE_LENGTH = 0.02  # m of device that never leaves the sheath
 # those of its distal links that can leave the sheath.
 COMMON_LENGTH = 0.34  # m
 _LINE_SPACING = 1e-3  # m
-# Least distance of the sheath's axis from any lumen, m: the wall is 4 mm thick. Nearer
-# to the inlet than `_NEAR_INLET` the sheath touches the inlet's own wall.
+# Least distance of the sheath's axis from any lumen, m, with a play of the device of at
+# most `CLEARANCE`: the wall is 5 mm thick. Nearer to the inlet than `_NEAR_INLET` the
+# sheath touches the inlet's own wall.
 _CLEAR_OF_LUMEN = 5.5e-3  # m
 _NEAR_INLET = 0.015  # m
 # Distance from the plane of the inlet within which the sheath holds the device, m.
@@ -104,6 +106,7 @@ def place_device(
     device: devices.Device,
     working_length: float | None = None,
     farthest_shift: float = 0.0,
+    play: float = 0.0,
 ) -> Placement:
     """Places a device at the inlet of an anatomy.
 
@@ -112,10 +115,12 @@ def place_device(
         device: Device; the length of its tip limits the start depth.
         working_length: Simulated length, m; None for what the goal needs.
         farthest_shift: Largest shift of the goal past its place, m.
+        play: Radial clearance of the device in the sheath, m.
 
     Raises:
         ValueError: if `working_length` is too short for the tip and the start depth, or
-            longer than any device.
+            longer than any device, or if with this play, but not with less, the device
+            would touch a vessel beside the sheath.
     """
     inlet = anatomy.inlet
     route = anatomy.route(goal, farthest_shift)
@@ -136,7 +141,14 @@ def place_device(
             f"{least:.3f} m here to be moved at all, and {WORKING_LENGTHS[1]:g} m at "
             "most"
         )
-    direction = sheath_direction(anatomy)
+    direction = sheath_direction(anatomy, play)
+    loose = direction is None and play > CLEARANCE
+    if loose and sheath_direction(anatomy) is not None:
+        raise ValueError(
+            f"sheath_clearance is {play:g} m, with which the device would touch a "
+            f"vessel of {anatomy.name!r} beside the sheath; give {CLEARANCE:g} m, or "
+            "None for a sheath that holds the device"
+        )
     if direction is None:  # `start.StartPosture` refuses a device that stands in a wall
         direction = np.array(inlet.direction)
     quaternion = _frame(direction)
@@ -166,12 +178,15 @@ def _whole_links(length: float, device: devices.Device) -> float:
     return device.tip_length + max(count, 1) * link
 
 
-def sheath_direction(anatomy: Anatomy) -> np.ndarray | None:
+def sheath_direction(anatomy: Anatomy, play: float = 0.0) -> np.ndarray | None:
     """Direction (3,) of insertion that keeps the sheath outside all vessels.
 
     It is the inlet's own direction if a straight sheath fits behind the inlet. If a
     vessel crosses that line, as where the aorta bends back on itself, the sheath is
     tilted about its mouth by the smallest angle that clears it.
+
+    Args:
+        play: Radial clearance of the device in the sheath, m.
 
     Returns:
         Unit vector, world frame; None if the sheath crosses a vessel at every tilt up
@@ -179,25 +194,26 @@ def sheath_direction(anatomy: Anatomy) -> np.ndarray | None:
     """
     inlet = anatomy.inlet
     along = np.asarray(inlet.direction, dtype=float)
-    if _clear(anatomy, along[None])[0]:
+    least = _CLEAR_OF_LUMEN + max(play - CLEARANCE, 0.0)
+    if _clear(anatomy, along[None], least)[0]:
         return along
     x, y, _ = _matrix(_frame(along)).T
     turns = np.arange(0.0, 2 * np.pi, _AZIMUTH_STEP)
     around = np.cos(turns)[:, None] * x + np.sin(turns)[:, None] * y
     for tilt in np.arange(_TILT_STEP, _LARGEST_TILT + 1e-9, _TILT_STEP):
         directions = np.cos(tilt) * along + np.sin(tilt) * around
-        clear = _clear(anatomy, directions)
+        clear = _clear(anatomy, directions, least)
         if clear.any():
             return directions[clear.argmax()]
     return None
 
 
-def _clear(anatomy: Anatomy, directions: np.ndarray) -> np.ndarray:
-    """Whether (k,) sheaths in directions (k, 3) run outside all vessels."""
+def _clear(anatomy: Anatomy, directions: np.ndarray, least: float) -> np.ndarray:
+    """Whether (k,) sheaths in directions (k, 3) stay `least` m away from all lumens."""
     behind = np.arange(_NEAR_INLET, COMMON_LENGTH, _LINE_SPACING)
     lines = anatomy.inlet.position - behind[:, None] * directions[:, None]
     depth = anatomy.lumen(lines.reshape(-1, 3)).reshape(len(directions), -1)
-    return np.asarray((depth < -_CLEAR_OF_LUMEN).all(-1))
+    return np.asarray((depth < -least).all(-1))
 
 
 def _way_to_branching(anatomy: Anatomy) -> float:

@@ -82,6 +82,7 @@ class Scene:
             longest_tip(chosen),
             length,
             config.randomisation.farthest_shift,
+            config.sheath_clearance or 0.0,
         )
         friction = config.friction
         if config.devices is None:  # in a stack, it differs from link to link
