@@ -63,6 +63,17 @@ def test_the_wall_is_where_heart_and_breathing_put_it(arch):
     assert 1e3 * motion.wall_place(arch) < motion.WALL_BOUND
 
 
+def test_a_wall_that_a_probe_does_not_find_fails(arch, monkeypatch):
+    there = motion.clearances
+
+    def clearances(anatomy, course, times, points):
+        points[0, 0] += 5e-3
+        return there(anatomy, course, times, points)
+
+    monkeypatch.setattr(motion, "clearances", clearances)
+    assert not 1e3 * motion.wall_place(arch) < motion.WALL_BOUND
+
+
 def test_a_wall_carries_what_rests_on_it(tube):
     assert motion.slip(tube) < motion.SLIP_BOUND
 

@@ -153,6 +153,15 @@ def test_blood_comes_from_the_heart_delayed_by_the_way(access):
 def test_volume_and_profile_are_those_prescribed():
     for name in vessel.ANATOMIES:
         assert vessel.volume_defect(phantoms.load(name)) < vessel.VOLUME_BOUND
+    lost = dataclasses.replace(phantoms.load("simple1"))
+    blood = lost.circulation
+    for name, course in blood.courses.items():
+        for change in (0.01, np.nan):
+            less = course._replace(outlet=course.outlet - change)
+            courses = {**blood.courses, name: less}
+            broken = dataclasses.replace(blood, courses=courses)
+            vars(lost)["circulation"] = broken
+            assert not vessel.volume_defect(lost) < vessel.VOLUME_BOUND
     deviation, flow = vessel.profile()
     assert deviation < vessel.PROFILE_BOUND
     assert flow == pytest.approx(1.0, abs=1e-8)
@@ -241,6 +250,10 @@ def test_a_wall_of_a_thousand_times_the_modulus_is_the_rigid_one(rigid):
     soft, indented, _ = pushed({"wall": {"modulus": 0.1e6}})
     assert indented.max() > 1.5 * rigid[1].max()
     assert not np.array_equal(rigid[0], soft)
+
+
+def test_the_check_of_a_stiffened_wall_sees_one_that_is_not():
+    assert vessel.stiffened(1.0) > 1e-4
 
 
 @pytest.mark.parametrize(

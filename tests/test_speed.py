@@ -51,6 +51,14 @@ def test_the_account_adds_up_and_leaves_nothing_behind(environment):
     assert mujoco.get_mjcb_time() is None
 
 
+def test_the_overhead_is_the_suite_over_mujoco_without_the_first_run(monkeypatch):
+    pairs = iter([(9.0, 1.0), (3.0, 2.0), (2.0, 2.0)])
+    monkeypatch.setattr(speed, "RATIOS", 2)
+    monkeypatch.setattr(speed, "load", lambda: None)
+    monkeypatch.setattr(speed, "against_bare_steps", lambda *_: next(pairs))
+    assert speed.suite_overhead("push") == [1.5, 1.0]
+
+
 def test_calibrated_speed_is_the_product_of_factor_and_humanoid(monkeypatch):
     monkeypatch.setattr(speed, "BARS", {"random": (1.0, 1e9)})
     monkeypatch.setattr(speed, "RUNS", 1)

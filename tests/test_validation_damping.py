@@ -19,6 +19,19 @@ def test_a_released_device_swings_as_the_beam_with_stated_losses(blood):
     assert decay == pytest.approx(expected, rel=damping.RELEASE_BOUND / 100)
 
 
+def test_a_swing_has_the_frequency_and_decay_of_its_curve():
+    time = np.arange(0.0, 3.0, 1e-3)
+    curve = np.exp(-0.7 * time) * np.cos(2 * np.pi * 1.5 * time)
+    frequency, decay = damping._swing(time, curve)
+    assert frequency == pytest.approx(1.5, rel=1e-3)
+    assert decay == pytest.approx(0.7, rel=0.01)
+
+
+def test_three_points_bend_a_device_as_a_beam():
+    found = [damping.three_point(0.1, damping.SHORT_LINK, on) for on in (True, False)]
+    np.testing.assert_allclose(found, 1.0, rtol=damping.SPAN_BOUND / 100)
+
+
 def off(lag, expected):
     """Whether `cathsim validate rod` refuses a lag."""
     bound = damping.SPIN_BOUND

@@ -70,6 +70,40 @@ def test_the_checks_of_rest_see_a_swing():
     assert [check.passed for check in found.checks("one")] == [False] * 3
 
 
+def test_a_push_ends_at_its_depth():
+    batch = rest.pushed({}, "type1", (0.0, 0.0048))
+    rest.watch(batch, 0.2, 0.04)
+    short, long = batch.rollout.readings.insertion
+    assert long - short == pytest.approx(0.0048, abs=5e-5)
+
+
+@pytest.mark.parametrize("fine", [0.9, 1.1])
+def test_rest_is_compared_with_shorter_steps_and_a_stricter_solver(monkeypatch, fine):
+    """Only the mean force of the reference counts: its own motion is not judged."""
+    swing = 1e-3 * np.sin(np.arange(200.0))[:, None, None] * np.eye(3)[:1]
+
+    def watch(step, settling, watched):
+        if step == rest.PHYSICS_TIMESTEP / rest.FINER:
+            return rest.Rest(swing, fine * (1.0 + 50 * swing[..., 0]))
+        assert step == rest.PHYSICS_TIMESTEP
+        return rest.Rest(0.0 * swing, np.ones((200, 1)))
+
+    def pushed(options, anatomy, depths, *, physics_timestep):
+        return physics_timestep
+
+    monkeypatch.setattr(rest, "watch", watch)
+    monkeypatch.setattr(rest, "pushed", pushed)
+    one = rest.compared({}, ("type1",), (0.05,))
+    assert one.deviation == pytest.approx(100 * abs(1 / fine - 1), rel=0.01)
+    assert not one.wobble.any() and not one.fluctuation.any()
+    given = []
+    monkeypatch.setattr(rest, "compared", lambda each: given.append(each) or one)
+    rest.validate_rest()
+    usual, strict = given[: len(rest.DEVICES)], given[len(rest.DEVICES) :]
+    assert usual == [*rest.DEVICES.values()]
+    assert strict == [{**each, "solver_tolerance": rest.STRICT} for each in usual]
+
+
 def test_the_helix_of_one_hand_ends_where_it_turns_back():
     way = np.concatenate([np.zeros(5), np.arange(80) * 0.2])
     turn = np.where(way < 10, way, 20 - way)

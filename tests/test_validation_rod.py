@@ -5,7 +5,7 @@ import pytest
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import MAX_ROTATION_SPEED
-from cathsim_dmc.validation import platforms, rod, sheath
+from cathsim_dmc.validation import platforms, rod, sheath, theory
 from cathsim_dmc.validation.rig import Rig
 
 
@@ -32,6 +32,30 @@ def test_cantilever_is_the_elastica_up_to_60_degrees_in_any_plane():
     assert max(one.deviation for one in results) < rod.CANTILEVER_BOUND / 100
     # The loads are not trivial: the end moves by more than half of the length.
     assert results[2].expected.position[-1, 1] > 0.2
+
+
+def test_a_displacement_out_of_the_plane_of_the_load_is_an_error(monkeypatch):
+    class Aside(Rig):
+        """A rig that bends as the elastica does, and by 3 % to the side."""
+
+        def settle(self, force, **_):
+            lengths, bending, _ = self.sections
+            end = theory.elastica(lengths, bending, np.radians(30.0)).position[-1]
+            along, across = end - (lengths.sum(), 0.0)
+            aside = 0.03 * np.hypot(along, across)
+            self.data.site_xpos[self.head] += across, aside, along
+
+    monkeypatch.setattr(rod, "Rig", Aside)
+    (one,) = rod.cantilevers(end_angles=(30.0,), plane=0.0)
+    assert one.deviation == pytest.approx(0.03)
+
+
+def test_the_rise_of_a_lag_is_that_of_each_curve():
+    time = np.linspace(0.0, 4.0, 4001)
+    mine, expected = (0.3 * (1 - np.exp(-time / rise)) for rise in (0.2, 0.25))
+    lag = rod.TwistLag(time, 2 * time, 2 * time - mine, expected)
+    assert lag.lags == pytest.approx((0.3, 0.3), rel=1e-4)
+    assert lag.rises == pytest.approx((0.2, 0.25), rel=1e-3)
 
 
 def test_coarse_chain_fails_the_cantilever():

@@ -1,6 +1,8 @@
 """Closed forms against other closed forms, and the report of checks."""
 
+import itertools
 import json
+import types
 
 import numpy as np
 import pytest
@@ -8,7 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
-from cathsim_dmc.validation import force_sensors, pair, rod, theory, vessel, wall
+from cathsim_dmc.entities.contact import FRICTION
+from cathsim_dmc.laws.compliance import Material, stiffness
+from cathsim_dmc.validation import (
+    damping,
+    force_sensors,
+    friction,
+    pair,
+    rod,
+    s_bend,
+    theory,
+    two_rods,
+    vessel,
+    wall,
+)
 from cathsim_dmc.validation.checks import Check, Report
 
 # Checks whose bounds the physics misses (docs/limits.md).
@@ -74,6 +89,152 @@ def test_report_is_one_json_object_without_nan():
     assert plain["findings"] == {"array": [0.0, 1.0], "nan": None}
     assert not report.passed
     assert report.table().row_count == 2
+
+
+# What the checks judge, of measurements that are right but for one of each kind.
+
+WRONG = [0.0, 0.06, -0.06, np.nan]  # relative deviation
+
+
+def replaced(monkeypatch, module, **measures):
+    """Replaces the measurements of a module by functions."""
+    for name, measure in measures.items():
+        monkeypatch.setattr(module, name, measure)
+
+
+def judged(checks, wrong):
+    """Whether the checks, which all should be alike, pass."""
+    found = {check.name: check.passed for check in checks}
+    assert len(set(found.values())) == 1 and len(found) > 1, found
+    assert all(found.values()) == (wrong == 0.0)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_the_rod_is_judged_by_its_worst_measurement(monkeypatch, wrong):
+    off, size, one = 1 + wrong, abs(wrong), np.ones(1)
+
+    class Driven:
+        """A drive that gives way under a load."""
+
+        def move(self, duration, command, force):
+            return command * duration * 0.04 * off - 1e-2 * size * force
+
+    def cantilevers(name="berenstein_5f", *_, **__):
+        deviation = size if name == "berenstein_5f" else 0.0
+        shape = theory.Elastica(1.0, np.zeros((1, 2)))
+        return [rod.Cantilever(0.5, np.zeros((1, 2)), shape, deviation)]
+
+    replaced(
+        monkeypatch,
+        rod,
+        Driven=Driven,
+        cantilevers=cantilevers,
+        buckling=lambda end: rod.Buckling(end, 1.0, one, one, off, 1.0),
+        twist_under_torque=lambda device: (1.0, off * rod.TWIST),
+        twist_lag=lambda: types.SimpleNamespace(lags=(off, 1.0), rises=(off, 1.0)),
+        slip_force=lambda: 5.0 * off,
+    )
+    judged(itertools.islice(rod._checks({}), 11), wrong)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_damping_is_judged_by_its_worst_measurement(monkeypatch, wrong):
+    off = 1 + wrong
+    replaced(
+        monkeypatch,
+        damping,
+        release=lambda *, blood: (off, 1.0, off, 1.0),
+        spin=lambda speed: (off, 1.0),
+        three_point=lambda span, link, on_joint: 1.0 if on_joint else off,
+    )
+    judged(damping.checks(), wrong)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_friction_is_judged_by_its_worst_measurement(monkeypatch, wrong):
+    size = abs(wrong)
+
+    def slid(device, load, speed):
+        last = speed == friction.SPEEDS[-1]
+        return FRICTION * (1 + wrong * last), size * last
+
+    replaced(
+        monkeypatch,
+        friction,
+        slid=slid,
+        creep=lambda device: 1e-3 * size,
+        arch_ripple=lambda: size,
+        CAPSTANS=(),
+    )
+    judged(friction.checks([]), wrong)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_stopped_push_is_judged_at_rest(monkeypatch, wrong):
+    off = 1 + wrong
+
+    def stopped(speed, coefficient, later=0.0, tolerance=0.0):
+        held = off * off if later else 1.0
+        return s_bend.Stopped(1.0, off, held, 1.0, off, 1.0)
+
+    replaced(monkeypatch, s_bend, stopped=stopped)
+    judged(s_bend.checks(), wrong)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_two_rods_are_judged_by_energy_and_by_the_device_that_is_off(
+    monkeypatch, wrong
+):
+    """The drag on the wire is proportional to its speed; the force points backwards."""
+
+    def rods(turn, end, **more):
+        return two_rods.Rods(np.array([0.0, turn]), np.array([0.0, 0.0, end]), **more)
+
+    def simulate(names, gaps, rotation):
+        force = np.where(np.array(gaps) > 0, 0.2 * (1 + wrong), 7.0)
+        return rods(0.0, 0.0, force=force)
+
+    def reference(devices, gaps, rotation, length):
+        return rods(0.0, 0.0, energy=1.0 - 0.2 * float(np.sum(gaps)))
+
+    replaced(
+        monkeypatch,
+        two_rods,
+        in_half_circle=lambda *_: (rods(wrong, 0.3 + wrong), rods(0.0, 0.3), 0.35),
+        simulate=simulate,
+        reference=reference,
+        work=lambda speed: (1.0 + wrong + 100.0 * speed, 1.0),
+    )
+    judged(two_rods.checks(), wrong)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_vessel_is_judged_by_its_worst_measurement(monkeypatch, wrong):
+    off, size = 1 + wrong, abs(wrong)
+
+    def indentation(kind, radius, modulus, loads):
+        ends = 2 if kind == "capsule" else 1
+        return loads * off / ends / stiffness(radius, Material(modulus, 1.5e-3, 1.0))
+
+    replaced(
+        monkeypatch,
+        vessel,
+        cantilever=lambda speed: (off, 1.0),
+        terminal_velocity=lambda force: (off, 1.0),
+        volume_defect=lambda anatomy: size,
+        profile=lambda: (size, off),
+        indentation=indentation,
+        stiffened=lambda factor: size,
+    )
+    of_motion = {
+        "section_flow": lambda tube, time: off,
+        "diameters": lambda tube: (1e-2 * size, np.array([0.0, wrong]), np.zeros(2)),
+        "wall_place": lambda anatomy: 1e-2 * size,
+        "slip": lambda tube: 100 * size,
+        "frame": lambda tube: 100 * size,
+    }
+    replaced(monkeypatch, vessel.motion, **of_motion)
+    judged(vessel._checks(), wrong)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cathsim_dmc.entities import contact
+from cathsim_dmc.entities import arena, contact
 from cathsim_dmc.validation import convergence, friction, pair, s_bend, wall
 from cathsim_dmc.validation.rig import tube as straight_tube
 
@@ -45,6 +45,27 @@ def test_the_capstan_check_sees_an_end_that_swings(monkeypatch):
 def test_what_sticks_does_not_creep():
     """Half the limit moved it by 0.05 mm/s."""
     assert friction.creep("steerable_5f") < 1e-3 * friction.CREEP_BOUND
+
+
+def test_the_check_of_creep_sees_friction_that_gives_way(monkeypatch):
+    monkeypatch.setattr(arena, "FRICTION_STIFFNESS", 1.0)
+    assert 1e3 * friction.creep("steerable_5f") > friction.CREEP_BOUND
+
+
+def test_the_axis_of_the_s_bend_is_two_arcs_between_straight_ends():
+    line, bend, angle = s_bend._Line(0.01), s_bend.BEND, s_bend.ANGLE
+    turn = np.linspace(0.05, 0.95, 7) * angle
+    arc = bend * np.stack([1 - np.cos(turn), np.sin(turn)], axis=-1) + (0.0, 0.01)
+    way = np.stack([np.sin(turn), np.cos(turn)], axis=-1)
+    middle = bend * np.array([1 - np.cos(angle), np.sin(angle)]) + (0.0, 0.01)
+    straight = np.array([[0.0, -0.02], [0.0, 0.0]])
+    # The second half is the first one turned about the middle.
+    points = np.vstack([straight, arc, 2 * middle - arc, 2 * middle - straight])
+    ways = np.vstack([[[0.0, 1.0]] * 2, way, way, [[0.0, 1.0]] * 2])
+    for aside in (-2e-3, 0.0, 2e-3):
+        offset, tangent = line.nearest(points + aside * ways[:, ::-1] * (1, -1))
+        np.testing.assert_allclose(offset, aside, atol=1e-12)
+        np.testing.assert_allclose(tangent, ways, atol=1e-12)
 
 
 def test_sliding_does_not_lift_a_device_off_the_wall():
