@@ -20,6 +20,25 @@ from cathsim_dmc.tasks.anatomies import GOALS
 from cathsim_dmc.validation.wall import field_error, lumen_checks
 
 RADII = [7.492, 4.211, 6.129]  # mm, of the BCA in the first three test arches
+# Means over the points of all centrelines, mm: x, y, z and the radius of the lumen.
+FIGURES = {
+    "arch-I-2000000": (27.917, 19.818, 55.395, 9.233),
+    "arch-III-3000000": (7.753, 23.511, 39.37, 6.944),
+    "arch-II-bovine_trunk-3000001": (21.081, 8.343, 55.546, 9.68),
+    "arch-II-bovine_branch-3000002": (28.474, 14.995, 54.023, 7.195),
+    "arch-II-aberrant-3000003": (22.308, 18.808, 53.083, 8.904),
+    "neck-III-bovine_branch-5000000": (-4.353, -1.221, 92.379, 6.156),
+}
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_the_arches_of_the_sets_keep_their_geometry(name):
+    """As long as these figures stay, so do the arches that results were measured on."""
+    sets = (arch.arch_set(one) for one in arch.SETS)
+    (seed,) = [one for each in sets for one in each if one.name == name]
+    lines = [one.centreline for one in arch_tree(seed.parameters()).vessels.values()]
+    rows = np.vstack([np.column_stack([one.points, one.radii]) for one in lines])
+    assert 1e3 * rows.mean(axis=0) == pytest.approx(FIGURES[name], abs=2e-3)
 
 
 def test_same_seed_gives_the_same_bytes():
@@ -74,7 +93,6 @@ def test_sets_are_disjoint_and_fixed():
     assert {one.variant for one in test} == {"normal"}
     assert {one.variant for one in arch.arch_set("test_variants")} == set(arch.VARIANTS)
     assert test[3].name == "arch-II-2000003"
-    # As long as these figures stay, so do the arches that results were measured on.
     radii = [round(1e3 * one.parameters().bca.radius, 3) for one in test[:3]]
     assert radii == RADII
     with pytest.raises(ValueError, match="train, test, test_variants"):

@@ -94,10 +94,8 @@ def release(*, blood: bool = True) -> tuple[float, float, float, float]:
         curve.append(rig.head_position[0])
     time = rig.model.opt.timestep * np.arange(len(curve))
     beam = _beam(one, length, start, time, blood)
-    (mine, decay), (theirs, expected) = (
-        _swing(time, np.array(curve)),
-        _swing(time, beam),
-    )
+    mine, decay = _swing(time, np.array(curve))
+    theirs, expected = _swing(time, beam)
     return mine, theirs, decay, expected
 
 

@@ -64,10 +64,8 @@ def speed(say: Callable[[str], None] = lambda text: None) -> Report:
     for policy in ("random", "push"):
         runs = suite_overhead(policy)
         low, middle, high = np.quantile(runs, [0.25, 0.5, 0.75])
-        name, note = (
-            f"suite step / mj_step, {policy}",
-            f"quartiles {low:.2f}–{high:.2f}",
-        )
+        name = f"suite step / mj_step, {policy}"
+        note = f"quartiles {low:.2f}–{high:.2f}"
         checks.append(Check.at_most(name, float(middle), MOST_OVERHEAD, "x", note))
     return Report("speed, one core", checks, {"calibration": calibration})
 

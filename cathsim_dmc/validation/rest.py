@@ -125,10 +125,7 @@ class Compared(NamedTuple):
 
     def checks(self, name: str) -> Iterator[Check]:
         """Checks of the worst state of the device `name`."""
-        name, moved = (
-            f"{name} at rest, worst of {len(self.wobble)} states: ",
-            self.moved,
-        )
+        name = f"{name} at rest, worst of {len(self.wobble)} states: "
         note = f"median {np.median(self.wobble):.4f} mm"
         most = self.wobble.max()
         yield Check.at_most(f"{name}RMS of the head", most, STILL, "mm", note)
@@ -136,7 +133,7 @@ class Compared(NamedTuple):
         most = self.fluctuation.max()
         yield Check.at_most(f"{name}fluctuation of the force", most, STEADY, "%", note)
         note = f"median {np.median(self.deviation):.2f} %, the head is "
-        note += f"{moved.max():.3f} mm away at most"
+        note += f"{self.moved.max():.3f} mm away at most"
         what = f"{name}mean force against steps {FINER} times shorter"
         yield Check.at_most(what, self.deviation.max(), CONVERGED, "%", note)
 

@@ -22,6 +22,7 @@ _SHAKE = 0.15  # standard deviation of each coordinate of a unit heading
 # lengths and courses are.
 _CAROTID, _ARM, _VERTEBRAL = (3.15e-3, 0.35e-3), (3.6e-3, 0.4e-3), (1.8e-3, 0.2e-3)
 _THINNEST = 1.3e-3  # m
+_ATTEMPTS = 20
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,7 @@ def _line(
     return Centreline(line.points, np.interp(share, along, radii))
 
 
-def sample_neck(
-    random_state: Random, tree: VesselTree, attempts: int = 20
-) -> tuple[Course, ...]:
+def sample_neck(random_state: Random, tree: VesselTree) -> tuple[Course, ...]:
     """Random arteries of neck and arms for an arch; equal states give equal arteries.
 
     The BCA divides into the right carotid (`rcca`) and the right subclavian artery
@@ -108,6 +107,7 @@ def sample_neck(
             "a neck needs an arch with bca, lcca and lsa; this one has "
             f"{', '.join(tree.vessels)}"
         )
+    attempts = _ATTEMPTS
     while True:
         courses = _drawn(random_state, tree)
         try:
