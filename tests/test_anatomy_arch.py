@@ -8,7 +8,7 @@ import pytest
 
 from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.anatomy.arch.tree import arch_tree
+from cathsim_dmc.anatomy.arch.tree import _septa, arch_tree
 
 
 def test_type_one_has_the_published_figures():
@@ -90,6 +90,29 @@ def test_branches_that_cross_are_refused():
     upright = replace(arch.TYPE_II.bca, take_off=-0.3)
     with pytest.raises(ValueError, match="come within|leaves at"):
         arch_tree(replace(arch.TYPE_II, lcca=leaning, bca=upright))
+
+
+def test_the_wall_between_ostia_is_what_their_radii_leave_of_the_spacings():
+    radii = {"bca": 6e-3, "lcca": 4e-3, "lsa": 5e-3}
+    branches = {n: replace(getattr(arch.TYPE_II, n), radius=r, end_radius=r)
+                for n, r in radii.items()}  # fmt: skip
+    spacings = {"bca_lcca_spacing": 21e-3, "lcca_lsa_spacing": 12e-3}
+    params = replace(arch.TYPE_II, **branches, **spacings)
+    assert _septa(params) == pytest.approx([11e-3, 3e-3, 3e-3])
+    # An LCCA on the BCA has no neighbour; that of the BCA is the LSA.
+    trunk = replace(params, bovine=True, lcca_lsa_spacing=30e-3)
+    assert _septa(trunk) == pytest.approx([math.inf, 19e-3, 19e-3])
+    last = replace(branches["lsa"], radius=4.5e-3, end_radius=4.5e-3)
+    rsa = replace(params, aberrant=last, lsa_aberrant_spacing=12e-3)
+    assert _septa(rsa) == pytest.approx([11e-3, 3e-3, 2.5e-3, 2.5e-3])
+
+
+def test_a_branch_that_is_wider_than_its_parent_is_refused():
+    levels = ("bca_level", "lcca_level", "lsa_level", "descending")
+    thin = {f"{level}_radius": 10e-3 for level in levels}
+    wide = replace(arch.TYPE_II.bca, radius=11.9e-3)
+    with pytest.raises(ValueError, match="'bca' has a radius of 0.014. m.*0.95 of its"):
+        arch_tree(replace(arch.TYPE_II, bca=wide, bca_lcca_spacing=35e-3, **thin))
 
 
 def test_limbs_bend_and_the_plane_tilts_and_sways():
