@@ -23,6 +23,7 @@ RADII = [7.492, 4.211, 6.129]  # mm, of the BCA in the first three test arches
 # Means over the points of all centrelines, mm: x, y, z and the radius of the lumen.
 FIGURES = {
     "arch-I-2000000": (27.917, 19.818, 55.395, 9.233),
+    "arch-I-2000010": (38.245, 13.851, 38.548, 8.949),  # its limb bends the most
     "arch-III-3000000": (7.753, 23.511, 39.37, 6.944),
     "arch-II-bovine_trunk-3000001": (21.081, 8.343, 55.546, 9.68),
     "arch-II-bovine_branch-3000002": (28.474, 14.995, 54.023, 7.195),
