@@ -156,7 +156,7 @@ def test_friction_is_judged_by_its_worst_measurement(monkeypatch, wrong):
 
     def slid(device, load, speed):
         last = speed == friction.SPEEDS[-1]
-        return FRICTION * (1 + wrong * last), size * last
+        return (FRICTION * (1 + wrong), size) if last else (FRICTION, 0.0)
 
     replaced(
         monkeypatch,
