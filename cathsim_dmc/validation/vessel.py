@@ -17,6 +17,7 @@ from cathsim_dmc.laws.blood import Blood, beat
 from cathsim_dmc.laws.compliance import Material, reference, stiffness
 from cathsim_dmc.laws.parameters import total
 from cathsim_dmc.laws.planes import MOST
+from cathsim_dmc.physics import adapters, dispatcher
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
 from cathsim_dmc.physics.effects import views
 from cathsim_dmc.physics.flow import EXPONENT, velocities
@@ -68,8 +69,6 @@ def cantilever(speed: float) -> tuple[float, float]:
 
 def terminal_velocity(force: float) -> tuple[float, float]:
     """Velocity (m/s) of a free link under a lateral force (N), and expected one."""
-    from cathsim_dmc.physics import adapters, dispatcher
-
     radius = devices.get("steerable_5f").outer_radius
     sizes = {"links": 1, "joints": 0}
     spec = bare()
@@ -132,8 +131,6 @@ def indentation(
 
     It lies along a tube with a radius, m, and a wall of 1.5 mm with a modulus, Pa.
     """
-    from cathsim_dmc.physics import adapters, dispatcher
-
     spec = bare(tube(0.2, radius).lumen)
     spec.nuserdata = MOST + 1
     half = LINK / 2 if kind == "capsule" else 0.0
