@@ -24,6 +24,7 @@ from cathsim_dmc.physics import held
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.simulation.warp import contacts, devices
 from cathsim_dmc.simulation.warp.simulation import WarpSimulation
+from cathsim_dmc.simulation.warp.worlds import Worlds
 
 needs_warp = pytest.mark.skipif(
     importlib.util.find_spec("mujoco_warp") is None, reason="needs the extra gpu"
@@ -205,6 +206,20 @@ def test_parameters_of_contacts_are_mixed_as_in_mujoco():
     assert dims == {0: links.dims[0, 0], 1: links.dims[0, 1]}
     assert links.mix[0, 0] == 0.25
     assert links.priorities.tolist() == [[0, 1]]
+
+
+@needs_warp
+def test_devices_that_turn_take_part_in_a_pool():
+    """Anatomies have bases of other lengths, and these the field `dof_length`."""
+    task = suite.make_task("arch_lcca", pool=2, rotation=True)
+    simulation = WarpSimulation(task, 3, device="cpu")
+    simulation.reset()
+    stepper = simulation.stepper
+    lengths = stepper._own["dof_length"]
+    assert (lengths != lengths[0]).any()
+    laws = stepper.contacts, stepper._passive
+    made = Worlds(stepper._device, stepper._model, stepper._own, laws, 1)
+    made.write_model(stepper._own, ["dof_length"])
 
 
 @pytest.mark.slow

@@ -23,8 +23,9 @@ CONTACTS, ROWS = 48, 128
 SPARSE = True
 _WRITTEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl", "qfrc_applied", "time")
 _ALWAYS = ("qpos", "act", "ctrl", "qfrc_applied", "time")
-# Fields of a model that Warp does not read here: they serve MuJoCo's own collision.
-_HOST_ONLY = ("geom_aabb", "geom_rbound", "mesh_")
+# Fields of a model that Warp does not read here: they serve MuJoCo's own collision,
+# and islands that sleep.
+_HOST_ONLY = ("geom_aabb", "geom_rbound", "mesh_", "dof_length")
 
 
 class Worlds:
