@@ -18,6 +18,8 @@ from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.torchrl import BatchedEnv
 
 # isort: on
+from dm_control import mjcf
+
 from cathsim_dmc import suite
 from cathsim_dmc.entities.contact import CONTACT_SOLREF
 from cathsim_dmc.physics import held
@@ -206,6 +208,17 @@ def test_parameters_of_contacts_are_mixed_as_in_mujoco():
     assert dims == {0: links.dims[0, 0], 1: links.dims[0, 1]}
     assert links.mix[0, 0] == 0.25
     assert links.priorities.tolist() == [[0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("options", "names"),
+    [({}, ["wall"]), ({"sheath_clearance": 1e-3}, ["wall", "sheath/bore"])],
+)
+def test_a_bore_without_contact_has_none_on_warp(options, names):
+    task = suite.make_task("type1_lcca", **options)
+    model = mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model).model.ptr
+    found = [model.geom(geom).name for geom in contacts.carriers_of(model).tolist()]
+    assert found == names
 
 
 @needs_warp

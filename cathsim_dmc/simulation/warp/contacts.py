@@ -209,9 +209,10 @@ class WallContacts:
 
 
 def carriers_of(model: mujoco.MjModel) -> np.ndarray:
-    """Geoms (C,) of a compiled model that carry a wall."""
-    marked = [registered(tuple(user)) is not None for user in model.geom_user.tolist()]
-    return np.flatnonzero(marked)
+    """Geoms (C,) of a compiled model that carry a wall and collide."""
+    marked = [registered(user) is not None for user in model.geom_user.tolist()]
+    # The bore of a sheath that holds the device by hinges does not.
+    return np.flatnonzero(np.array(marked) & (model.geom_contype != 0))
 
 
 def _links(model: mujoco.MjModel, carriers: np.ndarray) -> Links:
