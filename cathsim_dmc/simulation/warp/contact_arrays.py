@@ -18,7 +18,7 @@ class Links(NamedTuple):
         dims: (L, C) dimensions of a contact.
         priorities: (L, C) 1 where the carrier's parameters hold, -1 where the link's
             do, 0 where they are mixed.
-        mix: (L, C) weight of the link's `solref` and `solimp`.
+        mix: (L, C) weight of the link's `solref` and `solimp` where they are mixed.
     """
 
     geoms: Any
@@ -65,10 +65,10 @@ class Walls(NamedTuple):
 class Fields(NamedTuple):
     """Fields of Warp's model, (1 or N, ...)."""
 
-    size: Any
-    friction: Any
-    solref: Any
-    solimp: Any
+    geom_size: Any
+    geom_friction: Any
+    geom_solref: Any
+    geom_solimp: Any
     timestep: Any
 
 
@@ -102,21 +102,17 @@ class Found(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Arrays of mujoco_warp's `Contact`, and their number."""
+    """Arrays of mujoco_warp's `Contact` that differ between contacts, and `nacon`."""
 
     dist: Any
     pos: Any
     frame: Any
-    includemargin: Any
     friction: Any
     solref: Any
-    solreffriction: Any
     solimp: Any
     dim: Any
     geom: Any
     efc_address: Any
     worldid: Any
-    type: Any
     geomcollisionid: Any
-    adhesion: Any
     nacon: Any

@@ -42,7 +42,7 @@ from cathsim_dmc.simulation.warp.devices import Scratch
 SCRATCH: Scratch = ((SAMPLES,), (PLANES, 4), (MOST, CONTACT))
 _ROUNDED = 1e-6  # of a number in single precision
 _LEAST_FRICTION = 1e-5  # MuJoCo's mjMINMU
-_CONSTRAINT = 1  # mujoco_warp's ContactType.CONSTRAINT
+_OVERFLOW = 1 << 3  # mujoco_warp's OverflowType.NARROWPHASE
 
 
 @compiled
@@ -103,6 +103,8 @@ class Pair(NamedTuple):
     """A link and a wall in one world.
 
     Attributes:
+        world: Number of the world.
+        number: Number of the wall in `Walls`.
         wall: `laws.wall.Wall`.
         capsule: The link in the frame of the wall.
         law: `laws.contact.Law`.
@@ -112,6 +114,8 @@ class Pair(NamedTuple):
         frame: (9) matrix whose columns are the axes of the wall's frame.
     """
 
+    world: Any
+    number: Any
     wall: Any
     capsule: Any
     law: Any
@@ -122,19 +126,17 @@ class Pair(NamedTuple):
 
 
 @compiled
-def pair_of(thread, links, walls, fields, motion):
-    """`Pair` of a thread.
+def _whose(thread, links, worlds):
+    """Link, world and carrier of a thread, (carrier · N + world) · L + link."""
+    count = len(links.geoms)
+    return thread % count, thread // count % worlds, thread // (count * worlds)
 
-    Args:
-        thread: (carrier · N + world) · L + link.
-        links: `Links`.
-        walls: `Walls`.
-        fields: `Fields`.
-        motion: `Motion`.
-    """
-    count, worlds = len(links.geoms), len(walls.of_world)
-    link, world = thread % count, (thread // count) % worlds
-    which = thread // (count * worlds)
+
+@compiled
+def pair_of(thread, scene):
+    """`Pair` of a thread of a `Scene`."""
+    links, walls, fields, motion = scene.links, scene.walls, scene.fields, scene.motion
+    link, world, which = _whose(thread, links, len(walls.of_world))
     geom, number = links.geoms[link], walls.of_world[world, which]
     wall, middle = _wall(walls, number), walls.middle[number]
     frame = matrix(walls.turns, world, which)
@@ -145,17 +147,17 @@ def pair_of(thread, links, walls, fields, motion):
     apart = (centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2])
     seen = into(frame, apart)
     local = (middle[0] + seen[0], middle[1] + seen[1], middle[2] + seen[2])
-    size = fields.size[world % len(fields.size), geom]
+    size = fields.geom_size[world % len(fields.geom_size), geom]
     radius, half_length = float(size[0]), float(size[1])
     caps = (True, True)
     if links.joints[link] >= 0:
         joint = vector(motion.xpos, world, links.joints[link])
         caps = end_caps(centre, axis, half_length, joint)
     capsule = Capsule(local, into(frame, axis), half_length, caps)
-    impedance = float(fields.solimp[world % len(fields.solimp), geom, 0])
+    impedance = float(fields.geom_solimp[world % len(fields.geom_solimp), geom, 0])
     if abs(impedance - COMPLIANT) < _ROUNDED:
         impedance = COMPLIANT
-    reference = float(fields.solref[world % len(fields.solref), geom, 0])
+    reference = float(fields.geom_solref[world % len(fields.geom_solref), geom, 0])
     law = contact_law(wall, radius, 0.0, impedance, reference)
     travel, turn = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     if looks_ahead(law):
@@ -163,7 +165,7 @@ def pair_of(thread, links, walls, fields, motion):
         travel, turn = _swept(links, motion, world, link, step)
         travel, turn = into(frame, travel), into(frame, turn)
     sweep = sweep_of(capsule, law, travel, turn)
-    return Pair(wall, capsule, law, sweep, centre, axis, frame)
+    return Pair(world, number, wall, capsule, law, sweep, centre, axis, frame)
 
 
 class Scene(NamedTuple):
@@ -186,7 +188,7 @@ class Written(NamedTuple):
         out: Warp's contacts, world by world, without a gap between two worlds.
         counts: (N,) number of contacts of a world.
         starts: (N,) index of the first contact of a world.
-        overflow: (N,) set to 1 if a world has more contacts than room.
+        overflow: (N,) Warp's bits of what a world has too much of.
     """
 
     links: Links
@@ -203,12 +205,12 @@ def find(thread, scratch, scene):
     """Finds the contacts of a link with a wall.
 
     Args:
-        thread: As `pair_of`.
+        thread: As `_whose`.
         scratch: Arrays of the shapes `SCRATCH`.
         scene: `Scene`.
     """
     scene.found.number[thread] = 0
-    pair = pair_of(thread, scene.links, scene.walls, scene.fields, scene.motion)
+    pair = pair_of(thread, scene)
     if not is_finite(pair):
         return
     samples, planes, out = scratch
@@ -250,47 +252,36 @@ def _tangent(normal):
 
 
 @compiled
-def _mixed(array, row, geoms, k, mix, priority):
-    """Entry k of a parameter of a contact, from those of link and carrier."""
-    link, carrier = float(array[row, geoms[0], k]), float(array[row, geoms[1], k])
+def _of_one(priority, link, carrier, of_both):
+    """The parameter of the geom with the higher priority, or that of both."""
     if priority:
         return carrier if priority > 0 else link
-    return mix * link + (1.0 - mix) * carrier
+    return of_both
 
 
 @compiled
 def _write_law(links, fields, out, at, pair):
     """Writes a contact's parameters from two geoms, as MuJoCo's `mj_contactParam`."""
     world, link, which = pair
-    geoms = links.geoms[link], links.carriers[which]
+    own, other = links.geoms[link], links.carriers[which]
     priority, mix = links.priorities[link, which], links.mix[link, which]
-    row = world % len(fields.friction)
-    for k in range(3):  # sliding, spinning and rolling
-        one = float(fields.friction[row, geoms[0], k])
-        other = float(fields.friction[row, geoms[1], k])
-        value = max(one, other)
-        if priority:
-            value = other if priority > 0 else one
-        value = max(value, _LEAST_FRICTION)
-        if k == 1:
-            out.friction[at, 2] = value
-        else:
-            first = 0 if k == 0 else 3
-            out.friction[at, first] = out.friction[at, first + 1] = value
-    row = world % len(fields.solref)
-    first = fields.solref[row, geoms[0], 0], fields.solref[row, geoms[1], 0]
-    direct = first[0] <= 0 or first[1] <= 0
+    row = fields.geom_friction[world % len(fields.geom_friction)]
+    for k, kind in enumerate((0, 0, 1, 2, 2)):  # sliding, spinning, rolling
+        a, b = float(row[own, kind]), float(row[other, kind])
+        friction = _of_one(priority, a, b, max(a, b))
+        out.friction[at, k] = max(friction, _LEAST_FRICTION)
+    row = fields.geom_solref[world % len(fields.geom_solref)]
+    direct = row[own, 0] <= 0 or row[other, 0] <= 0
     for k in range(2):
-        value = _mixed(fields.solref, row, geoms, k, mix, priority)
-        if direct and not priority:
-            one = float(fields.solref[row, geoms[0], k])
-            value = min(one, float(fields.solref[row, geoms[1], k]))
-        out.solref[at, k], out.solreffriction[at, k] = value, 0.0
-    row = world % len(fields.solimp)
+        a, b = float(row[own, k]), float(row[other, k])
+        both = min(a, b) if direct else mix * a + (1.0 - mix) * b
+        out.solref[at, k] = _of_one(priority, a, b, both)
+    row = fields.geom_solimp[world % len(fields.geom_solimp)]
     for k in range(5):
-        out.solimp[at, k] = _mixed(fields.solimp, row, geoms, k, mix, priority)
+        a, b = float(row[own, k]), float(row[other, k])
+        out.solimp[at, k] = _of_one(priority, a, b, mix * a + (1.0 - mix) * b)
     out.dim[at] = links.dims[link, which]
-    out.geom[at, 0], out.geom[at, 1] = geoms
+    out.geom[at, 0], out.geom[at, 1] = own, other
 
 
 @compiled
@@ -310,7 +301,7 @@ def count(world, scratch, given):
             total += found.number[thread]
     most = len(given.out.dist) // worlds
     if total > most:
-        given.overflow[world] = 1
+        given.overflow[world] |= _OVERFLOW
     given.counts[world] = min(total, most)
 
 
@@ -319,14 +310,13 @@ def place(thread, scratch, given):
     """Writes the contacts of a link with a wall into Warp's arrays.
 
     Args:
-        thread: As `pair_of`.
+        thread: As `_whose`.
         scratch: Not used.
         given: `Written`.
     """
     links, found, out = given.links, given.found, given.out
     threads, worlds = len(links.geoms), len(given.overflow)
-    link, world = thread % threads, (thread // threads) % worlds
-    which = thread // (threads * worlds)
+    link, world, which = _whose(thread, links, worlds)
     last = given.starts[world] + given.counts[world]
     if thread == 0:
         out.nacon[0] = given.starts[worlds - 1] + given.counts[worlds - 1]
@@ -335,32 +325,29 @@ def place(thread, scratch, given):
         carrier, before = own // threads, own % threads
         at += found.number[(carrier * worlds + world) * threads + before]
     for n in range(min(found.number[thread], last - at)):
-        _write(given, at, (world, link, which, n), found.rows[thread, n])
-        at += 1
+        _write(given, at + n, (world, link, which), found.rows[thread, n])
+        out.geomcollisionid[at + n] = n
 
 
 @compiled
 def _write(given, at, own, row):
     """Writes a contact to index `at` of Warp's arrays."""
-    world, link, which, n = own
-    out = given.out
-    out.dist[at], out.includemargin[at] = row[0], 0.0
-    normal = (row[4], row[5], row[6])
+    out, normal = given.out, (row[4], row[5], row[6])
     side = _tangent(normal)
     other = (
         normal[1] * side[2] - normal[2] * side[1],
         normal[2] * side[0] - normal[0] * side[2],
         normal[0] * side[1] - normal[1] * side[0],
     )
+    out.dist[at] = row[0]
     for k in range(3):
         out.pos[at, k] = row[1 + k]
         out.frame[at, 0, k] = normal[k]
         out.frame[at, 1, k] = side[k]
         out.frame[at, 2, k] = other[k]
-    _write_law(given.links, given.fields, out, at, (world, link, which))
+    _write_law(given.links, given.fields, out, at, own)
     if row[7] != 0.0:
         share(Contact(out.pos[at], out.frame[at], out.solimp[at], out.solref[at]))
-    out.worldid[at], out.type[at] = world, _CONSTRAINT
-    out.geomcollisionid[at], out.adhesion[at] = n, 0.0
+    out.worldid[at] = own[0]
     for k in range(out.efc_address.shape[1]):
         out.efc_address[at, k] = -1

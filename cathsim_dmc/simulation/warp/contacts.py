@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import mujoco
@@ -29,7 +29,10 @@ from cathsim_dmc.simulation.warp.contact_kernels import (
     place,
 )
 from cathsim_dmc.simulation.warp.devices import NONE, Device
-from cathsim_dmc.simulation.warp.moving import MovingWalls
+
+_CONSTRAINT = 1  # mujoco_warp's ContactType.CONSTRAINT
+# Of the arrays of `Walls` that are joined.
+_KINDS = (np.float64, np.int16, np.int32, np.int16, np.float64, np.float64)
 
 
 class WallContacts:
@@ -57,18 +60,18 @@ class WallContacts:
         self.carriers = carriers_of(model)
         self.is_wall = np.zeros(model.ngeom, bool)
         self.is_wall[self.carriers] = model.geom_bodyid[self.carriers] == 0
-        self._host = _links(model, self.carriers)
-        self._links = Links._make(map(device.constant, self._host))
+        links = _links(model, self.carriers)
+        self._links, self._threads = (
+            device.constant(links),
+            num_worlds * links.dims.size,
+        )
         self._numbers: dict[tuple[float, ...], int] = {}
         self._parts: list[Registered] = []
         shape = num_worlds, len(self.carriers)
         self._of_world = np.zeros(shape, np.int32)
         self._places, self._turns = np.zeros((*shape, 3)), np.zeros((*shape, 3, 3))
-        self._walls: Walls | None = None
-        self._motion: MovingWalls | None = None
+        self._walls: Any = None
         self.enter(np.arange(num_worlds), model, mujoco.MjData(model))
-        self._scene: Scene | None = None
-        self._written: Written | None = None
 
     def enter(
         self, worlds: Sequence[int] | np.ndarray, model: mujoco.MjModel,
@@ -92,18 +95,10 @@ class WallContacts:
             self._of_world[worlds, which] = self._numbers[key]
             self._places[worlds, which] = data.geom_xpos[carrier]
             self._turns[worlds, which] = data.geom_xmat[carrier].reshape(3, 3)
-        if self._motion is not None:
-            self._motion.enter(worlds, model, data)
         self._entered = True
 
-    def move(self, effect: Effect, bore: int) -> None:
-        """Makes the walls move; called before `bind`.
-
-        Args:
-            effect: `physics.motion.Moving`, bound to its worlds.
-            bore: Geom around the sheath; -1 for none.
-        """
-        self._motion = MovingWalls(self._device, effect, bore)
+    def take(self, effects: Iterable[Effect]) -> None:
+        """Takes the effects, bound to their worlds, before `bind`."""
 
     @property
     def is_bound(self) -> bool:
@@ -120,92 +115,83 @@ class WallContacts:
         device, view = self._device, self._device.view
         if self._walls is None:
             self._walls = self._made()
-        names = ("geom_size", "geom_friction", "geom_solref", "geom_solimp")
-        given = [view(getattr(model, name)) for name in names]
-        fields = Fields._make([*given, view(model.opt.timestep)])
-        motion = Motion._make(view(getattr(data, name)) for name in Motion._fields)
-        arrays = [view(getattr(data.contact, name)) for name in Contacts._fields[:-1]]
-        threads = self.num_worlds * self._host.dims.size
+        fields = device.views(Fields, model, timestep=view(model.opt.timestep))
         found = Found(
-            device.constant(np.zeros(threads, np.int32)),
-            device.constant(np.zeros((threads, MOST, ROW))),
+            device.constant(np.zeros(self._threads, np.int32)),
+            device.constant(np.zeros((self._threads, MOST, ROW))),
         )
-        self._overflow = device.constant(np.zeros(self.num_worlds, np.int32))
+        motion = device.views(Motion, data)
         self._scene = Scene(self._links, self._walls, fields, motion, found)
-        contacts = Contacts._make([*arrays, view(data.nacon)])
+        # The arrays that `Contacts` lacks stay 0.
+        data.contact.type.fill_(_CONSTRAINT)
+        contacts = device.views(Contacts, data.contact, nacon=view(data.nacon))
         self._sums = tuple(device.zeros(self.num_worlds) for _ in range(2))
         self.counts, self.starts = map(view, self._sums)
         self._written = Written(
-            self._links, fields, found, contacts, self.counts, self.starts,
-            self._overflow,
-        )  # fmt: skip
-        if self._motion is not None:
-            self._motion.bind(model, data, self._scene, self._written)
+            links=self._links,
+            fields=fields,
+            found=found,
+            out=contacts,
+            counts=self.counts,
+            starts=self.starts,
+            overflow=view(data.overflow),
+        )
 
     def begin(self) -> None:
         """Begins a control step."""
-        if self._entered and self._walls is not None:
-            self._device.write(self._walls.of_world, self._of_world)
-            self._device.write(self._walls.places, self._places)
-            self._device.write(self._walls.turns, self._turns)
-            if self._motion is not None:
-                self._motion.place()
+        if self._entered:
+            self._place()
             self._entered = False
-        self._device.write(self._overflow, np.zeros(self.num_worlds, np.int32))
 
-    def overflowed(self) -> np.ndarray:
-        """(N,) bool, whether a world had more contacts than room in the step."""
-        return self._device.host(self._overflow) != 0
+    def _place(self) -> None:
+        """Copies what `enter` has set to the device."""
+        self._device.write(self._walls.of_world, self._of_world)
+        self._device.write(self._walls.places, self._places)
+        self._device.write(self._walls.turns, self._turns)
 
     def __call__(self, model: Any, data: Any) -> None:
         """Finds the contacts with walls; mujoco_warp's callback after its collision."""
         del model, data
-        device, threads = self._device, self.num_worlds * self._host.dims.size
-        if self._motion is None:
-            device.launch(find, threads, SCRATCH, self._scene)
-        else:
-            self._motion.find(threads)
-        device.launch(count, self.num_worlds, NONE, self._written)
-        device.sum_before(self._sums[0], self._sums[1])
-        device.launch(place, threads, NONE, self._written)
+        self._find()
+        self._device.launch(count, self.num_worlds, NONE, self._written)
+        self._device.sum_before(self._sums[0], self._sums[1])
+        self._device.launch(place, self._threads, NONE, self._written)
+
+    def _find(self) -> None:
+        self._device.launch(find, self._threads, SCRATCH, self._scene)
 
     def write(self) -> None:
-        """Copies the parameters of the motion from the host to the device."""
-        if self._motion is not None:
-            self._motion.write()
+        """Copies the parameters of a motion from the host to the device."""
 
     def carry(self) -> None:
-        """Adds the velocities of walls to the rows of constraints, once these exist."""
-        if self._motion is not None:
-            self._motion.carry(self.num_worlds)
+        """Adds velocities of the walls to the rows of constraints, once these exist."""
+
+    def _lattice(self, wall: Registered) -> np.ndarray:
+        """Lattice of the motion of a wall, empty if it does not move."""
+        del wall
+        return np.zeros(0)
 
     def _made(self) -> Walls:
         """Copies the walls of all anatomies to the device."""
-        empty = [np.zeros(1), *(np.zeros(1, t) for t in (np.int16, np.int32, np.int16))]
-        columns: list[list[np.ndarray]] = [[] for _ in range(6)]
-        starts = np.zeros((len(self._parts), 6, 2), np.int64)
+        empty = np.zeros(0)
+        columns: list[list[np.ndarray]] = [[] for _ in _KINDS]
+        starts = np.zeros((len(self._parts), len(_KINDS), 2), np.int64)
         for number, wall in enumerate(self._parts):
-            lattice = wall.lattice
-            if self._motion is None or lattice is None:
-                lattice = np.zeros(0)
-            one = [*empty, wall.arrays[0]] if wall.is_bore else [*wall.arrays, empty[0]]
-            for which, array in enumerate([*one, lattice]):
+            lumen, line = (wall.arrays, empty)
+            if wall.is_bore:
+                lumen, line = [empty] * 4, wall.arrays[0]
+            for which, array in enumerate([*lumen, line, self._lattice(wall)]):
                 before = sum(map(len, columns[which]))
                 starts[number, which] = before, before + len(array)
-                columns[which].append(np.asarray(array).ravel())
-        types = (np.float64, np.int16, np.int32, np.int16, np.float64, np.float64)
+                columns[which].append(array)
         joined = (
             np.concatenate(column).astype(kind)
-            for column, kind in zip(columns, types, strict=True)
+            for column, kind in zip(columns, _KINDS, strict=True)
         )
-        constant = self._device.constant
-        rest = (
-            constant(starts),
-            constant(np.array([part.is_bore for part in self._parts])),
-            constant(np.array([part.middle for part in self._parts], np.float64)),
-            *map(constant, (self._of_world, self._places, self._turns)),
-        )
-        return Walls._make([*map(constant, joined), *rest])
+        bores = np.array([wall.is_bore for wall in self._parts])
+        middles = np.array([wall.middle for wall in self._parts], np.float64)
+        rest = (starts, bores, middles, self._of_world, self._places, self._turns)
+        return self._device.constant(Walls._make([*joined, *rest]))
 
 
 def carriers_of(model: mujoco.MjModel) -> np.ndarray:
@@ -237,15 +223,21 @@ def _links(model: mujoco.MjModel, carriers: np.ndarray) -> Links:
     mixed = np.maximum(own, other)
     dims = np.where(above > 0, other, np.where(above < 0, own, mixed))
     weights = model.geom_solmix[geoms, None], model.geom_solmix[None, carriers]
-    whole = (
-        geoms,
-        joints,
-        carriers,
-        last,
-        model.body_rootid[bodies],
-        model.dof_parentid,
-        dims,
-        above,
+    whole = Links(
+        geoms=geoms,
+        joints=joints,
+        carriers=carriers,
+        last_dof=last,
+        roots=model.body_rootid[bodies],
+        parents=model.dof_parentid,
+        dims=dims,
+        priorities=above,
+        mix=weights[0] / sum(weights),
     )
-    arrays = [np.asarray(each, np.int32) for each in whole]
-    return Links._make([*arrays, weights[0] / sum(weights)])
+    return whole._replace(
+        **{
+            name: np.asarray(each, np.int32)
+            for name, each in whole._asdict().items()
+            if name != "mix"
+        }
+    )

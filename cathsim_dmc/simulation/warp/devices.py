@@ -73,8 +73,11 @@ class Device:
             if collects:
                 gc.enable()
 
-    def constant(self, values: np.ndarray) -> Any:
-        """A copy of an array on the device, for thread functions."""
+    def constant(self, values: Any) -> Any:
+        """A copy on the device of an array, or of a named tuple of arrays."""
+        if isinstance(values, tuple):
+            kind: Any = type(values)
+            return kind._make(map(self.constant, values))
         values = np.ascontiguousarray(values)
         if not self.is_cuda:
             return values.copy()
@@ -88,6 +91,17 @@ class Device:
         with self.active():
             return _cuda().as_cuda_array(array)
 
+    def views(self, kind: Any, source: Any, **others: Any) -> Any:
+        """A named tuple of views of the arrays of the same names in `source`.
+
+        Args:
+            kind: Class of the named tuple.
+            source: Part of Warp's model or data.
+            others: Fields that `source` does not have.
+        """
+        names = [name for name in kind._fields if name not in others]
+        return kind(**{n: self.view(getattr(source, n)) for n in names}, **others)
+
     def zeros(self, size: int) -> Any:
         """Makes a Warp array (size,) of int, all 0."""
         return self._warp.zeros(size, dtype=int, device=self.name)
@@ -96,9 +110,12 @@ class Device:
         """Writes the exclusive prefix sums of numbers; both are arrays of `zeros`."""
         self._warp.utils.array_scan(numbers, sums, inclusive=False)
 
-    def write(self, array: Any, values: np.ndarray) -> None:
-        """Writes values into an array made by `constant`."""
-        if self.is_cuda:
+    def write(self, array: Any, values: Any) -> None:
+        """Writes values into what `constant` has made."""
+        if isinstance(array, tuple):
+            for own, given in zip(array, values, strict=True):
+                self.write(own, given)
+        elif self.is_cuda:
             with self.active():
                 array.copy_to_device(np.ascontiguousarray(values, array.dtype))
         else:
@@ -120,17 +137,15 @@ class Device:
             scratch: Shapes of the float64 arrays that are private to each thread.
             given: Named tuple of arrays, numbers and named tuples.
         """
-        if self.is_cuda:
-            self._run(_kernel(function, scratch), count, given)
-        else:
+        if not self.is_cuda:
             _loop(function)(count, tuple(map(np.zeros, scratch)), given)
-
-    def _run(self, kernel: Any, count: int, given: Any) -> None:
+            return
         stream = _cuda().external_stream(self._warp.get_stream(self.name).cuda_stream)
         # Small blocks spread few threads over all multiprocessors of the GPU.
         block = _THREADS if count > _MANY else 32
+        blocks = (count + block - 1) // block
         with self.active():
-            kernel[(count + block - 1) // block, block, stream](count, given)
+            _kernel(function, scratch)[blocks, block, stream](count, given)
 
 
 def _cuda() -> Any:

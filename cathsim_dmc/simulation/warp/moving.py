@@ -1,18 +1,21 @@
-"""Walls that move, in the contacts of MuJoCo Warp."""
+"""Contacts with walls that move, written into the arrays of MuJoCo Warp."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from cathsim_dmc.physics.effects import Effect
-from cathsim_dmc.simulation.warp.contact_kernels import Scene, Written
+from cathsim_dmc.collision.fields import Registered
+from cathsim_dmc.physics.effects import Effect, of_kind
+from cathsim_dmc.physics.motion import Moving
+from cathsim_dmc.simulation.warp.contacts import WallContacts
 from cathsim_dmc.simulation.warp.devices import Device
 from cathsim_dmc.simulation.warp.moving_kernels import (
     SCRATCH,
+    Boxes,
     Carried,
     MovingScene,
     Vessels,
@@ -21,23 +24,20 @@ from cathsim_dmc.simulation.warp.moving_kernels import (
 )
 
 
-class MovingWalls:
-    """The motion of the walls of N worlds.
+class MovingContacts(WallContacts):
+    """Contacts of the devices of N worlds with walls that move.
 
     The velocity of a wall enters the reference of a contact's constraint. On the CPU it
     is a column of the contact's Jacobian, see `physics.adapters.motion`.
     """
 
-    def __init__(self, device: Device, effect: Effect, bore: int):
-        """Takes the arguments of `WallContacts.move`."""
-        self._device, self._given, self._bore = device, effect.world.parameters, bore
-        count = effect.world.num_simulations
-        self._places, self._sizes = np.zeros((count, 1, 3)), np.zeros((count, 3))
-        self._turns = np.zeros((count, 1, 3, 3))
-        everyone, model = np.arange(count), effect.world.model
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        self.enter(everyone, model, data)
+    def __init__(self, device: Device, model: mujoco.MjModel, num_worlds: int):
+        """Takes the arguments of `WallContacts`."""
+        kind = mujoco.mjtObj.mjOBJ_GEOM
+        self._bore = mujoco.mj_name2id(model, kind, "sheath/bore")
+        shapes = Boxes((1, 3), (1, 3, 3), (3,))
+        self._boxes = Boxes._make(np.zeros((num_worlds, *each)) for each in shapes)
+        super().__init__(device, model, num_worlds)
 
     def enter(
         self,
@@ -45,45 +45,51 @@ class MovingWalls:
         model: mujoco.MjModel,
         data: mujoco.MjData,
     ) -> None:
-        """Finds the sheath of some worlds (K,) in a model and its kinematics."""
+        """Sets the walls and the sheath of some worlds (K,)."""
+        super().enter(worlds, model, data)
         if self._bore >= 0:
-            self._places[worlds, 0] = data.geom_xpos[self._bore]
-            self._turns[worlds, 0] = data.geom_xmat[self._bore].reshape(3, 3)
-            self._sizes[worlds] = model.geom_size[self._bore]
+            self._boxes.places[worlds, 0] = data.geom_xpos[self._bore]
+            self._boxes.turns[worlds, 0] = data.geom_xmat[self._bore].reshape(3, 3)
+            self._boxes.sizes[worlds] = model.geom_size[self._bore]
 
-    def bind(self, model: Any, data: Any, scene: Scene, written: Written) -> None:
-        """Binds to Warp's arrays and to those of the contacts."""
-        constant, view = self._device.constant, self._device.view
-        given = [constant(np.array(each)) for each in self._given]
-        self._vessels = Vessels(
-            time=view(data.time),
-            parameters=type(self._given)._make(given),
-            places=constant(self._places),
-            turns=constant(self._turns),
-            sizes=constant(self._sizes),
-        )
-        self._scene = MovingScene(scene, self._vessels)
+    def take(self, effects: Iterable[Effect]) -> None:
+        """Takes the parameters (N,) of the motion."""
+        effect: Any = of_kind(effects, Moving)
+        self._given = effect.world.parameters
+
+    def bind(self, model: Any, data: Any) -> None:
+        """Binds to the arrays of Warp's model and data, which must not be replaced."""
+        super().bind(model, data)
+        device, view = self._device, self._device.view
+        own = device.constant(self._given), device.constant(self._boxes)
+        self._vessels = Vessels(view(data.time), own[0], own[1])
+        self._moving = MovingScene(self._scene, self._vessels)
         self._carried = Carried(
-            scene.links, scene.walls, self._vessels, written.out, written.counts,
-            written.starts, scene.fields.timestep, view(data.efc.vel),
-            view(data.efc.aref),
-        )  # fmt: skip
+            links=self._links,
+            walls=self._walls,
+            vessels=self._vessels,
+            contacts=self._written.out,
+            counts=self.counts,
+            starts=self.starts,
+            timestep=view(model.opt.timestep),
+            velocity=view(data.efc.vel),
+            reference=view(data.efc.aref),
+        )
 
-    def place(self) -> None:
-        """Copies poses and sizes of the sheaths from the host to the device."""
-        self._device.write(self._vessels.places, self._places)
-        self._device.write(self._vessels.turns, self._turns)
-        self._device.write(self._vessels.sizes, self._sizes)
+    def _place(self) -> None:
+        super()._place()
+        self._device.write(self._vessels.boxes, self._boxes)
 
     def write(self) -> None:
         """Copies the parameters of the motion from the host to the device."""
-        for values, array in zip(self._given, self._vessels.parameters, strict=True):
-            self._device.write(array, values)
+        self._device.write(self._vessels.parameters, self._given)
 
-    def find(self, threads: int) -> None:
-        """Finds the contacts in a number of threads."""
-        self._device.launch(find_moving, threads, SCRATCH, self._scene)
+    def _find(self) -> None:
+        self._device.launch(find_moving, self._threads, SCRATCH, self._moving)
 
-    def carry(self, worlds: int) -> None:
-        """Adds the velocities of walls to the rows of constraints."""
-        self._device.launch(carry, worlds, SCRATCH, self._carried)
+    def carry(self) -> None:
+        """Adds velocities of the walls to the rows of constraints, once these exist."""
+        self._device.launch(carry, self.num_worlds, SCRATCH, self._carried)
+
+    def _lattice(self, wall: Registered) -> np.ndarray:
+        return super()._lattice(wall) if wall.lattice is None else wall.lattice

@@ -39,22 +39,32 @@ SCRATCH: Scratch = ((SAMPLES + WARP,), (PLANES + VALUES, 4), (MOST, CONTACT))
 _LEAST, _MOST = 1e-4, 0.9999  # MuJoCo's mjMINIMP and mjMAXIMP
 
 
+class Boxes(NamedTuple):
+    """Boxes around the sheaths of N worlds; size 0 for none.
+
+    Attributes:
+        places: (N, 1, 3) m, centres.
+        turns: (N, 1, 3, 3), axes in columns.
+        sizes: (N, 3) m, half lengths.
+    """
+
+    places: Any
+    turns: Any
+    sizes: Any
+
+
 class Vessels(NamedTuple):
-    """Motion of the walls of N worlds, and the boxes around their sheaths.
+    """Motion of the walls of N worlds, and their sheaths, which do not move.
 
     Attributes:
         time: (N,) s, Warp's.
         parameters: `laws.motion.MotionParameters` of arrays (N,).
-        places: (N, 1, 3) m, centre of the box around the sheath.
-        turns: (N, 1, 3, 3), its axes in columns.
-        sizes: (N, 3) m, its half lengths; 0 for none.
+        boxes: See `Boxes`.
     """
 
     time: Any
     parameters: Any
-    places: Any
-    turns: Any
-    sizes: Any
+    boxes: Boxes
 
 
 class MovingScene(NamedTuple):
@@ -90,12 +100,18 @@ class Carried(NamedTuple):
 
 
 @compiled
-def _in_sheath(vessels, world, place):
+def _is_inside(boxes, world, place):
     """Whether a place (3) m is in the box around the sheath."""
-    origin, size = vector(vessels.places, world, 0), vessels.sizes[world]
+    origin, size = vector(boxes.places, world, 0), boxes.sizes[world]
     apart = (place[0] - origin[0], place[1] - origin[1], place[2] - origin[2])
-    x, y, z = into(matrix(vessels.turns, world, 0), apart)
+    x, y, z = into(matrix(boxes.turns, world, 0), apart)
     return abs(x) < size[0] and abs(y) < size[1] and abs(z) < size[2]
+
+
+@compiled
+def _lattice(walls, number):
+    """Lattice of the motion of a wall; empty for a wall at rest."""
+    return (walls.lattice[walls.starts[number, 5, 0] : walls.starts[number, 5, 1]],)
 
 
 @compiled
@@ -103,35 +119,30 @@ def find_moving(thread, scratch, given):
     """Finds the contacts of a link with a wall that may move.
 
     Args:
-        thread: See `contact_kernels.pair_of`.
+        thread: See `contact_kernels.find`.
         scratch: Arrays of the shapes `SCRATCH`.
         given: `MovingScene`.
     """
     scene, vessels = given.scene, given.vessels
-    walls, count = scene.walls, len(scene.links.geoms)
     scene.found.number[thread] = 0
-    pair = pair_of(thread, scene.links, walls, scene.fields, scene.motion)
+    pair = pair_of(thread, scene)
     if not is_finite(pair):
         return
+    wall, capsule, law, sweep = pair.wall, pair.capsule, pair.law, pair.sweep
     first, planes, out = scratch
     samples, own = first[:SAMPLES], planes[:PLANES]
-    world = (thread // count) % len(walls.of_world)
-    number = walls.of_world[world, thread // (count * len(walls.of_world))]
-    lattice = walls.lattice[walls.starts[number, 5, 0] : walls.starts[number, 5, 1]]
+    (lattice,) = _lattice(scene.walls, pair.number)
     if len(lattice) == 0:
-        memory = Memory(samples, own)
-        made = contacts(pair.wall, pair.capsule, pair.law, pair.sweep, memory, out)
+        made = contacts(wall, capsule, law, sweep, Memory(samples, own), out)
     else:
         # In the sheath, which does not move, only the wall at rest counts.
-        if _in_sheath(vessels, world, pair.centre):
-            if clearance_along(pair.wall, pair.capsule, 0.0) >= FREE:
+        if _is_inside(vessels.boxes, pair.world, pair.centre):
+            if clearance_along(wall, capsule, 0.0) >= FREE:
                 return
-        course = nth_course(vessels.parameters, world, float(vessels.time[world]))
-        moving = MovingScratch(samples, own, planes[PLANES:], first[SAMPLES:])
-        motion, law = (lattice, course), pair.law
-        made = moving_contacts(
-            pair.wall, pair.capsule, law, pair.sweep, motion, moving, out
-        )
+        time = float(vessels.time[pair.world])
+        motion = lattice, nth_course(vessels.parameters, pair.world, time)
+        memory = MovingScratch(samples, own, planes[PLANES:], first[SAMPLES:])
+        made = moving_contacts(wall, capsule, law, sweep, motion, memory, out)
     keep(scene.found, thread, pair, out, made)
 
 
@@ -182,8 +193,7 @@ def carry(world, scratch, given):
     time = float(given.vessels.time[world]) + 0.5 * step
     course = nth_course(given.vessels.parameters, world, time)
     for which in range(len(given.links.carriers)):
-        ends = walls.starts[walls.of_world[world, which], 5]
-        lattice = walls.lattice[ends[0] : ends[1]]
+        (lattice,) = _lattice(walls, walls.of_world[world, which])
         if len(lattice) == 0:
             continue
         first = given.starts[world]

@@ -25,74 +25,47 @@ from cathsim_dmc.simulation.warp.devices import NONE, Device
 _OF_CONTACTS = ("compliance", "motion")  # adapters; see `contacts.WallContacts`
 
 
-class Arrays(NamedTuple):
-    """Arrays of Warp's data and model, (1 or N, ...), as `laws.device.Device`.
-
-    Attributes:
-        first_link: Number of the first link among the bodies.
-        body_dofadr: (L,) first degree of freedom of each link.
-        body_dofnum: (L,) number of degrees of freedom of each link.
-        geoms: (L,) geoms of the links.
-        hinges: (3, 2 J) joints of the hinges, their indices in `qpos`, and their
-            degrees of freedom.
-        time: (N,) s.
-    """
-
-    first_link: Any
-    xipos: Any
-    xmat: Any
-    cvel: Any
-    subtree_com: Any
-    cdof: Any
-    qpos: Any
-    qfrc_passive: Any
-    geom_size: Any
-    jnt_stiffness: Any
-    qpos_spring: Any
-    body_dofadr: Any
-    body_dofnum: Any
-    geoms: Any
-    hinges: Any
-    time: Any
-
-
-@compiled
-def device_of(world, arrays):
-    """`laws.device.Device` of a world."""
-    first = arrays.first_link
-    last = first + len(arrays.geoms)
-    return DeviceState(
-        arrays.xipos[world, first:last],
-        arrays.xmat[world, first:last],
-        arrays.cvel[world, first:last],
-        arrays.subtree_com[world, first:last],
-        arrays.geom_size[world % len(arrays.geom_size)],
-        arrays.geoms,
-        arrays.body_dofadr,
-        arrays.body_dofnum,
-        arrays.cdof[world],
-        arrays.qpos[world],
-        arrays.qfrc_passive[world],
-        arrays.jnt_stiffness[world % len(arrays.jnt_stiffness)],
-        arrays.qpos_spring[world % len(arrays.qpos_spring)],
-        arrays.hinges[0],
-        arrays.hinges[1],
-        arrays.hinges[2],
-    )
-
-
 class Given(NamedTuple):
-    """Inputs of a law.
+    """Arguments of a law.
 
     Attributes:
         parameters: Parameters of the law, of arrays (N, ...).
-        arrays: `Arrays`.
+        first_link: Number of the first link among the bodies.
+        device: `laws.device.Device` of Warp's arrays (1 or N, ...), of all bodies.
+        time: (N,) s, Warp's.
         memory: `laws.springs.Scratch` of arrays (N, ...).
     """
 
     parameters: Any
-    arrays: Arrays
+    first_link: int
+    device: DeviceState
+    time: Any
     memory: Any
+
+
+@compiled
+def device_of(world, given):
+    """`laws.device.Device` of a world."""
+    first, device = given.first_link, given.device
+    last = first + len(device.geoms)
+    return DeviceState(
+        device.xipos[world, first:last],
+        device.xmat[world, first:last],
+        device.cvel[world, first:last],
+        device.subtree_com[world, first:last],
+        device.geom_size[world % len(device.geom_size)],
+        device.geoms,
+        device.body_dofadr,
+        device.body_dofnum,
+        device.cdof[world],
+        device.qpos[world],
+        device.qfrc_passive[world],
+        device.jnt_stiffness[world % len(device.jnt_stiffness)],
+        device.qpos_spring[world % len(device.qpos_spring)],
+        device.hinge_joints,
+        device.hinge_qpos,
+        device.hinge_dofs,
+    )
 
 
 @compiled
@@ -116,8 +89,7 @@ def add_drag(world, scratch, all_given):
         given.friction[world],
         given.space_velocity[world],
     )
-    time = float(all_given.arrays.time[world])
-    drag(blood, time, device_of(world, all_given.arrays))
+    drag(blood, float(all_given.time[world]), device_of(world, all_given))
 
 
 @compiled
@@ -133,7 +105,26 @@ def add_springs(world, scratch, all_given):
     bends = Bends(memory.bends.bends[world], memory.bends.twists[world])
     own = Scratch(memory.angles[world], bends, memory.free[world])
     springs = Springs(given.rest[world], given.compliance[world])
-    shape_torques(springs, device_of(world, all_given.arrays), own)
+    shape_torques(springs, device_of(world, all_given), own)
+
+
+_LAWS = {"blood": add_drag, "springs": add_springs}  # by the adapter of an effect
+
+
+class _Law(NamedTuple):
+    """A law of an effect.
+
+    Attributes:
+        act: Thread function.
+        given: Its parameters on the host, arrays (N, ...).
+        parameters: Their copy on the device.
+        changes: Whether they change within an episode.
+    """
+
+    act: Any
+    given: Any
+    parameters: Any
+    changes: bool
 
 
 class PassiveForces:
@@ -154,56 +145,46 @@ class PassiveForces:
             NotImplementedError: if there is a law that is not simulated on Warp.
         """
         self._device, self._places, self._count = device, places, count
-        # The last entry of each: whether its parameters change within an episode.
-        self._laws: list[tuple[Any, Any, Any, bool]] = []
+        self._laws: list[_Law] = []
         for effect in effects:
-            if effect.adapter not in ("blood", "springs"):
-                has_law = effect.law is not None or effect.adapter is not None
-                if not has_law or effect.adapter in _OF_CONTACTS:
-                    continue
+            act = _LAWS.get(effect.adapter or "")
+            if act is not None:
+                given = effect.world.parameters
+                changes = act is add_springs or isinstance(effect, Flow)
+                self._laws.append(_Law(act, given, device.constant(given), changes))
+            elif effect.adapter not in _OF_CONTACTS and (effect.adapter or effect.law):
                 raise NotImplementedError(
                     f"the law of {type(effect).__qualname__} is not simulated on "
                     "Warp; take the device 'cpu'"
                 )
-            given = effect.world.parameters
-            there = type(given)._make(device.constant(np.array(each)) for each in given)
-            law = add_drag if effect.adapter == "blood" else add_springs
-            changes = law is add_springs or isinstance(effect, Flow)
-            self._laws.append((law, given, there, changes))
 
     def bind(self, model: Any, data: Any, host: mujoco.MjModel) -> None:
         """Binds to the arrays of Warp's model and data, which must not be replaced."""
         view, constant, places = self._device.view, self._device.constant, self._places
         links = slice(places.first_link, places.first_link + len(places.geoms))
-        rows = view(data.xmat)
-        names = ("cvel", "subtree_com", "cdof", "qpos", "qfrc_passive")
-        fields = ("geom_size", "jnt_stiffness", "qpos_spring")
-        joints = places.hinges.shape[1] // 2
-        bends = (
-            np.zeros((self._count, joints), complex),
-            np.zeros((self._count, joints)),
+        hinges = places.hinges.astype(np.int64)
+        turns, joints = view(data.xmat), hinges.shape[1] // 2
+        device = self._device.views(
+            DeviceState,
+            data,
+            xmat=turns.reshape((*turns.shape[:2], 9)),
+            geom_size=view(model.geom_size),
+            geoms=constant(places.geoms.astype(np.int64)),
+            body_dofadr=constant(host.body_dofadr[links]),
+            body_dofnum=constant(host.body_dofnum[links]),
+            jnt_stiffness=view(model.jnt_stiffness),
+            qpos_spring=view(model.qpos_spring),
+            hinge_joints=constant(hinges[0]),
+            hinge_qpos=constant(hinges[1]),
+            hinge_dofs=constant(hinges[2]),
         )
-        memory = Scratch(
-            constant(np.zeros((self._count, 2 * joints))),
-            Bends._make(map(constant, bends)),
-            constant(np.zeros((self._count, joints, 2))),
-        )
-        arrays = Arrays._make(
-            [
-                places.first_link,
-                view(data.xipos),
-                rows.reshape((*rows.shape[:2], 9)),
-                *(view(getattr(data, name)) for name in names),
-                *(view(getattr(model, name)) for name in fields),
-                constant(host.body_dofadr[links]),
-                constant(host.body_dofnum[links]),
-                constant(places.geoms.astype(np.int64)),
-                constant(places.hinges.astype(np.int64)),
-                view(data.time),
-            ]
-        )
+        shape = self._count, joints
+        bends = Bends(np.zeros(shape, complex), np.zeros(shape))
+        own = Scratch(np.zeros((shape[0], 2 * joints)), bends, np.zeros((*shape, 2)))
+        first, time, memory = places.first_link, view(data.time), constant(own)
         self._calls = [
-            (law, Given(there, arrays, memory)) for law, _, there, _ in self._laws
+            (law.act, Given(law.parameters, first, device, time, memory))
+            for law in self._laws
         ]
 
     def write(self, whole: bool) -> None:
@@ -212,11 +193,9 @@ class PassiveForces:
         Args:
             whole: Whether also to copy those that are constant within an episode.
         """
-        for _, given, there, changes in self._laws:
-            if not (whole or changes):
-                continue
-            for values, array in zip(given, there, strict=True):
-                self._device.write(array, values)
+        for law in self._laws:
+            if whole or law.changes:
+                self._device.write(law.parameters, law.given)
 
     def __call__(self, model: Any, data: Any) -> None:
         """Adds the forces of all laws; mujoco_warp's callback after its own ones."""

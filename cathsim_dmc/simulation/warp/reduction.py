@@ -13,6 +13,7 @@ from cathsim_dmc.simulation.warp.devices import NONE, Device
 
 _LARGEST = 1e10  # MuJoCo's mjMAXVAL: beyond it a simulation has diverged
 _FORCES = 7  # rows of `Totals.force`
+_DIVERGED, _LOST, _BESIDE = _FORCES, _FORCES + 1, _FORCES + 2  # rows of `Added.out`
 
 
 class Totals(NamedTuple):
@@ -23,62 +24,45 @@ class Totals(NamedTuple):
             physics steps in place of the means, and the largest contact depth, m.
         diverged: (N,) 1 if an entry of the state is beyond MuJoCo's mjMAXVAL or not
             finite, else 0.
+        lost: (N,) 1 if there were more contacts or constraint rows than room, else 0.
         beside: (N, B) the sensors other than those of contacts.
     """
 
     force: Any
     diverged: Any
+    lost: Any
     beside: Any
 
 
 class Added(NamedTuple):
-    """Arrays of `clear` and `add`, most of them Warp's.
+    """Arguments of `add`; the arrays without a description are Warp's.
 
     Attributes:
+        step: Number of the physics step.
+        last: Number of the last physics step.
         counts, starts: (N,), see `WallContacts`.
         is_wall: (ngeom,) whether a geom is the wall of the vessel.
-        geom: (K, 2) geoms of the contacts.
-        dist: (K,) signed distances of the contacts, m.
-        dim: (K,) number of constraint rows of a contact.
-        rows: (K, dim) indices of these rows; -1 for none.
-        forces: (N, R) forces of the rows, N.
-        out: (8 + B, N) the fields of `Totals`, concatenated.
+        force: (N, R) forces of the constraint rows, N.
+        beside: (B,) indices of the sensors other than those of contacts.
+        out: (9 + B, N) the fields of `Totals`, concatenated.
     """
 
+    step: int
+    last: int
     counts: Any
     starts: Any
     is_wall: Any
     geom: Any
     dist: Any
     dim: Any
-    rows: Any
-    forces: Any
-    out: Any
-
-
-class Ended(NamedTuple):
-    """Arrays of `end`.
-
-    Attributes:
-        sensors: (N, nsensordata), Warp's.
-        places: (B,) indices of the sensors other than those of contacts.
-        qpos: (N, nq), Warp's.
-        qvel: (N, nv), Warp's.
-        out: See `Added`.
-    """
-
-    sensors: Any
-    places: Any
+    efc_address: Any
+    force: Any
     qpos: Any
     qvel: Any
+    sensordata: Any
+    overflow: Any
+    beside: Any
     out: Any
-
-
-@compiled
-def clear(world, scratch, given):
-    """Begins a control step of a world; `given` is `Added`."""
-    for k in range(_FORCES + 1):
-        given.out[k, world] = 0.0
 
 
 @compiled
@@ -90,7 +74,10 @@ def add(world, scratch, given):
         scratch: Not used.
         given: `Added`.
     """
-    out, rows, forces = given.out, given.rows, given.forces
+    out, rows, forces = given.out, given.efc_address, given.force
+    if given.step == 0:
+        for k in range(_FORCES):
+            out[k, world] = 0.0
     total, largest, deepest = 0.0, 0.0, out[6, world]
     first = given.starts[world]
     for at in range(first, first + given.counts[world]):
@@ -106,27 +93,34 @@ def add(world, scratch, given):
         largest = max(largest, force)
         deepest = max(deepest, -float(given.dist[at]))
     out[0, world], out[1, world] = total, largest
-    out[2, world], out[3, world] = (
-        max(out[2, world], total),
-        max(out[3, world], largest),
-    )
+    out[2, world] = max(out[2, world], total)
+    out[3, world] = max(out[3, world], largest)
     out[4, world] += total
     out[5, world] += largest
     out[6, world] = deepest
+    if given.step == given.last:
+        _end(world, given)
 
 
 @compiled
-def end(world, scratch, given):
-    """Ends a control step of a world; `given` is `Ended`."""
-    out, qpos, qvel = given.out, given.qpos, given.qvel
-    for k in range(qpos.shape[1]):
-        if not abs(qpos[world, k]) < _LARGEST:
-            out[_FORCES, world] = 1.0
-    for k in range(qvel.shape[1]):
-        if not abs(qvel[world, k]) < _LARGEST:
-            out[_FORCES, world] = 1.0
-    for k in range(len(given.places)):
-        out[_FORCES + 1 + k, world] = given.sensors[world, given.places[k]]
+def _end(world, given):
+    """Ends a control step of a world; `given` is `Added`."""
+    out = given.out
+    fine = _is_fine(given.qpos[world]) and _is_fine(given.qvel[world])
+    out[_DIVERGED, world] = 0.0 if fine else 1.0
+    out[_LOST, world] = 1.0 if given.overflow[world] else 0.0
+    given.overflow[world] = 0
+    for k in range(len(given.beside)):
+        out[_BESIDE + k, world] = given.sensordata[world, given.beside[k]]
+
+
+@compiled
+def _is_fine(values):
+    """Whether all values are finite and below MuJoCo's mjMAXVAL."""
+    for k in range(len(values)):
+        if not abs(values[k]) < _LARGEST:
+            return False
+    return True
 
 
 class Reduction:
@@ -143,41 +137,31 @@ class Reduction:
             contacts: Has the places of the contacts.
             beside: (B,) indices of the sensors other than those of contacts.
         """
-        view, found = device.view, data.contact
         self._device, self._count = device, len(data.qpos)
-        self._out = device.constant(np.zeros((_FORCES + 1 + len(beside), self._count)))
-        self._added = Added(
+        view, found = device.view, data.contact
+        self._added = device.views(
+            Added,
+            data,
+            step=0,
+            last=0,
             counts=contacts.counts,
             starts=contacts.starts,
             is_wall=device.constant(contacts.is_wall),
             geom=view(found.geom),
             dist=view(found.dist),
             dim=view(found.dim),
-            rows=view(found.efc_address),
-            forces=view(data.efc.force),
-            out=self._out,
-        )
-        self._ended = Ended(
-            sensors=view(data.sensordata),
-            places=device.constant(beside.astype(np.int64)),
-            qpos=view(data.qpos),
-            qvel=view(data.qvel),
-            out=self._out,
+            efc_address=view(found.efc_address),
+            force=view(data.efc.force),
+            beside=device.constant(beside.astype(np.int64)),
+            out=device.constant(np.zeros((_BESIDE + len(beside), self._count))),
         )
 
-    def begin(self) -> None:
-        """Begins a control step."""
-        self._device.launch(clear, self._count, NONE, self._added)
-
-    def add(self) -> None:
-        """Adds a physics step."""
-        self._device.launch(add, self._count, NONE, self._added)
-
-    def end(self) -> None:
-        """Ends a control step."""
-        self._device.launch(end, self._count, NONE, self._ended)
+    def add(self, step: int, last: int) -> None:
+        """Adds a physics step; the first begins a control step, the last ends it."""
+        given = self._added._replace(step=step, last=last)
+        self._device.launch(add, self._count, NONE, given)
 
     def read(self) -> Totals:
         """The totals on the host."""
-        out = self._device.host(self._out)
-        return Totals(out[:_FORCES], out[_FORCES], out[_FORCES + 1 :].T)
+        out = self._device.host(self._added.out)
+        return Totals(out[:_FORCES], out[_DIVERGED], out[_LOST], out[_BESIDE:].T)

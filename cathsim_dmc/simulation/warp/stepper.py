@@ -22,10 +22,12 @@ import numpy as np
 from cathsim_dmc import rows
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.dispatcher import Places
+from cathsim_dmc.physics.effects import of_kind
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.simulation.warp.contacts import WallContacts
 from cathsim_dmc.simulation.warp.devices import Device
+from cathsim_dmc.simulation.warp.moving import MovingContacts
 from cathsim_dmc.simulation.warp.passive import PassiveForces
 from cathsim_dmc.simulation.warp.worlds import Worlds
 from cathsim_dmc.tasks.cases import Case
@@ -35,6 +37,7 @@ from cathsim_dmc.tasks.rollout import Rollout
 # State of a simulation that the physics changes, and state that the effects write.
 _STATE = ("qpos", "qvel", "act", "qacc_warmstart")
 _GIVEN = ("userdata", "qfrc_applied")
+_KEPT = (*_STATE, *_GIVEN, "time")
 _LEAST_TOLERANCE = 1e-6  # of the solver, which has single precision
 
 
@@ -66,31 +69,28 @@ class WarpStepper(Stepper):
         self.lost = np.zeros(num_simulations, np.int64)
         self._names = tuple(dict.fromkeys((*_STATE, *task.data_fields)))
         self._read = [name for name in self._names if name not in _GIVEN]
-        self.arrays = types.SimpleNamespace(**self._empty(model, num_simulations))
+        self.arrays, data = types.SimpleNamespace(), mujoco.MjData(model)
+        for name in (*self._names, *_KEPT, "ctrl"):
+            shape = num_simulations, *np.shape(getattr(data, name))
+            setattr(self.arrays, name, np.zeros(shape))
         self._force = np.zeros((7, num_simulations))
         # Whether the last physics step was done on the device.
         self._on_device = np.zeros(num_simulations, bool)
         self._own: dict[str, np.ndarray] = {}
-        fields = [name for effect in task.effects for name in effect.model_fields]
-        self._expand(dict.fromkeys(fields))
+        effects = task.effects
+        self._expand(name for effect in effects for name in effect.model_fields)
         self._dirty = set(self._own)
-        self._each_step = {n for effect in task.effects for n in effect.step_fields}
+        self._each_step = {n for effect in effects for n in effect.step_fields}
         self._cases: dict[int, Case] = {}
-        self._statistics: list[Any] = [None] * num_simulations
-        self._threads = num_threads or os.cpu_count() or 1
-        self._pool = concurrent.futures.ThreadPoolExecutor(self._threads)
+        threads = num_threads or os.cpu_count() or 1
+        self._pool = concurrent.futures.ThreadPoolExecutor(threads)
         self._local = threading.local()
-        self.contacts = WallContacts(device, model, num_simulations)
+        moves = of_kind(effects, Moving) is not None
+        kind = MovingContacts if moves else WallContacts
+        self.contacts = kind(device, model, num_simulations)
         self._begun = dict[str, np.ndarray]()
         self._worlds: Worlds | None = None
         self._stale = True
-
-    def _empty(self, model: mujoco.MjModel, count: int) -> dict[str, np.ndarray]:
-        """Arrays (N, ...) of the fields of `mujoco.MjData` that are read or written."""
-        data = mujoco.MjData(model)
-        names = dict.fromkeys((*self._names, *_GIVEN, "ctrl", "time"))
-        shapes = {name: np.shape(getattr(data, name)) for name in names}
-        return {name: np.zeros((count, *shape)) for name, shape in shapes.items()}
 
     def take(self, rollout: Rollout) -> None:
         """Takes the laws of the effects of the rollout that it steps.
@@ -101,9 +101,7 @@ class WarpStepper(Stepper):
         places = Places.of(self._model, rollout.index)
         count = self.num_simulations
         self._passive = PassiveForces(self._device, places, rollout.effects, count)
-        for effect in rollout.effects:
-            if isinstance(effect, Moving):
-                self.contacts.move(effect, places.bore)
+        self.contacts.take(rollout.effects)
 
     # Fields of the model that differ between worlds.
 
@@ -151,7 +149,7 @@ class WarpStepper(Stepper):
 
     def reset(self, indices: np.ndarray) -> None:
         """Resets some simulations (K,) to the default pose."""
-        for name in (*_STATE, *_GIVEN, "ctrl", "time"):
+        for name in (*_KEPT, "ctrl"):
             getattr(self.arrays, name)[indices] = 0.0
         self.arrays.qpos[indices] = self._model.qpos0
         self._stale = True
@@ -197,7 +195,7 @@ class WarpStepper(Stepper):
         self.arrays.time += self.substeps * self._timestep
         self._stale = False
         self._on_device[:] = True
-        self._note(totals.diverged != 0, worlds.overflowed())
+        self._note(totals.diverged != 0, totals.lost != 0)
 
     def close(self) -> None:
         """Frees the memory of the device; the next step allocates it again."""
@@ -212,7 +210,7 @@ class WarpStepper(Stepper):
             self.warnings[index] += 1
             for name, value in self._begun.items():
                 getattr(self.arrays, name)[index] = value[index]
-            self._on_host(index, lambda model, data: mujoco.mj_forward(model, data))
+            self._on_host(index, mujoco.mj_forward)
             self._stale = True
 
     def _forces(self) -> tuple[forces.WallForce, np.ndarray]:
@@ -249,7 +247,7 @@ class WarpStepper(Stepper):
         for index, state in zip(indices.tolist(), states, strict=True):
             model, data = self._mine()
             mujoco.mj_setState(model, data, state, kind)
-            for name in (*_STATE, *_GIVEN, "ctrl", "time"):
+            for name in (*_KEPT, "ctrl"):
                 getattr(self.arrays, name)[index] = getattr(data, name)
         self._stale = True
 
@@ -259,12 +257,9 @@ class WarpStepper(Stepper):
     # What MuJoCo does on the host.
 
     def _write(self, index: int, data: mujoco.MjData, arrays: Any) -> None:
-        for name in (*_STATE, *_GIVEN, "time"):
-            value = arrays[name][index]
-            if name == "time":
-                data.time = value.item()
-            else:
-                getattr(data, name)[:] = value
+        """Writes the state of one simulation, of a dict of arrays, and its control."""
+        for name in _KEPT:
+            setattr(data, name, arrays[name][index])
         data.ctrl[:] = self.arrays.ctrl[index]
 
     def _on_host(
@@ -294,23 +289,26 @@ class WarpStepper(Stepper):
 
         self._each(lambda index: self._on_host(index, forward), indices)
 
-    def still(self, indices: np.ndarray) -> forces.WallForce:
-        """Returns the force on the wall; some simulations (K,) have not moved yet."""
+    def _keep_still(self, indices: np.ndarray) -> None:
         rows = self.arrays.sensordata[indices][:, None, self._contacts]
+        self._keep_force(indices, rows)
+
+    def _keep_force(self, indices: np.ndarray, rows: np.ndarray) -> None:
+        """Keeps the force of some simulations (K,), see `forces.wall_force`."""
         force, depth = forces.wall_force(np.ascontiguousarray(rows))
         self._force[:, indices] = *force, depth
-        return self._forces()[0]
 
     def _each(self, act: Callable[[int], Any], indices: np.ndarray) -> list[Any]:
         return list(self._pool.map(act, indices.tolist()))
 
     def _refine(self, indices: np.ndarray, parts: int) -> np.ndarray:
         """Repeats the control step of some simulations in shorter physics steps."""
-        rows = np.stack(self._each(lambda i: self._again(i, parts), indices))
-        last = np.ascontiguousarray(rows[:, parts - 1 :: parts])
-        force, depth = forces.wall_force(last)
-        self._force[:, indices] = *force, depth
         self._stale = True
+        return self._run(indices, parts)
+
+    def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
+        rows = np.stack(self._each(lambda i: self._again(i, parts), indices))
+        self._keep_force(indices, rows[:, parts - 1 :: parts])
         return rows
 
     def _again(self, index: int, parts: int) -> np.ndarray:
@@ -334,14 +332,8 @@ class WarpStepper(Stepper):
         self._on_host(index, step, self._begun)
         return rows
 
-    def _keep_still(self, indices: np.ndarray) -> None:
-        """Does nothing: `still` reads the sensors."""
-
     def _forward(self, indices: np.ndarray) -> None:
         self._each(lambda index: self._on_host(index, mujoco.mj_forward), indices)
-
-    def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
-        return np.stack(self._each(lambda i: self._again(i, parts), indices))
 
 
 def refuse(task: Navigation) -> None:

@@ -18,9 +18,6 @@ from cathsim_dmc.simulation.warp.reduction import Reduction, Totals
 
 # Room for contacts and for rows of constraints, in each world.
 CONTACTS, ROWS = 48, 128
-# With a dense matrix of constraints, the solver visits the contacts of all worlds one
-# after the other; with a sparse one, only those of worlds that have not converged.
-SPARSE = True
 _WRITTEN = ("qpos", "qvel", "act", "qacc_warmstart", "ctrl", "qfrc_applied", "time")
 _ALWAYS = ("qpos", "act", "ctrl", "qfrc_applied", "time")
 # Fields of a model that Warp does not read here: they serve MuJoCo's own collision,
@@ -61,9 +58,10 @@ class Worlds:
         prepared = copy.copy(model)
         # `WallContacts` finds the contacts of the carriers.
         prepared.geom_contype[contacts.carriers] = 0
-        kinds = mujoco.mjtJacobian
-        kind = kinds.mjJAC_SPARSE if SPARSE else kinds.mjJAC_DENSE
-        prepared.opt.jacobian = kind.value
+        # With a dense matrix of constraints, the solver visits the contacts of all
+        # worlds one after the other; with a sparse one, only those of worlds that have
+        # not converged.
+        prepared.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE.value
         wall = model.sensor("wall_contacts")
         start, size = int(wall.adr[0]), int(wall.dim[0])
         with device.active():
@@ -77,7 +75,9 @@ class Worlds:
             self.data = self._mjwarp.make_data(prepared, nworld=count, **sizes)
             # The other geoms are only visual, and Warp does not read them.
             self._colliding = (model.geom_contype | model.geom_conaffinity) != 0
-            self._fields = {name for name in own if self._expand(name, own[name])}
+            self._fields: set[str] = set()
+            for name, values in own.items():
+                self._expand(name, values)
             contacts.bind(self.model, self.data)
             self._contacts = contacts
             self.model.callback.contactfilter = contacts
@@ -100,21 +100,28 @@ class Worlds:
         self._passive(model, data)
         self._contacts.carry()
 
-    def _expand(self, name: str, values: np.ndarray) -> bool:
-        """Gives each world its own values (N, ...); returns whether Warp has them."""
-        array = getattr(self.model, name, None)
-        if name.startswith("opt."):
-            raise NotImplementedError(f"{name} is the same in all worlds of Warp")
-        if name.startswith(_HOST_ONLY) or array is None:  # Warp does not read it
-            return False
+    def _array(self, name: str) -> Any:
+        """Warp's array of a field of the model; None if Warp does not read it."""
+        return None if name.startswith(_HOST_ONLY) else getattr(self.model, name, None)
+
+    def _expand(self, name: str, values: np.ndarray) -> None:
+        """Gives each world its own values (N, ...) of a field, if Warp reads it."""
+        array = self._array(name)
+        if array is None:
+            return
         if array.shape[0] != 1:
             self._check_shared(name, values)
-            return False
+            return
+        inner = tuple(getattr(array.dtype, "_shape_", ()))  # of a vector or a matrix
+        shape = (len(values), *array.shape[1:], *inner)
+        kind = np.int32 if array.dtype is int else np.float32
         made = self._warp.array(
-            self._shaped(values, array), dtype=array.dtype, device=self._device.name
+            np.ascontiguousarray(values.reshape(shape), kind),
+            dtype=array.dtype,
+            device=self._device.name,
         )
         setattr(self.model, name, made)
-        return True
+        self._fields.add(name)
 
     def _check_shared(self, name: str, values: np.ndarray) -> None:
         """Raise NotImplementedError if values (N, ...) of a shared field differ."""
@@ -127,21 +134,12 @@ class Worlds:
                 "take simulation_device='cpu'"
             )
 
-    @staticmethod
-    def _shaped(values: np.ndarray, array: Any) -> np.ndarray:
-        """Values in Warp's shape and type: vectors and matrices as last axes."""
-        inner = tuple(getattr(array.dtype, "_shape_", ()))
-        shape = (len(values), *array.shape[1:], *inner)
-        kind = np.int32 if array.dtype is int else np.float32
-        return np.ascontiguousarray(values.reshape(shape), kind)
-
     def write_model(self, own: Mapping[str, np.ndarray], names: Iterable[str]) -> None:
         """Writes fields of the model that have changed."""
         for name in names:
-            array = getattr(self.model, name, None)
             if name in self._fields:
-                self._put(name, array, own[name])
-            elif array is not None and not name.startswith(_HOST_ONLY):
+                self._put(name, self._array(name), own[name])
+            elif self._array(name) is not None:
                 self._check_shared(name, own[name])
 
     def write(self, arrays: Any, whole: bool) -> None:
@@ -178,7 +176,6 @@ class Worlds:
 
     def step(self) -> None:
         """Does the physics steps of a control step."""
-        self._reduction.begin()
         self._contacts.begin()
         with self._device.active():
             if not self._device.is_cuda:
@@ -189,33 +186,31 @@ class Worlds:
             self._warp.capture_launch(self._graph)
 
     def _steps(self) -> None:
-        for left in reversed(range(self._substeps)):
-            self._step(last=not left)
-        self._reduction.end()
+        for number in range(self._substeps):
+            self._step(number)
 
-    def _step(self, last: bool) -> None:
+    def _step(self, number: int) -> None:
         """Does a physics step; only the last computes sensors and forces on links."""
         option, without = self.model.opt, mujoco.mjtDisableBit.mjDSBL_SENSOR.value
-        kept, option.run_rne_postconstraint = option.disableflags, last
-        option.disableflags = kept if last else kept | without
+        last, kept = self._substeps - 1, option.disableflags
+        option.run_rne_postconstraint = number == last
+        option.disableflags = kept if number == last else kept | without
         try:
             self._mjwarp.step(self.model, self.data)
         finally:
             option.disableflags = kept
-        self._reduction.add()
+        self._reduction.add(number, last)
 
     def _captured(self) -> Any:
         """Captures the physics steps as a CUDA graph; the state does not change."""
         kept = {name: self._warp.clone(getattr(self.data, name)) for name in _WRITTEN}
-        for last in (False, True):  # compiles all kernels before the capture
-            self._step(last)
-        self._reduction.end()
+        for number in (0, self._substeps - 1):  # compiles all kernels before
+            self._step(number)
         self.wait()
         with self._device.captured() as capture:
             self._steps()
         for name, array in kept.items():
             self._warp.copy(getattr(self.data, name), array)
-        self._reduction.begin()
         return capture.graph
 
     def read(self, arrays: Any, names: Iterable[str]) -> Totals:
@@ -265,9 +260,3 @@ class Worlds:
             np.copyto(out[own], there[own], where=chosen[own, None])
 
         rows.each(len(out), convert)
-
-    def overflowed(self) -> np.ndarray:
-        """(N,) bool, whether a world had too many contacts or rows in the step."""
-        found = self._contacts.overflowed() | (self.data.overflow.numpy() != 0)
-        self.data.overflow.zero_()
-        return found
