@@ -89,3 +89,10 @@ def test_a_world_without_room_is_lost_for_one_control_step(bit):
             reduction.add(world, (), given)
         assert given.out[8].tolist() == expected
     assert not given.overflow.any()
+
+
+@pytest.mark.parametrize("bit", [9, 10])  # ITERATIONS, LS_ITERATIONS
+def test_a_solver_that_ends_early_lacks_no_room(bit):
+    given = added(last=0, overflow=np.array([1 << bit, 0]))
+    reduction.add(0, (), given)
+    assert given.out[8, 0] == 0 and not given.overflow.any()

@@ -13,6 +13,9 @@ from cathsim_dmc.simulation.warp.devices import NONE, Device
 
 _LARGEST = 1e10  # MuJoCo's mjMAXVAL: beyond it a simulation has diverged
 _FORCES = 7  # rows of `Totals.force`
+# Bits of mujoco_warp's OverflowType for contacts and constraint rows; others are the
+# limits of iterations of the solver.
+_ROOM = 0b1001111
 _DIVERGED, _LOST, _BESIDE = _FORCES, _FORCES + 1, _FORCES + 2  # rows of `Added.out`
 
 
@@ -108,7 +111,7 @@ def _end(world, given):
     out = given.out
     fine = _is_fine(given.qpos[world]) and _is_fine(given.qvel[world])
     out[_DIVERGED, world] = 0.0 if fine else 1.0
-    out[_LOST, world] = 1.0 if given.overflow[world] else 0.0
+    out[_LOST, world] = 1.0 if given.overflow[world] & _ROOM else 0.0
     given.overflow[world] = 0
     for k in range(len(given.beside)):
         out[_BESIDE + k, world] = given.sensordata[world, given.beside[k]]
