@@ -17,7 +17,9 @@ TASK, SEED, STEPS = "type1_lcca", 3, 30
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    return write_mjcf(TASK, tmp_path_factory.mktemp("mjcf") / "scene", seed=SEED)
+    return write_mjcf(
+        TASK, tmp_path_factory.mktemp("mjcf") / "scene", seed=np.int64(SEED)
+    )
 
 
 def actions():

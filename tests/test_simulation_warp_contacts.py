@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp_arrays
 
+from cathsim_dmc.laws import contact
 from cathsim_dmc.laws.device import Device as DeviceState
 from cathsim_dmc.simulation.warp import contact_kernels as kernels
 from cathsim_dmc.simulation.warp import passive
@@ -40,15 +41,15 @@ def test_contacts_lie_world_by_world_in_the_order_of_carriers_and_links():
     given = placed(warp_arrays.written(links, fields, number, rows))
     out, whose = given.out, itertools.product(range(3), range(3), range(2))
     order = [
-        (world, carrier, link, contact)
+        (world, carrier, link, one)
         for world, carrier, link in whose
-        for contact in range(number.reshape(3, 3, 2)[carrier, world, link])
+        for one in range(number.reshape(3, 3, 2)[carrier, world, link])
     ]
     assert given.counts.tolist() == [4, 5, 6] and out.nacon[0] == 15
     assert not given.overflow.any()
-    for at, (world, carrier, link, contact) in enumerate(order):
-        row = rows[(carrier * 3 + world) * 2 + link, contact]
-        assert out.worldid[at] == world and out.geomcollisionid[at] == contact
+    for at, (world, carrier, link, one) in enumerate(order):
+        row = rows[(carrier * 3 + world) * 2 + link, one]
+        assert out.worldid[at] == world and out.geomcollisionid[at] == one
         assert out.geom[at].tolist() == [links.geoms[link], links.carriers[carrier]]
         assert out.dist[at] == row[0]
         np.testing.assert_array_equal(out.pos[at], row[1:4])
@@ -91,16 +92,16 @@ def test_parameters_of_a_contact_are_those_of_mujoco():
         data = mujoco.MjData(own)
         data.qpos[:] = worlds[world].qpos
         mujoco.mj_forward(own, data)
-        for contact in data.contact:
-            carrier, link = sorted(contact.geom.tolist())
+        for each in data.contact:
+            carrier, link = sorted(each.geom.tolist())
             pair = (out.geom == (link, carrier)).all(axis=1) & (out.worldid == world)
             (at,) = np.flatnonzero(pair)
             found.add((world, link, carrier))
-            tangent = kernels._tangent(tuple(contact.frame[:3].tolist()))
-            np.testing.assert_allclose(tangent, contact.frame[3:6], atol=1e-12)
-            assert out.dim[at] == contact.dim
+            tangent = kernels._tangent(tuple(each.frame[:3].tolist()))
+            np.testing.assert_allclose(tangent, each.frame[3:6], atol=1e-12)
+            assert out.dim[at] == each.dim
             for name in ("friction", "solref", "solimp"):
-                value, there = getattr(contact, name), getattr(out, name)[at]
+                value, there = getattr(each, name), getattr(out, name)[at]
                 np.testing.assert_allclose(there, value, rtol=1e-12, err_msg=name)
     assert len(found) == 3 * 2 * 3
 
@@ -139,6 +140,51 @@ def test_a_link_is_seen_in_the_frame_of_the_wall_of_its_world():
         assert pair.capsule.caps == ((True, True), (False, True))[link]
 
 
+def test_a_link_has_its_law_and_its_sweep_in_each_world():
+    """Of a lumen; the first link is that of a compliant wall, in single precision."""
+    model, worlds = warp_arrays.scene()
+    given = warp_arrays.scene_of(model, worlds)
+    solimp = np.repeat(given.fields.geom_solimp, 3, axis=0)
+    solimp[:, given.links.geoms[0], 0] = np.float32(contact.COMPLIANT)
+    solimp[2, given.links.geoms[1], 0] = 0.02
+    steps = 0.004 * np.array([1.0, 2.0, 3.0])
+    given = given._replace(
+        walls=given.walls._replace(is_bore=np.zeros(2, bool)),
+        fields=given.fields._replace(geom_solimp=solimp, timestep=steps),
+    )
+    kind, moved = mujoco.mjtObj.mjOBJ_GEOM.value, np.zeros(6)
+    for thread in range(6):
+        pair, (world, link) = kernels.pair_of(thread, given), divmod(thread, 2)
+        geom, data = int(given.links.geoms[link]), worlds[world]
+        impedance = contact.COMPLIANT if link == 0 else solimp[world, geom, 0]
+        radius = given.fields.geom_size[world, geom, 0]
+        reference = given.fields.geom_solref[world, geom, 0]
+        law = contact.contact_law(pair.wall, radius, 0.0, impedance, reference)
+        assert tuple(pair.law) == tuple(law) and law.compliant == (link == 0)
+        mujoco.mj_objectVelocity(model, data, kind, geom, moved, 0)
+        turn = given.walls.turns[world, 0]
+        way = (steps[world] * turn.T @ moved.reshape(2, 3).T).T
+        own = [tuple(each.tolist()) for each in way]
+        sweep = contact.sweep_of(pair.capsule, law, own[1], own[0])
+        np.testing.assert_allclose(pair.sweep.travel, sweep.travel, atol=1e-12)
+        np.testing.assert_allclose(pair.sweep.turn, sweep.turn, atol=1e-12)
+        assert pair.sweep.reach == pytest.approx(sweep.reach)
+
+
+def test_two_planes_of_a_place_share_its_spring():
+    """From the flag of the law to the parameters of the contacts."""
+    model, worlds = warp_arrays.scene()
+    scene = warp_arrays.scene_of(model, worlds)
+    scene.found.number[:] = 0
+    pair = kernels.pair_of(2, scene)
+    rows = np.array([[1.0, 0, 0, 0.05, 0, 1], [0, 1.0, 0, 0.05, 0, 0]])
+    kernels.keep(scene.found, 2, pair, rows, 2)
+    given = warp_arrays.written(scene.links, scene.fields, *scene.found)
+    out = placed(given).out
+    np.testing.assert_allclose(out.solref[0], out.solref[1] / 2)
+    np.testing.assert_array_equal(out.worldid[:3], [1, 1, 9])
+
+
 def test_contacts_of_a_link_with_the_wall_of_its_world():
     """A link in each world, parallel to its bore and pressed into it."""
     model, worlds = warp_arrays.scene()
@@ -166,7 +212,8 @@ def test_contacts_of_a_link_with_the_wall_of_its_world():
     assert given.found.number[0] == 0
 
 
-def test_a_device_of_a_world_has_the_values_of_this_world():
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_device_of_a_world_has_the_values_of_this_world(shared):
     random = np.random.RandomState(0)
     whole = {
         name: random.rand(warp_arrays.WORLDS, 6, 3) for name in DeviceState._fields
@@ -175,15 +222,19 @@ def test_a_device_of_a_world_has_the_values_of_this_world():
     own = ("geoms", "body_dofadr", "body_dofnum")
     hinges = ("hinge_joints", "hinge_qpos", "hinge_dofs")
     whole |= {name: indices + n for n, name in enumerate((*own, *hinges))}
-    whole["geom_size"], shared = whole["geom_size"][:1], whole["geom_size"][0]
+    fields = ("geom_size", "jnt_stiffness", "qpos_spring")
+    if shared:
+        whole |= {name: whole[name][:1] for name in fields}
     device = DeviceState(**whole)
     given = passive.Given((), 2, device, np.zeros(warp_arrays.WORLDS), ())
     for world in range(warp_arrays.WORLDS):
         found = passive.device_of(world, given)._asdict()
         for name in ("xipos", "xmat", "cvel", "subtree_com"):
             np.testing.assert_array_equal(found[name], whole[name][world, 2:5])
-        for name in ("cdof", "qpos", "qfrc_passive", "jnt_stiffness", "qpos_spring"):
+        for name in ("cdof", "qpos", "qfrc_passive"):
             np.testing.assert_array_equal(found[name], whole[name][world])
         for name in (*own, *hinges):
             np.testing.assert_array_equal(found[name], whole[name])
-        np.testing.assert_array_equal(found["geom_size"], shared)
+        for name in fields:
+            value = whole[name][0 if shared else world]
+            np.testing.assert_array_equal(found[name], value)

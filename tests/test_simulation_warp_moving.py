@@ -8,19 +8,19 @@ from cathsim_dmc.laws import motion
 from cathsim_dmc.simulation.warp import moving_kernels
 
 
-def breathing(shift):
+def breathing(shift, growth=0.0):
     """`Vessels` at 3 s, 4 s and 5 s, and a lattice that breathing shifts as a whole."""
     parameters = motion.MotionParameters(
         heart=np.zeros(warp_arrays.WORLDS),
         breathing=np.array([0.5, 0.8, 0.7]),
-        distensibility=np.zeros(warp_arrays.WORLDS),
+        distensibility=np.array([0.02, 0.01, 0.03]),
         rate=np.ones(warp_arrays.WORLDS),
         phase=np.zeros(warp_arrays.WORLDS),
         wave_speed=np.ones(warp_arrays.WORLDS),
         breath_rate=np.array([0.3, 0.2, 0.1]),
         breath_phase=np.array([0.1, 0.0, 0.2]),
     )
-    node = np.concatenate([np.zeros(3), shift, np.zeros(2)])
+    node = np.array([0.0, 0, 0, *shift, growth, 0])
     lattice = np.concatenate([(-20, -20, -20, 40, 2, 2, 2), np.tile(node, 8)])
     boxes = moving_kernels.Boxes(
         places=np.zeros((warp_arrays.WORLDS, 1, 3)),
@@ -119,7 +119,7 @@ def test_contacts_are_carried_by_the_wall_of_their_world():
     """
     model, worlds = warp_arrays.scene()
     shift = np.array([0.02, -0.01, 0.03])
-    vessels, lattice = breathing(shift)
+    vessels, lattice = breathing(shift, growth=0.5)
     given = warp_arrays.scene_of(model, worlds)
     links, step = given.links, 0.004
     carrier = int(links.carriers[0])
@@ -147,7 +147,11 @@ def test_contacts_are_carried_by_the_wall_of_their_world():
         moving_kernels.carry(world, scratch, carried)
     assert (velocity[0] == 1).all() and (reference[0] == 1).all()
     course = motion.nth_course(vessels.parameters, 1, 4.0 + step / 2)
-    speeds = axes @ (course.breathing_rate * shift)
+    there = np.empty(motion.WARP)
+    motion.warp(lattice, course, out.pos[1], np.empty((motion.VALUES, 4)), there)
+    # A wall that widens moves along the normal from the device into the wall.
+    assert there[19] != 0
+    speeds = axes @ (course.breathing_rate * shift + there[19] * axes[0])
     impedance = 0.5 + 0.3 * 0.4**2 / 0.5
     damping, spring = 70 / 0.8, 900 / 0.8**2 * impedance
     normal = (damping + step * spring) / (1 + step * (damping + step * spring))

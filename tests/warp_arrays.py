@@ -25,8 +25,16 @@ SCENE = """
       friction="0.2 0.1 0.1" solref="0.03 0.9" contype="1" conaffinity="0"/>
     <geom name="d" type="box" size="1 1 1" condim="6" solref="0.03 1.2" contype="1"
       conaffinity="0"/>
+    <body pos="5 0 0">
+      <joint type="slide"/>
+      <geom size="0.1" contype="0" conaffinity="0"/>
+    </body>
     <body pos="0.1 0 1.05">
       <freejoint/>
+      <body>
+        <joint/>
+        <geom size="0.1" contype="0" conaffinity="0"/>
+      </body>
       <geom name="c" type="capsule" size="0.1 0.2" contype="0" conaffinity="1"
         condim="4" friction="0.6 1e-3 5e-4" solref="-50 -9" solmix="0.5"/>
       <body pos="0 0.5 -0.2">
@@ -47,8 +55,8 @@ def scene():
     random, worlds = np.random.RandomState(0), []
     for _ in range(WORLDS):
         data = mujoco.MjData(model)
-        data.qpos[:3] += random.uniform(-0.02, 0.02, 3)
-        data.qpos[7:] = random.uniform(-0.3, 0.3, 2)
+        data.qpos[1:4] += random.uniform(-0.02, 0.02, 3)
+        data.qpos[8:] = random.uniform(-0.3, 0.3, 3)
         data.qvel[:] = random.uniform(-1, 1, model.nv)
         mujoco.mj_forward(model, data)
         worlds.append(data)

@@ -81,7 +81,7 @@ def write_mjcf(
             "the scene of one"
         )
     env.reset()
-    values = {"name": task, "seed": seed, **describe(env)}
+    values = {"name": task, "seed": options["random"], **describe(env)}
     directory.parent.mkdir(parents=True, exist_ok=True)
     with atomic_directory(directory) as folder:
         mjcf.export_with_assets(env.task.root_entity.mjcf_model, folder, SCENE)
