@@ -18,18 +18,34 @@ from numba.core import caching
 _LOG = logging.getLogger(__name__)
 _PACKAGE = Path(__file__).parent
 # Texts that mark a source file with compiled functions or with compiler code.
-_MARKS = (b"\n@compiled", b"\n@callback", b"import numba", b"from numba")
+_MARKS = (
+    *(b"\n@compiled", b"\n@law", b"\n@inlined", b"\n@callback"),
+    *(b"import numba", b"from numba"),
+)
+# Other files with constants that compiled functions contain.
+_CONSTANTS = ("anatomy/motion.py", "imaging/carm.py", "imaging/options.py")
 _SEAL = hashlib.sha256().digest_size
+
+
+def sources() -> dict[Path, bytes]:
+    """Source files on which compiled code depends, in order, and their contents."""
+    every = {path: path.read_bytes() for path in sorted(_PACKAGE.rglob("*.py"))}
+    constants = [_PACKAGE / name for name in _CONSTANTS]
+    return {
+        path: source
+        for path, source in every.items()
+        if path.parent.name == "laws"
+        or path in constants
+        or any(mark in source for mark in _MARKS)
+    }
 
 
 @functools.cache
 def _stamp() -> bytes:
     # Compiled code depends on the layout of MuJoCo's structs.
     digest = hashlib.sha256(metadata.version("mujoco").encode())
-    for path in sorted(_PACKAGE.rglob("*.py")):
-        source = path.read_bytes()
-        if path.parent.name == "laws" or any(mark in source for mark in _MARKS):
-            digest.update(source)
+    for source in sources().values():
+        digest.update(source)
     return digest.digest()
 
 

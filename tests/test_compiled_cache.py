@@ -1,16 +1,19 @@
 """The cache of compiled loops: no fault of it stops a run, and none goes unsaid."""
 
+import ast
 import ctypes
 import errno
 import logging
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numba
 import pytest
 from numba.core import caching
 
+import cathsim_dmc
 from cathsim_dmc import compiled_cache
 from cathsim_dmc.collision import native
 from cathsim_dmc.compiled import compiled
@@ -218,3 +221,35 @@ def test_a_part_is_compiled_with_its_caller_alone():
         return made(number) + 1.0
 
     assert call(20.5) == 42.0
+
+
+COMPILING = {"compiled", "law", "inlined", "callback", "_adapter"}
+
+
+def used_by_compiled(tree):
+    """Names that the compiled functions of a module refer to."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef):
+            by = {ast.unparse(each).split("(")[0] for each in node.decorator_list}
+            if by & COMPILING:
+                yield from (x.id for x in ast.walk(node) if isinstance(x, ast.Name))
+
+
+def test_a_change_of_any_source_of_compiled_code_compiles_anew():
+    """The functions that compiled code calls and the constants that it contains."""
+    package, missed = Path(cathsim_dmc.__file__).parent, set()
+    kept = set(compiled_cache.sources())
+    for path in package.rglob("*.py"):
+        tree = ast.parse(path.read_text())
+        used = set(used_by_compiled(tree))
+        if used and path not in kept:
+            missed.add(str(path))
+        for node in tree.body:
+            if not isinstance(node, ast.ImportFrom):
+                continue
+            names = (node.module or "").split(".")
+            source = package.parent.joinpath(*names).with_suffix(".py")
+            if names[0] != "cathsim_dmc" or source in kept or not source.exists():
+                continue
+            missed |= {f"{source}: {n.name}" for n in node.names if n.name in used}
+    assert not missed
