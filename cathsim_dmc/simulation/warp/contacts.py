@@ -61,10 +61,8 @@ class WallContacts:
         self.is_wall = np.zeros(model.ngeom, bool)
         self.is_wall[self.carriers] = model.geom_bodyid[self.carriers] == 0
         links = _links(model, self.carriers)
-        self._links, self._threads = (
-            device.constant(links),
-            num_worlds * links.dims.size,
-        )
+        self._links = device.constant(links)
+        self._threads = num_worlds * links.dims.size
         self._numbers: dict[tuple[float, ...], int] = {}
         self._parts: list[Registered] = []
         shape = num_worlds, len(self.carriers)
@@ -177,7 +175,7 @@ class WallContacts:
         columns: list[list[np.ndarray]] = [[] for _ in _KINDS]
         starts = np.zeros((len(self._parts), len(_KINDS), 2), np.int64)
         for number, wall in enumerate(self._parts):
-            lumen, line = (wall.arrays, empty)
+            lumen, line = wall.arrays, empty
             if wall.is_bore:
                 lumen, line = [empty] * 4, wall.arrays[0]
             for which, array in enumerate([*lumen, line, self._lattice(wall)]):
