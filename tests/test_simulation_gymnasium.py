@@ -1,5 +1,6 @@
 """The tasks as Gymnasium environments."""
 
+import functools
 import re
 import runpy
 import warnings
@@ -261,13 +262,16 @@ def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
     shown = many.render()
     assert len(shown) == 2 and shown[0].shape == (32, 64, 3)
     np.testing.assert_array_equal(shown[1], one.render())
+    state = one.snapshot()
     many.close()
     one.close()
     with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="make another"):
         one.reset()
     with pytest.raises(gymnasium.error.ResetNeeded):
         one.step(one.action_space.sample())
-    for use in (many.reset, lambda: many.step(many.action_space.sample())):
+    step = functools.partial(many.step, many.action_space.sample())
+    restore = functools.partial(one.restore, state)
+    for use in (many.reset, step, many.snapshot, one.snapshot, restore):
         with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="another"):
             use()
 

@@ -134,6 +134,7 @@ class CathSimEnv(gymnasium.Env):
 
     def snapshot(self) -> Snapshot:
         """The state between two steps; see `tasks.environment.Environment.snapshot`."""
+        _require_open(self._closed)
         return self.environment.snapshot()
 
     def restore(self, snapshot: Snapshot):
@@ -145,6 +146,7 @@ class CathSimEnv(gymnasium.Env):
         Raises:
             ValueError: if the snapshot is of another task, or of several simulations.
         """
+        _require_open(self._closed)
         timestep = self.environment.restore(snapshot)
         self._ended = timestep.last()
         info = self.environment.task.info()
@@ -292,6 +294,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
 
     def snapshot(self) -> Snapshot:
         """The state of all simulations; see `BatchSimulation.snapshot`."""
+        _require_open(self.closed)
         return self.simulation.snapshot()
 
     def restore(self, snapshot: Snapshot):
