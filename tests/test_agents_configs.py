@@ -64,6 +64,8 @@ def test_only_settings_that_learning_does_not_depend_on_may_change():
     assert "total_frames" in annealed.changed_for_resume(
         annealed.replace(total_frames=1_000)
     )
+    assert config.resumable - annealed.resumable == {"total_frames"}
+    assert "demonstrations" not in config.resumable  # PPO has none
     shown = make_config("sac", demonstrations="here")
     assert shown.changed_for_resume(shown.replace(demonstrations="moved")) == {}
     alone = shown.replace(demonstrations=None)

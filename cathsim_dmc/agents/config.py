@@ -180,14 +180,6 @@ class TrainingConfig:
     state_dependent_std: ClassVar[bool] = False
     # Settings by the name of a preset; settings that it leaves out have their defaults.
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"published": {}}
-    # Settings that may change when a run is resumed: none that learning depends on,
-    # except for the number of frames and the path of the dataset.
-    resumable: ClassVar[frozenset[str]] = frozenset(
-        {"total_frames", "checkpoint_frames", "checkpoint_seconds", "keep_checkpoints"}
-        | {"metrics_frames", "logger", "num_threads", "torch_threads", "torch_device"}
-        | {"simulation_device"}
-        | {"demonstrations", "modules", "collector", "collectors"}
-    )
 
     task: str = "type1_bca"
     observation: str | tuple[str, ...] = "internal"
@@ -242,6 +234,21 @@ class TrainingConfig:
         except (TypeError, ValueError) as error:
             what = f"finite numbers, strings, lists and dicts only: {error}"
             require(False, "task_kwargs", self.task_kwargs, what)
+
+    @property
+    def resumable(self) -> frozenset[str]:
+        """Settings that may change when the run is resumed.
+
+        Learning depends on none of them, except for the number of frames and the path
+        of the dataset.
+        """
+        names = frozenset(
+            {"total_frames", "checkpoint_frames", "checkpoint_seconds"}
+            | {"keep_checkpoints", "metrics_frames", "logger", "num_threads"}
+            | {"torch_threads", "torch_device", "torch_compile", "simulation_device"}
+            | {"demonstrations", "modules", "collector", "collectors"}
+        )
+        return names & vars(self).keys()
 
     @property
     def training_kwargs(self) -> dict[str, Any]:
@@ -303,8 +310,6 @@ class ActorCriticConfig(TrainingConfig):
         torch_compile: Whether torch compiles the loss and its gradient, for faster
             gradient steps (docs/training.md); it needs a C++ compiler and a minute.
     """
-
-    resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable | {"torch_compile"}
 
     critic_observation: str | tuple[str, ...] | None = None
     torch_compile: bool = False

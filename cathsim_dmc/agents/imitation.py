@@ -134,13 +134,17 @@ class BCConfig(CloningConfig):
     """
 
     algorithm: ClassVar[str] = "bc"
-    resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable - {"total_frames"}
 
     demonstrations: str | None = None
     gradient_steps: int = positive(10_000)
     steps_per_env: int = positive(128)
     total_frames: int = 20_480
     checkpoint_frames: int = 10_240
+
+    @property
+    def resumable(self) -> frozenset[str]:
+        """All but the number of frames, over which the gradient steps are spread."""
+        return super().resumable - {"total_frames"}
 
 
 class BC(CloningLearner):

@@ -19,7 +19,6 @@ from cathsim_dmc.agents.config import (
     TUNED_TRAINING,
     ActorCriticConfig,
     ConfigError,
-    TrainingConfig,
     positive,
     require,
     within,
@@ -115,12 +114,10 @@ class PPOConfig(ActorCriticConfig):
         """Frames per update, over all environments."""
         return self.steps_per_update
 
-    def changed_for_resume(self, other: TrainingConfig) -> dict[str, tuple]:
-        """Return fields that must not change, also the length of an annealed run."""
-        changed = super().changed_for_resume(other)
-        if self.anneal and self.total_frames != other.total_frames:
-            changed["total_frames"] = (self.total_frames, other.total_frames)
-        return changed
+    @property
+    def resumable(self) -> frozenset[str]:
+        """All but the length of a run over which the learning rate falls."""
+        return super().resumable - ({"total_frames"} if self.anneal else set())
 
 
 class PPO(Learner):

@@ -195,7 +195,7 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
         # With another algorithm nearly all settings differ.
         if "algorithm" in changed:
             changed = {"algorithm": changed["algorithm"]}
-        may = sorted(config.resumable & set(vars(config)) - set(changed))
+        may = sorted(checkpoint.config.resumable - set(changed))
         annealed = "total_frames" in changed and vars(config).get("anneal")
         why = (
             " The learning rate of this run falls over its length." if annealed else ""
