@@ -33,7 +33,7 @@ from cathsim_dmc.agents.policies import (
     task_and_options,
 )
 from cathsim_dmc.policies import in_environment
-from cathsim_dmc.simulation.environments import PIXELS, VECTOR
+from cathsim_dmc.simulation.environments import PIXELS
 from cathsim_dmc.simulation.episodes import play_alone
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.interface import action_table, observation_table
@@ -150,7 +150,7 @@ def card_of(player: TrainedPolicy, task: Any) -> dict[str, Any]:
         "control_timestep" in s; "training", "evaluation", "versions".
     """
     shapes, table = player.shapes, observation_table(task)
-    inputs = zip(_inputs(player), _normalisers(player.network), strict=True)
+    inputs = zip(shapes.raw_keys, _normalisers(player.network), strict=True)
     card, kept = player.card or {}, player.checkpoint
     if kept is not None:
         card = {"sha256": dict(kept.sha256), "training": {"frames": kept.frames}}
@@ -205,7 +205,7 @@ def _input(
 def _played(player: TrainedPolicy, env: Any) -> dict[str, np.ndarray]:
     """Return inputs of the network and its actions at up to 64 steps of an episode."""
     seen: list[dict[str, np.ndarray]] = []
-    keys = (*_inputs(player), "action")
+    keys = (*player.shapes.raw_keys, "action")
     handle = player.network.register_forward_hook(
         lambda _, __, out: seen.append({k: out[k].numpy().copy() for k in keys})
     )
@@ -218,14 +218,8 @@ def _played(player: TrainedPolicy, env: Any) -> dict[str, np.ndarray]:
     return {key: np.concatenate([seen[i][key] for i in places]) for key in keys}
 
 
-def _inputs(player: TrainedPolicy) -> list[str]:
-    """Return the names of the inputs, vector before pixels."""
-    shapes = player.shapes
-    return [VECTOR] * (shapes.vector > 0) + [PIXELS] * (shapes.pixels is not None)
-
-
 def _write_model(player: TrainedPolicy, path: Path, samples: Any) -> None:
-    names = _inputs(player)
+    names = player.shapes.raw_keys
     batch = torch.export.Dim("N")
     with _quiet():
         torch.onnx.export(

@@ -103,7 +103,7 @@ def serve(
             wrong = error
             say(f"{peer}:{port}: {error}")
             log.write("refused", fault=error.fault, reason=error.text)
-            if session.running is not None:
+            if session.running:
                 done.append(session.summary(error.fault, error.text))
         except BaseException as error:  # of the device, or a signal
             text = f"the device's program ends: {type(error).__name__}: {error}"
@@ -156,7 +156,7 @@ class _Running:
 class _Session:
     """Session with one driver."""
 
-    running: _Running | None = None
+    running = False  # an episode
     played: int | None = None  # steps of the last episode
 
     def __init__(
@@ -171,6 +171,7 @@ class _Session:
         self._options, self._log = options, log
         speeds = ["/s" in str(one["unit"]) for one in device.action]
         self._speeds = np.array(speeds, dtype=bool)
+        self._run = _Running()
 
     def greet(self) -> None:
         hello = self._wait(HANDSHAKE, "hello")
@@ -210,7 +211,8 @@ class _Session:
     def episode(self) -> dict[str, Any]:
         """Run one episode and return its summary; stop the device in any case."""
         device, options = self._device, self._options
-        self.running = run = _Running()
+        self.running, self._run = True, _Running()
+        run = self._run
         self._heard = due = time.monotonic()
         last, reason = np.zeros(len(self._speeds)), None
         try:
@@ -246,11 +248,11 @@ class _Session:
             device.stop()
         self._log.write("end", step=run.step, reason=end)
         found = self.summary(end, reason)
-        self.running, self.played = None, run.step
+        self.running, self.played = False, run.step
         return found
 
     def summary(self, end: str, reason: str | None) -> dict[str, Any]:
-        run = self.running or _Running()
+        run = self._run
         return {
             "end": end, "reason": reason, "steps": run.step, "missed": run.missed,
             "late": run.late, "force": run.force, "answer": milliseconds(run.answers),
@@ -258,7 +260,7 @@ class _Session:
         }  # fmt: skip
 
     def _too_much(self, force: Mapping[str, float]) -> str | None:
-        run, limit = self.running or _Running(), self._options.force_limit
+        run, limit = self._run, self._options.force_limit
         largest = max((abs(force[k]) for k in LIMITED if k in force), default=0.0)
         run.force = max(run.force, largest)
         return "force_limit" if limit is not None and largest > limit else None
@@ -274,7 +276,7 @@ class _Session:
     def _apply(self, action: np.ndarray, state: State) -> None:
         """Give the device an action; log it with the forces of the last state."""
         self._device.command(action)
-        step, force = (self.running or _Running()).step, dict(state.force)
+        step, force = self._run.step, dict(state.force)
         self._log.write("applied", step=step, action=action.tolist(), force=force)
 
     def _action(self, due: float, state: State) -> tuple[np.ndarray | None, str | None]:
@@ -283,7 +285,7 @@ class _Session:
         The action is applied when it arrives. Messages are received for the rest of the
         period too, so that a stop or the loss of the driver takes effect at once.
         """
-        run, options = self.running or _Running(), self._options
+        run, options = self._run, self._options
         action, frames = None, 0
         while True:
             now, until = time.monotonic(), self._heard + options.watchdog
