@@ -54,6 +54,11 @@ def test_unknown_names_list_the_valid_ones():
         make_config("ppo", learn_rate=1.0)
 
 
+def test_an_observation_of_policy_and_critic_is_collected_once():
+    config = PPOConfig(observation="image", critic_observation=("internal", "image"))
+    assert config.collected_observation == ("image", "internal")
+
+
 def test_only_settings_that_learning_does_not_depend_on_may_change():
     config = PPOConfig()
     longer = config.replace(total_frames=1_000_000, num_threads=1, torch_threads=2)

@@ -347,6 +347,22 @@ def test_an_episode_is_repeated_with_the_end_that_it_had(by_hand):
     assert stopped.truncations == [False, False, True]
 
 
+def test_an_option_with_its_default_value_is_the_default(by_hand, tmp_path):
+    import dataclasses
+
+    from cathsim_dmc.recording.dataset import DatasetError, repeat_episodes
+
+    episode = Episode.load(by_hand / "simple1_bca_001.npz")
+    options = {**episode.meta["task_kwargs"], "device": "steerable_5f"}
+    meta = {**episode.meta, "task_kwargs": options}
+    dataclasses.replace(episode, meta=meta).save(tmp_path / "a.npz")
+    (one,) = repeat_episodes(tmp_path, "tracking", device=None)
+    assert len(one.actions) == 3
+    said = "its device is the default, not 'steerable_4f'"
+    with pytest.raises(DatasetError, match=said):
+        list(repeat_episodes(tmp_path, "tracking", device="steerable_4f"))
+
+
 def test_an_episode_that_leads_elsewhere_is_refused(by_hand, tmp_path):
     import dataclasses
 

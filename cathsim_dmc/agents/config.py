@@ -321,4 +321,4 @@ class ActorCriticConfig(TrainingConfig):
             return self.observation
         both = self.observation, self.critic_observation
         names = ((one,) if isinstance(one, str) else one for one in both)
-        return tuple(itertools.chain.from_iterable(names))
+        return tuple(dict.fromkeys(itertools.chain.from_iterable(names)))

@@ -102,6 +102,15 @@ def chosen(options: Mapping[str, Any], name: str) -> Any:
     return None if value == getattr(NavigationConfig, name, None) else value
 
 
+def _require_options(own: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Raises ValueError unless episodes have the task and options that are wanted."""
+    for name in wanted:
+        pair = chosen(own, name), chosen(wanted, name)
+        if pair[0] != pair[1]:
+            told = ["the default" if one is None else repr(one) for one in pair]
+            raise ValueError(f"its {name} is {told[0]}, not {told[1]}")
+
+
 def metadata_of(path: str | os.PathLike[str]) -> Path:
     """Returns the path of a dataset's metadata.json; DatasetError if there is none."""
     data = next(Path(path).glob("data"), Path(path)) / "metadata.json"
@@ -139,9 +148,8 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
         if not {"observation_space", "action_space"} <= set(named):
             raise ValueError("metadata.json lacks the spaces")
         own = json.loads(named.get("env_spec") or "{}").get("kwargs", {})
-        for name, value in options.items():
-            if own and chosen(own, name) != chosen(options, name):
-                raise ValueError(f"its {name} is {own.get(name)!r}, not {value!r}")
+        if own:
+            _require_options(own, options)
         for file in data.parent.glob("*.hdf5"):
             check_stored(file)
         for number, episode in enumerate(minari.MinariDataset(data.parent)):
@@ -268,9 +276,7 @@ def repeat_episodes(
         try:
             episode = Episode.load(file)
             task, own = _common([episode])
-            for name, value in options.items():
-                if (found := {"task": task, **own}.get(name)) != value:
-                    raise ValueError(f"its {name} is {found!r}, not {value!r}")
+            _require_options({"task": task, **own}, options)
             wanted = task, {**own, "observation": observation}
             if environment is None or made != wanted:
                 environment = suite.load(suite.DOMAIN, task, wanted[1])
