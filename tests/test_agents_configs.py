@@ -59,6 +59,16 @@ def test_an_observation_of_policy_and_critic_is_collected_once():
     assert config.collected_observation == ("image", "internal")
 
 
+def test_what_is_for_the_training_replaces_the_options_of_the_task():
+    own = {"training_reward": {"path": -1.0}, "training_max_steps": 120}
+    given = {"max_steps": 300, "reward": {"time": -1.0}, "goal_radius": 0.01}
+    found = PPOConfig(task_kwargs=given, training_start=(0.0, 0.5), **own)
+    assert found.training_kwargs == {
+        "max_steps": 120, "reward": {"path": -1.0}, "goal_radius": 0.01,
+        "start_along_route": (0.0, 0.5),
+    }  # fmt: skip
+
+
 def test_only_settings_that_learning_does_not_depend_on_may_change():
     config = PPOConfig()
     longer = config.replace(total_frames=1_000_000, num_threads=1, torch_threads=2)

@@ -16,7 +16,13 @@ from test_agents_training import run, small_ppo, small_sac
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc import suite
-from cathsim_dmc.agents import Checkpoint, ConfigError, evaluate, pretrained
+from cathsim_dmc.agents import (
+    Checkpoint,
+    ConfigError,
+    PPOConfig,
+    evaluate,
+    pretrained,
+)
 from cathsim_dmc.agents.learners import make_config
 from cathsim_dmc.agents.networks import NetworkShapes, make_policy
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
@@ -194,6 +200,12 @@ def test_what_a_policy_of_images_observes_besides_may_grow(tmp_path):
     # Hidden layers come with numbers alone.
     with pytest.raises(ConfigError, match=r"does not fit .*sizes: .*\(vector=0"):
         started_from("image", 0)
+
+
+@pytest.mark.parametrize("config", ["ppo", {"task": "reach"}, PPOConfig])
+def test_what_is_no_settings_is_refused(tmp_path, config):
+    with pytest.raises(ConfigError, match="config is .*as make_config"):
+        run(config, tmp_path / "run")
 
 
 def test_a_start_that_fails_leaves_no_folder(tmp_path):

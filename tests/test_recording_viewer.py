@@ -33,6 +33,9 @@ def test_only_recordings_are_opened(recording, tmp_path):
     arrays.write_bytes(b"PK")
     with pytest.raises(ValueError, match="the viewer opens .*e.rrd"):
         check_recording(arrays)
+    other.unlink()
+    with pytest.raises(ValueError, match="no recording is beside .*--out FILE.rrd"):
+        check_recording(arrays)
 
 
 def test_no_display_is_an_error_that_names_the_way_out(recording, monkeypatch):

@@ -1,5 +1,6 @@
 """Entries of the leaderboard: submissions that are checked and played again."""
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping
@@ -135,12 +136,7 @@ def _player(entry: Entry) -> str | RecordedActions | None:
 
 
 def _same(one: EpisodeOutcome, other: EpisodeOutcome) -> bool:
-    return json.dumps(_plain(one)) == json.dumps(_plain(other))
-
-
-def _plain(episode: EpisodeOutcome) -> dict[str, Any]:
-    found = EvaluationResult("", "", (0,), (episode,), {}).to_dict()["episodes"][0]
-    return {name: value for name, value in found.items() if name not in ("seed", "env")}
+    return dataclasses.replace(one, env=other.env) == other
 
 
 def _result(values: Mapping[str, Any]) -> EvaluationResult:

@@ -25,7 +25,7 @@ from cathsim_dmc.agents.checkpoint import (
     save_checkpoint,
 )
 from cathsim_dmc.agents.collection import make_collector
-from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig, require
 from cathsim_dmc.agents.episodes import EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
 from cathsim_dmc.agents.interruption import noted_interruption
@@ -94,14 +94,17 @@ def train(
             when it is complete; it does not change the state of torch's generator.
 
     Raises:
-        ConfigError: the directory holds a run that was not to be resumed, or one with
-            other settings, or none that could be resumed; another process trains in
-            it; the torch device cannot be used; or `without_replay` lacks `resume`.
+        ConfigError: `config` is of another kind; the directory holds a run that was not
+            to be resumed, or one with other settings, or none that could be resumed;
+            another process trains in it; the torch device cannot be used; or
+            `without_replay` lacks `resume`.
         CheckpointError: the checkpoint to continue from is damaged.
         ReplayError: the files of its replay are missing or damaged.
         FloatingPointError: a loss is not finite; the last checkpoint stays.
         OSError: the disk is full, or the directory cannot be written to.
     """
+    settings = "settings, as make_config(...) returns them"
+    require(isinstance(config, TrainingConfig), "config", config, settings)
     if without_replay and not resume:
         raise ConfigError(
             "without_replay=True (--without-replay) is for a run that is resumed; give "

@@ -153,10 +153,10 @@ class Driver:
 
     def warm_up(self, choose: Choose, count: int) -> dict[str, float] | None:
         """Compute actions from zeros; return percentiles of their durations, ms."""
-        kinds = {
-            k: np.uint8 if d == "uint8" else float for k, (_, d) in self._table.items()
+        zeros = {
+            key: np.zeros(shape, np.uint8 if dtype == "uint8" else float)
+            for key, (shape, dtype) in self._table.items()
         }
-        zeros = {k: np.zeros(s, kinds[k]) for k, (s, _) in self._table.items()}
         times = []
         for _ in range(count):
             began = time.monotonic()

@@ -28,10 +28,12 @@ def check_recording(path: str | os.PathLike[str]) -> Path:
     if not path.is_file():
         raise FileNotFoundError(f"no recording at {path}")
     if path.suffix == ".npz":
-        raise ValueError(
-            f"{path} holds the arrays of an episode; the viewer opens the recording "
-            f"beside them, {path.with_suffix('.rrd')}"
-        )
+        beside = path.with_suffix(".rrd")
+        way = f"the viewer opens the recording beside them, {beside}"
+        if not beside.is_file():
+            way = "no recording is beside them; `cathsim record POLICY --out FILE.rrd` "
+            way += "writes both"
+        raise ValueError(f"{path} holds the arrays of an episode; {way}")
     with path.open("rb") as stream:
         begin = stream.read(len(_MAGIC))
         stream.seek(max(path.stat().st_size - len(_FOOTER) + _END, 0))
