@@ -5,6 +5,7 @@ import importlib
 import inspect
 import io
 import json
+import math
 import re
 import shlex
 import signal
@@ -31,6 +32,7 @@ from cathsim_dmc.bridge import ServeOptions
 from cathsim_dmc.cli import agents as commands
 from cathsim_dmc.cli import checks, options, result_tables, task_options, training
 from cathsim_dmc.cli import phantoms as cli_phantoms
+from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.image_set import ImageSetOptions
 from cathsim_dmc.validation import wall
@@ -125,6 +127,28 @@ def test_list_as_json(cathsim):
     assert printed["domain"] == "cathsim"
     assert list(printed["tasks"]) == list(suite.SUITE)
     assert all(line and "\n" not in line for line in printed["tasks"].values())
+
+
+def test_the_devices_are_listed_in_the_units_that_are_named(cathsim):
+    code, out, err = cathsim("list", "--devices", "--json")
+    assert code == 0 and not err
+    rows = json.loads(out)["devices"]
+    assert list(rows) == list(DEVICES)
+    wire, catheter = rows["wire_035_glide"], rows["steerable_5f"]
+    assert wire["outer_diameter_mm"] == pytest.approx(0.035 * 25.4)
+    assert catheter["lumen_diameter_mm"] == pytest.approx(1.0)
+    # Nitinol, 48 GPa with a Poisson's ratio of 0.33; diameters of the core in mm.
+    for part, core in (("shaft", 0.5), ("tip", 0.28)):
+        bending = 48e3 * math.pi * core**4 / 64
+        assert wire[f"{part}_bending_stiffness_n_mm2"] == pytest.approx(bending)
+        torsion = wire[f"{part}_torsional_stiffness_n_mm2"]
+        assert torsion == pytest.approx(bending / 1.33)
+    assert wire["tip_length_mm"] == pytest.approx(30.0)
+    assert 1.0 < wire["linear_density_g_per_m"] < 3.0  # the core alone has 1.3
+    assert wire["shape"] == "45° in 6.3 mm, 4 mm straight"
+    assert catheter["shape"] == "straight; steerable"
+    _, out, _ = cathsim("list", "--devices")
+    assert re.search(r"wire_035_glide +0\.889 +0 +147 +14\.5 +30 +45°", out)
 
 
 def test_generated_phantom_can_be_navigated(cathsim, tmp_path):
@@ -436,7 +460,8 @@ def test_every_setting_is_a_typed_option(cathsim, tmp_path):
     code, out, err = cathsim("train", "--out", tmp_path, "--resume", "--frames", 128)
     assert code == 0, err
     assert Checkpoint.open(tmp_path).config == config.replace(total_frames=128)
-    code, _, err = cathsim("train", "--out", tmp_path, "--resume", "--frames", 64)
+    same = "--resume", "--algo", "ppo"
+    code, _, err = cathsim("train", "--out", tmp_path, *same, "--frames", 64)
     assert code == 0 and "128 frames are done, and 64 are asked for" in err
     code, _, err = cathsim("train", "--out", tmp_path, "--resume", "--clip", 0.3)
     assert code == 2 and "clip: it has 0.1, given is 0.3" in err
