@@ -3,7 +3,8 @@ import json
 import pytest
 
 from cathsim_dmc.agents import ConfigError, PPOConfig, SACConfig, make_config
-from cathsim_dmc.agents.learners import LEARNERS, config_from_dict
+from cathsim_dmc.agents.learners import LEARNERS, check_usable, config_from_dict
+from cathsim_dmc.recording.dataset import DatasetError
 
 
 def test_ppo_defaults_are_the_published_settings():
@@ -38,11 +39,26 @@ def test_configs_survive_json(algorithm, preset):
         (PPOConfig, {"task_kwargs": {"a": float("inf")}}, "task_kwargs.*finite"),
         (SACConfig, {"random_frames": 10}, "random_frames is 10.*256"),
         (SACConfig, {"replay_frames": 32}, "replay_frames is 32"),
+        (PPOConfig, {"hidden": ()}, "hidden is .*one entry or more"),
+        (PPOConfig, {"training_start": (0.1, 0.2, 0.3)}, "training_start .*two shares"),
     ],
 )
 def test_bad_values_are_named(kind, settings, message):
     with pytest.raises(ConfigError, match=message):
         kind(**settings)
+
+
+def test_a_setting_that_is_no_more_does_not_hinder_an_older_run():
+    assert config_from_dict({**PPOConfig().to_dict(), "tensorboard": True}) == (
+        PPOConfig()
+    )
+
+
+def test_what_is_missing_is_told_before_the_environment_is_made():
+    with pytest.raises(DatasetError, match="no dataset in nowhere"):
+        check_usable(make_config("sac", demonstrations="nowhere"))
+    with pytest.raises(ValueError, match="--import no_such_module"):
+        check_usable(make_config(task="own_task", modules=["no_such_module"]))
 
 
 def test_unknown_names_list_the_valid_ones():
@@ -71,7 +87,12 @@ def test_what_is_for_the_training_replaces_the_options_of_the_task():
 
 def test_only_settings_that_learning_does_not_depend_on_may_change():
     config = PPOConfig()
-    longer = config.replace(total_frames=1_000_000, num_threads=1, torch_threads=2)
+    longer = config.replace(
+        total_frames=1_000_000, num_threads=1, torch_threads=2, torch_device="cuda",
+        simulation_device="cuda", torch_compile=True, checkpoint_frames=1,
+        checkpoint_seconds=1.0, keep_checkpoints=1, metrics_frames=1, logger="csv",
+        modules=["own"], collector="ray", collectors=4,
+    )  # fmt: skip
     assert config.changed_for_resume(longer) == {}
     other = config.replace(clip=0.2, seed=3)
     assert config.changed_for_resume(other) == {"clip": (0.1, 0.2), "seed": (0, 3)}
