@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from cathsim_dmc.agents import ConfigError, collection, evaluate, make_config, train
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.agents.ppo import PPO
 from cathsim_dmc.agents.sac import SAC
 from cathsim_dmc.agents.training import _truncate_diverged
 from cathsim_dmc.agents.training_log import read_metrics
@@ -194,10 +195,14 @@ def test_resuming_continues_counters_rows_and_weights(tmp_path, make):
     assert again.metrics == pytest.approx(first.metrics, rel=1e-6)
     assert Checkpoint.open(tmp_path).frames == 1_024
 
+    seconds = Checkpoint.open(tmp_path).seconds
     second = run(make(total_frames=2_048), tmp_path, resume=True)
     assert (first.frames, second.frames) == (1_024, 2_048)
     assert second.seconds > first.seconds
     rows = read_metrics(tmp_path / "metrics.csv")
+    # The speed is that of this process.
+    rate = 1_024 / (rows[-1]["seconds"] - seconds)
+    assert rows[-1]["frames_per_second"] == pytest.approx(rate, rel=1e-4)
     frames = [row["frames"] for row in rows]
     assert frames == sorted(set(frames))
     for name in ("gradient_steps", "episodes", "seconds"):
@@ -346,6 +351,41 @@ def test_a_diverged_simulation_is_truncated_not_terminated():
     _truncate_diverged(batch)
     assert batch["next", "terminated"].flatten().tolist() == [False, True, False]
     assert torch.equal(batch["next", "done"], flags)
+
+
+def test_a_learner_is_not_told_that_a_diverged_simulation_ended(tmp_path, monkeypatch):
+    step, update, seen = synthetic_env.ReachEnv._step, PPO.update, []
+
+    def diverging(env, state):
+        found, lost = step(env, state), torch.as_tensor(env.count == 3)[:, None]
+        found["info", "physics_error"] = lost.float()
+        for flag in ("terminated", "done"):
+            found[flag] |= lost
+        return found
+
+    def noted(learner, batch, progress):
+        seen.append(batch)
+        return update(learner, batch, progress)
+
+    monkeypatch.setattr(synthetic_env.ReachEnv, "_step", diverging)
+    monkeypatch.setattr(PPO, "update", noted)
+    run(small_ppo(total_frames=512), tmp_path)
+    ends = seen[0]["next"]
+    lost = ends["info", "physics_error"].bool()
+    assert lost.any() and ends["done"][lost].all()
+    assert not ends["terminated"][lost].any()
+
+
+def test_the_threads_of_torch_are_the_runs_and_then_those_before(tmp_path):
+    before, seen = torch.get_num_threads(), []
+
+    def make_env(*arguments, **options):
+        seen.append(torch.get_num_threads())
+        return synthetic_env.make_env(*arguments, **options)
+
+    config = small_ppo(total_frames=512, torch_threads=before + 1)
+    run(config, tmp_path, make_env=make_env)
+    assert (seen, torch.get_num_threads()) == ([before + 1], before)
 
 
 def test_training_has_its_own_reward_and_episodes_and_evaluation_the_tasks(tmp_path):

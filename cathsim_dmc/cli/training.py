@@ -19,7 +19,7 @@ from cathsim_dmc import agents  # isort: skip
 from cathsim_dmc import files
 from cathsim_dmc.agents.checkpoint import checkpoints_in
 from cathsim_dmc.agents.learners import LEARNERS, config_from_dict
-from cathsim_dmc.agents.training import no_run
+from cathsim_dmc.agents.training import CONFIG_FILE, no_run
 from cathsim_dmc.cli.options import INTERRUPTED, Modules
 from cathsim_dmc.cli.task_options import field_helps, task_kind
 
@@ -134,19 +134,16 @@ def _settings(arguments: list[str]) -> tuple[agents.TrainingConfig, bool]:
         parser.add_argument(name, nargs="?")
     parser.add_argument("--resume", action="store_true")
     found, _ = parser.parse_known_args(arguments)
-    path = Path(found.out or ".") / "config.json"
-    if found.resume and found.out and not found.preset and path.is_file():
-        text = f"{path} holds no settings of a run"
-        with files.refused(ValueError, text, (ValueError, TypeError)):
-            config = config_from_dict(dict(json.loads(path.read_text())))
-        if found.algo in (None, config.algorithm):
-            return config, True
-    if (
-        found.resume
-        and found.out
-        and not (path.is_file() or checkpoints_in(Path(found.out)))
-    ):
-        raise ValueError(no_run(found.out))  # before the parser requires a task
+    if found.resume and found.out:
+        path = Path(found.out) / CONFIG_FILE
+        if not (path.is_file() or checkpoints_in(Path(found.out))):
+            raise ValueError(no_run(found.out))  # before the parser requires a task
+        if path.is_file() and not found.preset:
+            text = f"{path} holds no settings of a run"
+            with files.refused(ValueError, text, (ValueError, TypeError)):
+                config = config_from_dict(dict(json.loads(path.read_text())))
+            if found.algo in (None, config.algorithm):
+                return config, True
     given = {"algorithm": found.algo, "preset": found.preset}.items()
     chosen = {name: value for name, value in given if value is not None}
     return agents.make_config(**chosen), False
