@@ -48,6 +48,21 @@ def test_a_dataset_holds_what_happened(episodes, tmp_path):
     np.testing.assert_array_equal(shown, first)
 
 
+def test_a_time_limit_truncates_and_actions_keep_their_precision(
+    shared_environment, tmp_path
+):
+    env, draw = shared_environment(TASK, **SHORT), np.random.default_rng(1)
+    recorder = EpisodeRecorder(env, TASK, SHORT)
+    episode = recorder.record_episode(lambda _: draw.uniform(-1, 1, 21), 6)
+    export([episode], tmp_path / "own", observation="tracking")
+    dataset = minari.MinariDataset(tmp_path / "own" / "data")
+    (data,) = dataset.iterate_episodes()
+    assert data.truncations.tolist() == [False] * 8 + [True]
+    assert not data.terminations.any()
+    np.testing.assert_array_equal(data.actions, episode.action)
+    assert dataset.id == "own-v0"  # an id of Minari ends in a version
+
+
 def test_what_cannot_be_repeated_is_refused(episodes, tmp_path):
     first, second = episodes
     other = dataclasses.replace(second, task="type1_lcca")
