@@ -293,6 +293,13 @@ def test_a_policy_that_does_not_fit_is_refused(cloned, tmp_path):
     config = small("ppo", initial_policy=str(cloned), hidden=(16,))
     with pytest.raises(ConfigError, match=r"hidden: it has \(32,\), given is \(16,\)"):
         train(config, tmp_path, progress=False)
+    for name, own, given in (
+        ("activation", "'tanh'", "relu"),
+        ("observation_clip", "10.0", 5.0),
+    ):
+        config = small("ppo", initial_policy=str(cloned), **{name: given})
+        with pytest.raises(ConfigError, match=f"{name}: it has {own}, given is"):
+            train(config, tmp_path, progress=False)
     with pytest.raises(ConfigError, match="initial_std is 0"):
         small("ppo", initial_std=0.0)
     with pytest.raises(ConfigError, match="initial_std .* initial_policy alone"):
