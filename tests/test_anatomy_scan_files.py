@@ -158,6 +158,54 @@ def test_an_image_of_itk_that_is_cut_off_is_refused(tmp_path, packed):
         label_surface(path)
 
 
+@pytest.mark.parametrize("kind", ["nii.gz", "mha"])
+def test_a_label_map_whose_packed_voxels_are_damaged_is_refused(tmp_path, kind):
+    """They unpack to other labels, which only the checksum at the end tells."""
+    path = tmp_path / f"map.{kind}"
+    if kind == "mha":
+        pytest.importorskip("vtkmodules")
+        meta(path, ball())
+        data = bytearray(path.read_bytes())
+    else:
+        nibabel = pytest.importorskip("nibabel")
+        nibabel.save(nibabel.Nifti1Image(ball(), np.eye(4)), path)
+        data = bytearray(path.read_bytes())
+    label_surface(path)
+    data[-2] ^= 1  # in the size or the checksum at the end
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match="cannot be read as"):
+        label_surface(path)
+
+
+@pytest.mark.parametrize("element", ["MET_LONG", "MET_LONG_LONG"])
+def test_an_image_of_itk_with_numbers_that_vtk_does_not_read_is_refused(
+    tmp_path, element
+):
+    pytest.importorskip("vtkmodules")
+    path = meta(tmp_path / "map.mha", ball().astype("i8"), element, packed=False)
+    with pytest.raises(ValueError, match=f"{element}; save them as .* MET_UCHAR"):
+        label_surface(path)
+
+
+def test_an_image_of_colours_is_told(tmp_path):
+    nibabel = pytest.importorskip("nibabel")
+    voxels = np.zeros((8, 8, 8), dtype=[(name, "u1") for name in "RGB"])
+    nibabel.save(nibabel.Nifti1Image(voxels, np.eye(4)), tmp_path / "map.nii")
+    with pytest.raises(ValueError, match="several numbers .* so it is an image"):
+        label_surface(tmp_path / "map.nii")
+
+
+@pytest.mark.parametrize(("axis", "edge"), [(2, 0.0), (0, np.nan)], ids=["flat", "nan"])
+def test_voxels_without_a_place_are_refused(tmp_path, axis, edge):
+    nrrd = pytest.importorskip("nrrd")
+    directions = np.eye(3)
+    directions[axis, axis] = edge
+    header = {"space": "left-posterior-superior", "space directions": directions}
+    nrrd.write(str(tmp_path / "map.nrrd"), ball(), header)
+    with pytest.raises(ValueError, match="no place in space: .* Mend spacing"):
+        label_surface(tmp_path / "map.nrrd")
+
+
 def test_labels_of_few_voxels_are_refused(tmp_path):
     nrrd = pytest.importorskip("nrrd")
     voxels = ball()

@@ -3,10 +3,12 @@
 import bz2
 import gzip
 import math
+import os
 import re
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +21,13 @@ MOST_VOXELS = 500_000_000  # of a label map: 512 x 512 x 1,900
 _PAD = 3  # voxels around the labels
 _MOST_LABELS = 500
 _DIFFER = 0.3  # least share of differing neighbours in an image; labels: far less
+_MOST_UNEVEN = 1e4  # condition number of the matrix of a voxel; usual ones: below 10
 _HEADER = 16_384  # bytes of a MetaImage that hold its header
+# Types of voxels that VTK reads from a MetaImage. With others, such as MET_LONG_LONG,
+# it returns undefined numbers or writes beyond its memory.
+_TYPES = [
+    f"MET_{kind}" for kind in "UCHAR CHAR USHORT SHORT UINT INT FLOAT DOUBLE".split()
+]
 # Names of units of length in files, and axes of the spaces of NRRD files in LPS.
 _UNITS = {
     "mm": "mm millimeter millimetre millimeters millimetres",
@@ -78,8 +86,7 @@ def label_surface(
     voxels, matrix, origin, names, said, frame = parsed(path, kind, read, extra)
     unit = units or said or "mm"
     factor = UNITS[unit] / UNITS[said or "mm"]
-    if factor != 1.0:
-        matrix, origin = factor * matrix, factor * origin
+    matrix, origin = factor * matrix, factor * origin
     if voxels.ndim != 3:
         raise ValueError(
             f"{path} has the shape {voxels.shape}; give one label map in three "
@@ -91,14 +98,22 @@ def label_surface(
             f"{path} holds {grey}, so it is an image; segment its lumen first (3D "
             "Slicer, TotalSegmentator) and give the label map."
         )
+    place = np.column_stack([matrix, origin])
+    if not (np.isfinite(place).all() and np.linalg.cond(matrix) < _MOST_UNEVEN):
+        raise ValueError(
+            f"{path} gives its voxels no place in space: the edges of one are "
+            f"{_rows(1e3 * matrix.T)} mm, the first is at {_rows(1e3 * origin[None])} "
+            "mm. Mend spacing, directions and origin in its header (3D Slicer: "
+            "Volumes), or export it again."
+        )
     seen = {int(k): int(n) for k, n in zip(values, counts, strict=True) if k != 0}
     chosen = [int(k) for k in labels] or list(seen)
-    if (not labels and len(seen) != 1) or not set(chosen) <= set(seen):
+    missing = [k for k in chosen if k not in seen]
+    if missing or (not labels and len(seen) != 1):
         listed = ", ".join(
             f"{k} {names.get(k, '')}".strip() + f" ({n:,} voxels)"
             for k, n in list(seen.items())[:20]
         )
-        missing = [k for k in chosen if k not in seen]
         lacks = f"no label {missing[0]}; it has " if missing else ""
         raise ValueError(
             f"{path} has {lacks}{len(seen)} labels: {listed or 'all voxels are 0'}; "
@@ -155,27 +170,45 @@ def _require_few(shape: Sequence[int]) -> int:
     return count
 
 
-def _require_end(path: Path, count: int, encoding: str, detached: bool) -> None:
-    """ValueError if a NRRD file holds more compressed voxels than it announces.
+def _require_end(stream: IO[bytes], count: int, encoding: str) -> None:
+    """ValueError if a file holds more compressed voxels than it announces.
 
-    Its reader would unpack the file to its end.
+    The reader of NRRD files would unpack them all. Other readers stop before the
+    checksum at the end, and return what damaged voxels are unpacked to.
     """
     opened = {"gz": gzip.open, "bz": bz2.open}
     if encoding[:2] not in opened:
         return
     left = 8 * count + 2**16  # bytes; no voxel has more than 8
-    with path.open("rb") as stream:
-        while not detached and stream.readline().strip():
-            pass
-        unpacked = opened[encoding[:2]](stream)
-        while left > 0 and (part := unpacked.read(2**20)):
-            left -= len(part)
+    unpacked = opened[encoding[:2]](stream)
+    while left > 0 and (part := unpacked.read(2**20)):
+        left -= len(part)
     if left <= 0:
         raise ValueError(f"it holds more than the {count:,} voxels that it announces")
 
 
+def _require_whole(path: Path, start: int, most: int) -> None:
+    """ValueError if compressed voxels from an offset on are damaged, or over `most`.
+
+    Both are bytes. VTK only prints that voxels are damaged, and returns undefined ones.
+    It also reports a file that is missing.
+    """
+    if path.is_file():
+        unpacker = zlib.decompressobj(zlib.MAX_WBITS | 32)
+        unpacker.decompress(path.read_bytes()[start:], most + 1)
+        if not unpacker.eof:
+            raise ValueError("it is damaged or cut off, or holds too many voxels")
+
+
+def _rows(table: np.ndarray) -> str:
+    """Vectors (n, 3) as text."""
+    return ", ".join("(" + ", ".join(f"{x:g}" for x in row) + ")" for row in table)
+
+
 def _grey(voxels: np.ndarray, values: np.ndarray) -> str:
     """Evidence that voxels are grey values of an image; empty for labels."""
+    if voxels.dtype.kind not in "biuf":
+        return f"voxels of several numbers (type {voxels.dtype})"
     if not np.array_equal(np.rint(values), values):
         return "numbers that are not whole"
     if values[0] < 0:
@@ -207,7 +240,10 @@ def _nifti(path: Path) -> _Voxels:
             "axes are taken as left, front and head, as old files have them. If they "
             "are others, the patient is turned or mirrored: set them and import again"
         )
-    _require_few(image.shape)
+    count = _require_few(image.shape)
+    if path.suffix.lower() == ".gz":
+        with path.open("rb") as stream:
+            _require_end(stream, count, "gz")
     voxels = np.asanyarray(image.dataobj)
     shape = voxels.shape[:3] + tuple(n for n in voxels.shape[3:] if n != 1)
     matrix, origin = affine[:, :3], affine[:, 3]
@@ -229,7 +265,10 @@ def _nrrd(path: Path) -> _Voxels:
                 "its voxels are in another file; save both as one .nrrd file"
             )
     count = _require_few(np.atleast_1d(header["sizes"]).tolist())
-    _require_end(data, count, str(header.get("encoding")), data is not path)
+    with data.open("rb") as stream:
+        while data is path and stream.readline().strip():
+            pass
+        _require_end(stream, count, str(header.get("encoding")))
     voxels, header = nrrd.read(str(path))
     space, frame = header.get("space"), ""
     if space is None:
@@ -266,15 +305,31 @@ def _meta(path: Path) -> _Voxels:
     from vtkmodules import vtkCommonCore, vtkIOImage
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    lines = path.read_bytes()[:_HEADER].decode("latin-1").splitlines()
-    entries = {}
-    for line in lines:
-        key, _, value = line.partition("=")
-        entries[key.strip()] = value.split()
-        if key.strip() == "ElementDataFile":
-            break
-    if entries.get("NDims") != ["3"]:
-        raise ValueError("its header does not say NDims = 3")
+    entries: dict[str, list[str]] = {}
+    with path.open("rb") as stream:
+        while "ElementDataFile" not in entries and stream.tell() < _HEADER:
+            key, _, value = os.fsdecode(stream.readline(_HEADER)).partition("=")
+            entries[key.strip()] = value.split()
+        start = stream.tell()
+    sizes = [int(size) for size in entries.get("DimSize", [])]
+    if entries.get("NDims") != ["3"] or len(sizes) != 3:
+        raise ValueError("its header does not say NDims = 3 and three sizes (DimSize)")
+    count = _require_few(sizes)
+    kind = " ".join(entries.get("ElementType", []))
+    channels = " ".join(entries.get("ElementNumberOfChannels", ["1"]))
+    if kind not in _TYPES or channels != "1":
+        raise ValueError(
+            f"its voxels are {channels} x {kind or 'of no type'}; save them as one "
+            f"channel of {', '.join(_TYPES)}"
+        )
+    if entries.get("CompressedData", ["False"])[0][:1] in "Tt1":
+        named = " ".join(entries["ElementDataFile"])
+        if named.upper() != "LOCAL":
+            _require_whole(path.parent / named, 0, 8 * count)
+        elif "CompressedDataSize" in entries:
+            _require_whole(path, start, 8 * count)
+        else:
+            raise ValueError("its header does not say CompressedDataSize")
 
     def numbers(names: str, default: np.ndarray) -> np.ndarray:
         given = [entries[name] for name in names.split() if name in entries]
@@ -284,7 +339,6 @@ def _meta(path: Path) -> _Voxels:
     turn = numbers("TransformMatrix Rotation Orientation", np.eye(3).ravel())
     spacing = numbers("ElementSpacing ElementSize", np.ones(3))
     origin = numbers("Offset Position Origin", np.zeros(3))
-    _require_few([int(size) for size in entries.get("DimSize", [])])
     reader = vtkIOImage.vtkMetaImageReader()
     reader.SetFileName(str(path))
     # VTK leaves missing voxels undefined. It reports them by an event only, and only
