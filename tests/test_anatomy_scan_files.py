@@ -145,7 +145,7 @@ def test_label_maps_of_itk_lie_where_they_were_saved(tmp_path, kind):
     middle = 1e-3 * (ORIGIN + (np.array((16, 11, 10)) * SPACING) @ TURN)
     np.testing.assert_allclose(vertices.mean(axis=0), middle, atol=0.1e-3)
     assert np.linalg.norm(vertices - middle, axis=1).max() < 7e-3
-    assert len(faces) > 100 and "label 1" in why
+    assert len(faces) > 100 and "label 1" in why and "voxels of 0.8 x 0.9 x 1 mm" in why
 
 
 @pytest.mark.parametrize("packed", [False, True])
