@@ -50,12 +50,14 @@ class _Shell(NamedTuple):
         outer: (V, 3) m, where the wall ends.
         faces: (F, 3) triangles of both, without the inlet's cap.
         cap: pieces that close the inlet except for its hole.
+        depth: (n,) m of points (n, 3) in the lumen, extended behind the inlet.
     """
 
     inner: np.ndarray
     outer: np.ndarray
     faces: np.ndarray
     cap: list[np.ndarray]
+    depth: Callable[[np.ndarray], np.ndarray]
 
 
 def wall_pieces(anatomy: Anatomy, wall: str = "merged") -> tuple[np.ndarray, ...]:
@@ -74,7 +76,7 @@ def wall_pieces(anatomy: Anatomy, wall: str = "merged") -> tuple[np.ndarray, ...
     """
     check_wall(wall)
     shell = _shell(bounds.instance("anatomy", anatomy, Anatomy))
-    return (*WALLS[wall](anatomy, shell), *shell.cap)
+    return (*WALLS[wall](shell), *shell.cap)
 
 
 def check_wall(wall: str) -> None:
@@ -117,7 +119,7 @@ def _shell(anatomy: Anatomy) -> _Shell:
         moved = np.minimum(moved + push, room)
     outward = np.maximum(reach, moved + THINNEST)
     inner, outer = (points + far[:, None] * normals for far in (moved, outward))
-    return _Shell(inner, outer, shell, _inlet_cap(points[cap[:, :2]], inlet))
+    return _Shell(inner, outer, shell, _inlet_cap(points[cap[:, :2]], inlet), depth)
 
 
 def _depth(anatomy: Anatomy) -> Callable[[np.ndarray], np.ndarray]:
@@ -143,27 +145,25 @@ def _before(
     return points + np.where(near, _AHEAD - height, 0.0)[..., None] * inward
 
 
-def _prisms(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
+def _prisms(shell: _Shell) -> Sequence[np.ndarray]:
     """One prism for each triangle."""
-    del anatomy
     ends = shell.inner[shell.faces], shell.outer[shell.faces]
     return list(np.concatenate(ends, axis=1))
 
 
-def _merged(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
+def _merged(shell: _Shell) -> Sequence[np.ndarray]:
     """Prisms, merged while they stay out of the lumen."""
-    prisms, pairs = _prisms(anatomy, shell), adjacent(shell.faces).tolist()
-    return merged(prisms, pairs, _depth(anatomy), TOLERANCE)
+    pairs = adjacent(shell.faces).tolist()
+    return merged(_prisms(shell), pairs, shell.depth, TOLERANCE)
 
 
-def _coacd(anatomy: Anatomy, shell: _Shell) -> Sequence[np.ndarray]:
+def _coacd(shell: _Shell) -> Sequence[np.ndarray]:
     """Pieces by convex decomposition (CoACD) of patches of the wall."""
     import coacd
     from tqdm import tqdm
 
-    del anatomy
     coacd.set_log_level("error")
-    inner, outer, faces, _ = shell
+    inner, outer, faces = shell.inner, shell.outer, shell.faces
     sides = np.diff(inner[faces], axis=1)
     flat = np.cross(sides[:, 0], sides[:, 1])
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)

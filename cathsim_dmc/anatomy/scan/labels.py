@@ -218,7 +218,8 @@ def _grey(voxels: np.ndarray, values: np.ndarray) -> str:
     # Labels are the same in whole regions; grey values differ from voxel to voxel.
     differ = both = 0
     for axis in range(3):
-        one, other = (np.delete(voxels, end, axis) for end in (0, -1))
+        along = np.moveaxis(voxels, axis, 0)
+        one, other = along[1:], along[:-1]
         inside = (one != 0) & (other != 0)
         both += int(inside.sum())
         differ += int((inside & (one != other)).sum())

@@ -254,11 +254,6 @@ def opened_at_inlet(
             raise ValueError(
                 f"a branch is cut off at {where} with the end of the lumen, for the "
                 f"inlet at {shown(inlet.position)}. Choose an inlet farther from it "
-                f"(inlet; --inlet X Y Z), such as {_listed(tips)}."
+                f"(inlet; --inlet X Y Z), such as {', '.join(map(shown, tips[:8]))}."
             )
     return opened, inlet, cut
-
-
-def _listed(places: list[np.ndarray]) -> str:
-    """Text of the first eight places (3,) m, for a message."""
-    return ", ".join(map(shown, places[:8]))
