@@ -88,6 +88,15 @@ def test_a_label_map_without_orientation_asks(tmp_path):
     assert notes[1].startswith("question: its header names no space")
 
 
+def test_a_label_map_of_one_point_in_time_has_three_dimensions(tmp_path):
+    nibabel = pytest.importorskip("nibabel")
+    found = []
+    for name, voxels in (("three.nii", ball()), ("four.nii", ball()[..., None])):
+        nibabel.save(nibabel.Nifti1Image(voxels, np.eye(4)), tmp_path / name)
+        found.append(label_surface(tmp_path / name).vertices)
+    np.testing.assert_array_equal(*found)
+
+
 def test_the_space_of_an_nrrd_file_may_be_mirrored(tmp_path):
     """LAS is what LPS is with the second axis to the front."""
     lps = label_surface(nrrd_map(tmp_path / "lps.nrrd", 1.0))
@@ -224,10 +233,12 @@ def test_whole_files_that_look_cut_off_are_read(y_mesh, tmp_path):
 def test_white_space_of_an_obj_may_be_any(y_mesh, tmp_path):
     vertices, faces = y_mesh
     path = write_obj(tmp_path / "lumen.obj", vertices, faces)
-    text = path.read_text()
-    for changed in (text.replace(" ", "\t"), text.replace("\n", "\n  ")):
-        path.write_text(changed.rstrip(" "))
-        assert len(read_triangles(path)[1]) == len(faces)
+    text, plain = path.read_text(), read_triangles(path)
+    changed = [text.replace(" ", "\t"), text.replace("\n", "\n  "), f"\ufeff{text}"]
+    for other in changed:
+        path.write_text(other.rstrip(" "), encoding="utf-8")
+        for one, same in zip(read_triangles(path), plain, strict=True):
+            np.testing.assert_array_equal(one, same)
 
 
 def test_corners_of_an_obj_are_counted_back_from_where_they_stand(y_mesh, tmp_path):

@@ -1,5 +1,6 @@
 """Reader of a lumen's triangles from a mesh file."""
 
+import codecs
 import io
 import re
 from collections.abc import Callable
@@ -239,9 +240,11 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _plain_obj(data: bytes) -> bytes:
     """An OBJ file with single blanks and absolute indices of its points.
 
-    The reader knows no other white space. It counts relative indices from the end of
-    the file, not from the last point so far, and takes an index 0 as 1.
+    The reader knows no other white space, and loses a point behind a byte order mark.
+    It counts relative indices from the end of the file, not from the last point so far,
+    and takes an index 0 as 1.
     """
+    data = data.removeprefix(codecs.BOM_UTF8)
     if b"\t" in data or b"\n " in data:
         data = re.sub(rb"(?m)^ +", b"", data.replace(b"\t", b" "))
     if not re.search(rb"(?m)^f (?:.* )?(?:-|0+(?!\d))", data):
