@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cathsim_dmc.anatomy.arch.arch import ArchSeed
-from cathsim_dmc.anatomy.arch.tree import arch_tree
-from cathsim_dmc.anatomy.scan.aorta import Bend, heart_odds, mirrored
+from cathsim_dmc.anatomy.scan.aorta import Bend
 from cathsim_dmc.anatomy.scan.arches import Arch
-from cathsim_dmc.anatomy.scan.naming import hypotheses, name_branches
+from cathsim_dmc.anatomy.scan.naming import hypotheses, name_branches, neutral_names
 from cathsim_dmc.anatomy.scan.offshoots import Offshoot, leads, offshoots
 
 FIRST, SPACE = 95e-3, 20e-3  # m of aorta up to the first ostium and between ostia
@@ -297,21 +295,6 @@ def test_an_arch_as_narrow_as_a_childs_is_asked_for(bend):
         assert ("is it an aortic arch? It is 10.0 mm wide" in asked) is asks
 
 
-def test_a_right_sided_arch_is_taken_where_heart_and_axes_are_given():
-    flip = np.diag([-1.0, 1.0, 1.0])
-    for tree in arches():
-        line_ = tree.root.centreline.points[::-1] @ flip
-        arch = Arch(None, (), None, [], Bend.of(line_), np.empty(0), [], 1.0)
-        assert arch.on_its_side(certain=True).right
-        with pytest.raises(ValueError, match="right-sided arch, give its heart and"):
-            arch.on_its_side(certain=False)
-        # With the heart at the other end, or front for back, it is none.
-        for wrong in (line_[::-1], line_ @ np.diag([1.0, -1.0, 1.0])):
-            arch = Arch(None, (), None, [], Bend.of(wrong), np.empty(0), [], 1.0)
-            with pytest.raises(ValueError, match="mirrored"):
-                arch.on_its_side(certain=True)
-
-
 def test_a_thin_last_branch_is_the_subclavian_more_than_a_vertebral_artery(bend):
     thin = (2.0, (2.0, [(40, 0, 95)]))
     assert named(bend, BCA, LCCA, thin)[0] == ["bca", "lcca", "lsa"]
@@ -329,72 +312,51 @@ def test_a_wide_fourth_branch_is_hardly_one_without_a_name(bend, first):
         assert names == ["rcca", "lcca", "lsa", "rsa"]
 
 
+def aberrant(y):
+    """An arch whose fourth branch leads y mm to the back."""
+    ends = [(20 * k - 20, y * (k == 3), 90) for k in range(4)]
+    return [(r, (r, [x])) for r, x in zip((4.2, 3.8, 3.4, 4.2), ends, strict=True)]
+
+
 def test_an_aberrant_subclavian_artery_leads_to_the_right_and_back(bend):
     """A fourth branch in the plane of the arch, or to the left, is asked for."""
-    radii = (4.2, 3.8, 3.4, 4.2)
+    assert named(bend, *aberrant(40))[0] == ["rcca", "lcca", "lsa", "rsa"]
+    names, notes = named(bend, *aberrant(-10))
+    assert names == [f"branch_{k}" for k in (1, 2, 3, 4)] and "question" in notes
 
-    def led(y):
-        ends = [(20 * k - 20, y * (k == 3), 90) for k in range(4)]
-        return named(bend, *((r, (r, [x])) for r, x in zip(radii, ends, strict=True)))
 
-    assert led(40)[0] == ["rcca", "lcca", "lsa", "rsa"]
-    assert "rsa" not in led(-10)[0] and "question" in led(-10)[1]
+@pytest.mark.parametrize(
+    "branches",
+    [(BCA, LCCA, LSA), (BOVINE, LSA), (NECK, LCCA, LSA), aberrant(40), aberrant(-10)],
+    ids=["usual", "bovine", "neck", "aberrant", "to the front"],
+)
+def test_an_arch_has_the_same_names_from_its_other_end(bend, branches):
+    ways, found, curves = built(*branches)
+    turned, end = Bend.of(bend.line[::-1]), 1e-3 * (len(bend.line) - 1)
+    back = [replace(one, s=end - one.s) for one in found[::-1]]
+    there = hypotheses(bend, found, 1.0, {False: 0.0})
+    again = hypotheses(turned, back, 1.0, {True: 0.0})
+    for key, odds in there.items():
+        assert again[key._replace(heart_last=True)] == pytest.approx(odds, abs=0.02)
+    there = name_branches(ways, bend, 1.0, found, curves, False)
+    again = name_branches(ways, turned, 1.0, back, curves, True)
+    # Neutral names are numbered from the start of the line.
+    neutral = there.names[0].startswith("branch")
+    assert again.names == there.names[:: -1 if neutral else 1]
+    assert again.right == there.right
+
+
+def test_neutral_names_are_in_the_order_of_the_forks():
+    ends = (
+        ((0, 0, 90), (20, 0, 90)),
+        ((0, 0, 90), (-20, 0, 90)),
+        ((0, 0, 50), (9, 0, 90)),
+    )
+    curves = [line((0, 0, 0), *corners) for corners in ends]
+    assert neutral_names(curves) == ["branch_2", "branch_3", "branch_1"]
 
 
 def test_branches_that_are_alike_do_not_tell_the_heart(bend):
     _, found, _ = built(*((4.4, (4.2, [(20 * k - 20, 0, 95)])) for k in range(3)))
     share = hypotheses(bend, found, 1.0, {False: 0.0, True: 0.0})
     assert 0.05 < sum(p for key, p in share.items() if key.heart_last) < 0.95
-
-
-def arches():
-    for seed, kind in enumerate(("I", "II", "III"), start=9_300_000):
-        yield arch_tree(ArchSeed(seed, kind).parameters())
-
-
-def evidence(tree, matrix=None):
-    """Log odds that the heart is at the last point, seen from either end."""
-    line_ = tree.root.centreline
-    points = line_.points if matrix is None else line_.points @ matrix.T
-    out = []
-    for turn in (1, -1):
-        bend = Bend.of(points[::turn])
-        s = np.linspace(0.0, line_.length, len(bend.line))[::turn]
-        places = [
-            1e-3 * abs(s - tree.origin(k)).argmin()
-            for k in tree.vessels
-            if k != "aorta"
-        ]
-        out.append(heart_odds(bend, line_.at(s).radius, places))
-    return out
-
-
-def test_the_heart_is_found_from_either_end_and_in_a_turned_scan():
-    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    turn *= np.sign(np.linalg.det(turn))
-    for tree in arches():
-        for matrix in (None, turn):
-            from_heart, to_heart = evidence(tree, matrix)
-            assert from_heart < -1.0 and to_heart > 1.0
-
-
-def test_an_arch_that_is_cut_short_stands_upright_by_its_branches():
-    """What is left of the descending limb leads to the back more than down."""
-    for tree in arches():
-        branches = [v.centreline for v in tree.vessels.values() if v.parent]
-        far = max(tree.origin(k) for k, v in tree.vessels.items() if v.parent)
-        cut = tree.root.centreline.slice(0.0, far + 25e-3).points
-        bend = Bend.of(cut, [b.slice(20e-3, b.length).points for b in branches])
-        assert bend.upright and mirrored(bend.azimuth(heart_last=False)) is None
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-def test_a_mirrored_arch_leads_to_the_wrong_side(axis):
-    flip = np.ones(3)
-    flip[axis] = -1.0
-    for tree in arches():
-        points = tree.root.centreline.points
-        assert mirrored(Bend.of(points).azimuth(heart_last=False)) is None
-        assert mirrored(Bend.of(points[::-1]).azimuth(heart_last=True)) is None
-        wrong = mirrored(Bend.of(points * flip).azimuth(heart_last=False))
-        assert wrong is not None and "mirrored" in wrong

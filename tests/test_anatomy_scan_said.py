@@ -105,6 +105,11 @@ def test_the_space_of_an_nrrd_file_may_be_mirrored(tmp_path):
     np.testing.assert_allclose(las.vertices * (1, -1, 1), lps.vertices, atol=1e-9)
     for one in (lps, las):
         assert trimesh.Trimesh(one.vertices, one.faces).volume > 0.0
+    bare = label_surface(
+        nrrd_map(tmp_path / "bare.nrrd", 1.0, **{"space origin": None})
+    )
+    moved = bare.vertices + 1e-3 * np.array((5.0, -3.0, 20.0))
+    np.testing.assert_allclose(moved, lps.vertices, atol=1e-9)
     other = nrrd_map(tmp_path / "other.nrrd", 1.0, space="scanner-xyz")
     with pytest.raises(ValueError, match="its space is 'scanner-xyz'.*LPS, RAS, LAS"):
         label_surface(other)
