@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy.scan.aorta import Bend
 from cathsim_dmc.anatomy.scan.arches import Arch
 from cathsim_dmc.anatomy.scan.naming import hypotheses, name_branches, neutral_names
-from cathsim_dmc.anatomy.scan.offshoots import Offshoot, leads, offshoots
+from cathsim_dmc.anatomy.scan.offshoots import Offshoot, leads, offshoots, third_limb
 
 FIRST, SPACE = 95e-3, 20e-3  # m of aorta up to the first ostium and between ostia
 
@@ -199,6 +199,29 @@ def test_branches_that_leave_in_one_lumen_are_one(bend):
     assert [one.curves for one in found] == [(0, 1)]
 
 
+def test_the_fork_of_a_branch_is_its_first(bend):
+    """It is a branch of the arch though one of its arms leads down."""
+    root = bend.line[: bend.apex]
+    ends = [(0, 0, 80), (10, 0, 120)], [(0, 0, 80), (-10, 0, 120)], [(0, 70, 20)]
+    rows = [line(1e3 * root[-1], (0, 0, 60), *corners) for corners in ends]
+    curves = [np.concatenate([root[:-1], row]) for row in rows]
+    ways = Tubes(curves, [6e-3, 4e-3, 4e-3])
+    (one,) = offshoots(ways, bend, np.full(len(bend.line), 13e-3), curves)
+    assert one.curves == (0, 1, 2) and 5e-3 < one.fork < 15e-3
+    # Where the scan shows one vessel of a bovine trunk, it is named after the wide one.
+    (alone,) = built((6.4, (5.8, [(-40, 0, 95)])))[1]
+    assert leads(ways, bend, alone, ("bovine", 0.99), 1.0, False) == {0: ("bca", 0.99)}
+
+
+@pytest.mark.parametrize(("past", "limb"), [(0, True), (80, False)])
+def test_a_wide_branch_is_a_third_limb_where_it_leaves_the_bend(bend, past, limb):
+    root = bend.line[: bend.apex + past]
+    curve = np.concatenate([root, line(1e3 * root[-1], 1e3 * root[-1] + (0, 70, 0))])
+    width = np.full(len(bend.line), 13e-3)
+    found = third_limb(Tubes([curve], [12.5e-3]), bend, width, [curve])
+    assert (found is not None) is limb
+
+
 def test_a_vertebral_artery_of_its_own_and_an_aberrant_subclavian(bend):
     assert named(bend, BCA, LCCA, THIN, LSA)[0] == ["bca", "lcca", "lva", "lsa"]
     aside = (1.9, (1.8, [(20, 30, 95)]))  # as no other artery between LCCA and LSA
@@ -360,3 +383,18 @@ def test_branches_that_are_alike_do_not_tell_the_heart(bend):
     _, found, _ = built(*((4.4, (4.2, [(20 * k - 20, 0, 95)])) for k in range(3)))
     share = hypotheses(bend, found, 1.0, {False: 0.0, True: 0.0})
     assert 0.05 < sum(p for key, p in share.items() if key.heart_last) < 0.95
+
+
+@pytest.mark.parametrize(
+    ("end", "fork", "aside"),
+    [
+        ((70, 0, 0), None, True),
+        ((50, 0, 0), None, None),  # too short for an arm
+        ((0, 0, 100), None, False),
+        ((0, 0, 100), 60e-3, None),  # too short past its fork
+    ],
+)
+def test_a_branch_leads_aside_where_it_is_long_enough_to_tell(end, fork, aside):
+    rows = (line((0, 0, 0), end),)
+    one = Offshoot(np.zeros(3), 0.1, 4e-3, (0,), fork, rows)
+    assert one.aside(np.array([0.0, 0.0, 1.0])) is aside
