@@ -422,6 +422,17 @@ def test_the_proof_finds_each_fault(computed):
     goal = replace(goal, arc_length=good.goals["lcca"].arc_length)
     goals = found("goals in their vessels", {"lcca": goal})
     assert "lies in lsa, not in lcca" in goals
+    # A goal beside its place in its vessel; one outside of the lumen.
+    aside = replace(good.goals["lcca"], position=goal.position)
+    away = replace(good.goals["lsa"], position=np.array([0.0, 0.5, 0.0]))
+    goals = found("goals in their vessels", {"lcca": aside, "lsa": away})
+    assert "from its place in lcca" in goals and "lsa lies outside the lumen" in goals
+    # An inlet beside the lumen that leads out of it.
+    inlet = good.inlet
+    place, way = inlet.position + (0.0, 0.05, 0.0), -inlet.direction
+    inlet = replace(inlet, position=place, direction=way)
+    said = failed(replace(good, inlet=inlet))["inlet"]
+    assert "from the centreline of aorta" in said and "does not lead into" in said
     # A vessel that is too thin for the unit.
     thin = replace(lcca, centreline=Centreline(line.points, 0.05 * line.radii))
     assert "another one (--units)" in found("sizes of vessels", lcca=thin)
