@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End, Inlet, Surface
-from cathsim_dmc.anatomy.scan import units
+from cathsim_dmc.anatomy.scan import check, units
 from cathsim_dmc.anatomy.scan.curves import read_curve, vessel_name
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.places import cut_open, describe, opened_at_inlet
@@ -181,6 +182,24 @@ def test_less_is_cut_off_where_the_inlet_would_meet_a_branch():
     assert 1e-3 < inlet.position[2] < 5e-3
     assert SurfaceDepth(surface)(branch.centreline.points[-2:-1]) > 1e-3
     assert list(opened.vessels) == ["aorta", "lsa"]
+
+
+@pytest.mark.parametrize(
+    ("order", "right"),
+    [
+        ("lcca rcca lsa", True),
+        ("lsa rcca lcca", True),
+        ("rcca lcca lsa", False),
+        ("lsa lcca rcca", False),
+        ("lcca lsa", False),
+    ],
+)
+def test_the_left_carotid_leaves_a_right_sided_arch_first(order, right):
+    vessels = {"aorta": Vessel("aorta", tube_line((0, 0, -40), (0, 0, 40), 8.0))}
+    for z, name in zip((-20, 0, 20), order.split(), strict=False):
+        line = tube_line((0, 0, z), (40, 0, z), 3.0)
+        vessels[name] = Vessel(name, line, "aorta", 8e-3)
+    assert check._right_sided(SimpleNamespace(tree=VesselTree(vessels))) is right
 
 
 def test_right_branches_share_the_brachiocephalic():

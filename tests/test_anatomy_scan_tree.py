@@ -448,10 +448,12 @@ def test_the_proof_finds_each_fault(computed):
     assert re.search("rsa .* leads 9[0-9] degrees off the p", failed(exchanged)[sides])
     slanted = np.array([(0.77, 0.64, 0.0), (-0.64, 0.77, 0.0), (0.0, 0.0, 1.0)])
     assert sides not in failed(replace(good, tree=moved(good.tree, slanted)))
-    # A branch that does not start on its parent.
+    # A branch that does not start on its parent; one that does in the grandparent.
     vessels.pop("lcca")
     adrift = Vessel("lcca", line.slice(0.04, 0.09), "lsa", 1e-3)
-    assert "outside of it" in found("branches on their parents", lcca=adrift)
+    early = Vessel("early", lsa.centreline.slice(0.0, 0.05), "lsa", 1e-3)
+    wrong = found("branches on their parents", lcca=adrift, early=early)
+    assert "outside of it" in wrong and "before that has an ostium" in wrong
     # Branches named from the wrong end of the aorta; neighbours that changed places.
     for other, words in (("lsa", "to the right"), ("lcca", "in this order")):
         vessels = renamed(good.tree.vessels, "bca", other)
