@@ -55,6 +55,18 @@ def test_a_hole_in_the_side_is_no_end(wide):
         mended(vertices, faces[~gone])
 
 
+def test_a_surface_with_many_shared_edges_is_refused():
+    """As of two bodies that are glued together; a few are cut out."""
+    tube = trimesh.creation.capsule(height=80.0, radius=6.0, count=[32, 32])
+    some = tube.faces[::40]
+    tops = tube.vertices[some].mean(axis=1) + 0.4
+    fins = np.column_stack([some[:, :2], len(tube.vertices) + np.arange(len(some))])
+    vertices = np.concatenate([tube.vertices, tops])
+    mended(vertices, np.concatenate([tube.faces, fins[:1]]))
+    with pytest.raises(ValueError, match=f"{len(fins)} edges shared .* too many to"):
+        mended(vertices, np.concatenate([tube.faces, fins]))
+
+
 def wall(*, ends=2, patch=False):
     """A bent tube of 5 mm inner radius with a wall, open at one end or both (mm)."""
     thick, length = 0.8, 40.0 * np.pi
