@@ -55,6 +55,15 @@ def test_a_hole_in_the_side_is_no_end(wide):
         mended(vertices, faces[~gone])
 
 
+@pytest.mark.parametrize("radii", [(6.0, 8.0), (8.0, 6.0)], ids="{0[0]:g}".format)
+def test_of_the_two_surfaces_of_a_wall_the_inner_one_is_taken(radii):
+    both = [trimesh.creation.capsule(height=80.0, radius=r) for r in radii]
+    whole = trimesh.util.concatenate(both)
+    volume, notes = mended(whole.vertices, whole.faces)
+    assert volume == pytest.approx(min(one.volume for one in both), rel=0.01)
+    assert "the inner of two surfaces taken" in notes
+
+
 def test_a_surface_with_many_shared_edges_is_refused():
     """As of two bodies that are glued together; a few are cut out."""
     tube = trimesh.creation.capsule(height=80.0, radius=6.0, count=[32, 32])
