@@ -279,7 +279,8 @@ def actions(value: Any, shape: tuple[int, ...]) -> np.ndarray:
 def instance(name: str, value: Any, kind: type) -> Any:
     """Returns an object of the class `kind`."""
     if not isinstance(value, kind):
-        refuse(name, value, f"a {kind.__name__}")
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        refuse(name, value, f"{article} {kind.__name__}")
     return value
 
 
