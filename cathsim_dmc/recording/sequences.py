@@ -181,6 +181,10 @@ def ends(shadow: Shadow) -> np.ndarray:
     return found
 
 
+def _within(random: Any, ends: Sequence[float] | np.ndarray) -> float:
+    return random.uniform(ends[0], ends[1])
+
+
 class Camera:
     """C-arm, contrast and dose of one sequence, randomly drawn."""
 
@@ -190,19 +194,19 @@ class Camera:
         The isocentre lies on the segment from the middle of the lumen's bounding box to
         `aim` (3,), m.
         """
-        self.angles = random.uniform(*PRIMARY), random.uniform(*SECONDARY)
+        self.angles = _within(random, PRIMARY), _within(random, SECONDARY)
         middle = np.mean(anatomy.lumen.box, axis=0)
         isocentre = middle + random.uniform() * (aim - middle)
         primary, secondary = np.radians(self.angles)
         self.arm = CArm(
-            primary, secondary, magnification=random.uniform(*ZOOM),
+            primary, secondary, magnification=_within(random, ZOOM),
             detector_size=DETECTOR_SIZE, resolution=(size, size),
             isocentre=tuple(isocentre),
         )  # fmt: skip
-        iodine = random.uniform(*IODINE)
+        iodine = _within(random, IODINE)
         self.iodine = iodine if random.uniform() < 0.5 else 0.0
-        self.kerma = float(np.exp(random.uniform(*np.log(KERMA))))
-        self.gain = random.uniform(*GAIN)
+        self.kerma = float(np.exp(_within(random, np.log(KERMA))))
+        self.gain = _within(random, GAIN)
 
     def seen(self, places: np.ndarray) -> np.ndarray:
         """Returns column, row and state (T, K, 3) of places (T, K, 3), m or NaN."""
