@@ -96,6 +96,16 @@ def test_planes_that_miss_inlet_or_goal_are_refused(height, unseen):
         suite.load("cathsim", TASK, {"observation": "biplane", "fluoroscopy": options})
 
 
+def test_planes_that_miss_the_inlet_of_any_anatomy_are_refused():
+    """They show inlet and goal of the first arch, not of the second."""
+    planes = {"view": (60, 0), "biplane": (-30, 0), "detector_size": 0.3}
+    options = {"observation": "biplane", "fluoroscopy": planes, "arches": "test"}
+    options |= {"first": 1}
+    suite.load("cathsim", "femoral_arch_lcca", {**options, "pool": 1})
+    with pytest.raises(ValueError, match="in both planes of 'arch-I-2000002'"):
+        suite.load("cathsim", "femoral_arch_lcca", {**options, "pool": 2})
+
+
 def test_a_frame_is_carried_without_turning_about_the_line():
     angle = np.linspace(2.0, 0.0, 200)
     line = np.stack([np.sin(angle), 0 * angle, 1 - np.cos(angle)], axis=1)

@@ -31,14 +31,24 @@ class ImageSensors:
     state = ("images",)  # see `snapshot`
 
     def __init__(
-        self, names: Sequence[str], case: Case, num_simulations: int, chain: CommonChain
+        self,
+        names: Sequence[str],
+        cases: Sequence[Case],
+        num_simulations: int,
+        chain: CommonChain,
     ):
-        """Prepares the sensors for observations of these names, before any episode."""
+        """Prepares the sensors for observations of these names, before any episode.
+
+        Raises:
+            ValueError: if `biplane` is observed by a single plane, or by planes that do
+                not show inlet and goal of each case.
+        """
         self._names, self._chain, self._count = names, chain, num_simulations
         self.planes: list[angiographs.Planes] = []
         self.thirds: list[angiographs.Planes] = []
         self.sight, self._noise = BiplaneSight(num_simulations), False
         if observations.needs(names, FLUOROSCOPY, BIPLANE):
+            case = cases[0]
             options = case.angiograph.options
             self.planes = [case.angiograph.planes()] * num_simulations
             self.thirds = [case.angiograph.third()] * num_simulations
@@ -50,7 +60,8 @@ class ImageSensors:
                         "the observation 'biplane' needs two planes: give fluoroscopy "
                         "a biplane, such as {'view': [60, 0], 'biplane': [-30, 0]}"
                     )
-                _check_in_view(case)
+                for each in cases:
+                    _check_in_view(each)
         self.images: dict[str, np.ndarray] = {}
 
     def capture(
@@ -130,21 +141,22 @@ class ImageSensors:
 
 
 def _check_in_view(case: Case) -> None:
-    """Refuse planes that do not show where the device enters, or the goal."""
-    scene, planes = case.scene, case.angiograph.planes()
+    """Refuses planes that do not show where the device enters, or the goal."""
+    scene, anatomy = case.scene, case.scene.anatomy
+    arms = case.fluoroscopy.carms(anatomy.surface.vertices)
     for what, place in {
-        "inlet": scene.anatomy.inlet.position,
+        "inlet": anatomy.inlet.position,
         f"goal {scene.goal.name!r}": scene.goal.position,
     }.items():
-        if not all(plane.carm.shows(place) for plane in planes):
+        if not all(arm.shows(place) for arm in arms):
             at, centre = (
                 f"({', '.join(f'{1e3 * x:.0f}' for x in point)}) mm"
-                for point in (place, planes[0].carm.isocentre)
+                for point in (place, arms[0].isocentre)
             )
             raise ValueError(
-                f"the observation 'biplane' needs the {what} at {at} in both planes, "
-                f"which turn about {centre} and do not show it: give fluoroscopy a "
-                "centre between inlet and goal, less magnification or a larger "
-                "detector_size, or import the scan with an inlet nearer to the goal "
-                "(--inlet)"
+                f"the observation 'biplane' needs the {what} at {at} in both planes of "
+                f"{anatomy.name!r}, which turn about {centre} and do not show it: give "
+                "fluoroscopy a centre between inlet and goal, less magnification or a "
+                "larger detector_size, or import the scan with an inlet nearer to the "
+                "goal (--inlet)"
             )

@@ -110,7 +110,7 @@ class Rollout(Restorable):
             self._enter(index)
         self.progress = Progress(self._names, cases, count, config.give_up)
         self._chain = CommonChain(scene.catheter, config.shaft_link)
-        self._sensors = ImageSensors(self._names, cases[0], count, self._chain)
+        self._sensors = ImageSensors(self._names, self._cases, count, self._chain)
         self._views = Views(self._names, config, model, scene, self.index.geoms)
         self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
