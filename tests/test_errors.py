@@ -228,7 +228,7 @@ def test_what_lies_outside_the_range_is_taken_with_a_warning():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda e, p: animate(3, None, p), "episode is 3; it must be a Episode"),
+        (lambda e, p: animate(3, None, p), "episode is 3; it must be an Episode"),
         (lambda e, p: animate(e, None, p, frames=0), "frames is 0.*from 1"),
         (lambda e, p: animate(e, None, p, width=True), "width is True"),
         (lambda e, p: animate(e, None, p, quality=1e9), "quality is 1000000000.0"),
