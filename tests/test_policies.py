@@ -201,3 +201,14 @@ def test_random_actions_of_a_simulation_do_not_depend_on_the_others():
     # A further episode goes on, it does not repeat.
     alone.reset(view, np.ones(1, bool))
     assert not np.array_equal(alone.act(None)[0], first[2])
+
+
+@pytest.mark.parametrize("name", ["push", "curl", "idle", "random_curl"])
+def test_noise_on_an_action_does_not_stay_in_the_policy(name):
+    env = suite.environment(suite.make_task(TASK))
+    policy = make_policy(name)
+    policy.reset(View(env), np.ones(1, dtype=bool))
+    action = policy.act(None)
+    told = action.copy()
+    action += 0.5
+    np.testing.assert_array_equal(policy.act(None), told)

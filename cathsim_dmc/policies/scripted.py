@@ -28,7 +28,7 @@ class _Scripted(Policy):
         return type(self)(self._seed + first)
 
     def act(self, observation: Any) -> np.ndarray:
-        return self._action
+        return self._action.copy()  # noise on it must not stay
 
 
 class Random(_Scripted):
