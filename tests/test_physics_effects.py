@@ -383,8 +383,11 @@ def test_drives_get_no_more_than_the_largest_action():
         np.testing.assert_array_equal(other.readings.head, one.readings.head)
 
 
-@pytest.mark.parametrize("given", [None, np.zeros((1, 3)), 0.0])
-def test_an_action_of_another_shape_is_refused(given):
+@pytest.mark.parametrize(
+    "given",
+    [None, np.zeros((1, 3)), 0.0, np.full((1, 21), np.nan), np.zeros((1, 21), complex)],
+)
+def test_an_action_of_another_kind_is_refused(given):
     class Wrong(Effect):
         def act(self, action, state):
             return given

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.laws import parameters as declared
@@ -163,15 +164,16 @@ class Effect:
 
 
 def check_action(effect: Effect, action: Any, shape: tuple[int, ...]) -> None:
-    """Raises ValueError unless `act` of an effect has returned an array of `shape`."""
+    """Raises ValueError unless `act` of an effect returns numbers (shape), finite."""
     name = f"act of {type(effect).__name__} returns"
     if action is None:
         raise ValueError(f"{name} None; return the action that takes effect")
-    if np.shape(action) != shape:
+    try:
+        bounds.array("it", action, shape=shape)
+    except ValueError as error:
         raise ValueError(
-            f"{name} an array of shape {np.shape(action)}; return the action that "
-            f"takes effect, of shape {shape}"
-        )
+            f"{name} another value than the action that takes effect: {error}"
+        ) from None
 
 
 def _kind(effect: Effect) -> Any:
