@@ -290,6 +290,15 @@ def test_a_device_touches_a_living_wall_at_as_many_places_as_a_rigid_one(rigid, 
 def test_what_no_vessel_does_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
         VesselOptions.make(given)
+    if isinstance(given, dict) and "flows" not in given:
+        with pytest.raises(ValueError, match=words):
+            VesselOptions(**given)
+
+
+def test_options_of_a_vessel_are_those_of_a_mapping():
+    given = {"flow": True, "wall": {"support": 0.5}, "motion": False}
+    assert VesselOptions(**given) == VesselOptions.make(given)
+    assert VesselOptions(**given).wall.support == 0.5
 
 
 def test_what_cannot_flow_or_be_observed_is_refused():

@@ -80,17 +80,22 @@ def read(
 class VesselOptions:
     """Flow, compliance and motion options of a vessel; None for none.
 
+    Each is given as such options, as a mapping of their fields, or as True for the
+    defaults.
+
     Attributes:
-        flow: Options of the flow of blood.
-        wall: Options of a compliant wall.
-        motion: Options of the motion of the vessel.
+        flow: `FlowOptions` of the blood.
+        wall: `WallOptions` of a compliant wall.
+        motion: `MotionOptions` of the vessel.
     """
 
-    flow: FlowOptions | None = None
-    wall: WallOptions | None = None
-    motion: MotionOptions | None = None
+    # These fields accept what `__post_init__` converts to an object of options.
+    flow: Any = None
+    wall: Any = None
+    motion: Any = None
 
     def __post_init__(self):
+        vars(self).update({name: _part(name, getattr(self, name)) for name in _KINDS})
         for name in OF_HEART if self.flow and self.motion else ():
             value = getattr(self.motion, name)
             if value is not None:
@@ -107,8 +112,7 @@ class VesselOptions:
         if isinstance(value, str):
             value = PRESETS[bounds.choice("vessel", value, PRESETS)]
         named = f"one of {', '.join(PRESETS)}, or "
-        parts = bounds.mapping("vessel", value, _KINDS, named)
-        return cls(**{name: _part(name, part) for name, part in parts.items()})
+        return cls(**bounds.mapping("vessel", value, _KINDS, named))
 
     @property
     def living(self) -> bool:
