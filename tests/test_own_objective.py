@@ -191,6 +191,19 @@ def test_an_outcome_that_is_none_is_refused_by_the_name_of_its_objective(
             answer(other)
 
 
+@pytest.mark.parametrize(
+    "distance",
+    [None, 0.1, [0.1, 0.1], np.zeros(3), np.zeros((2, 1)), np.full(2, np.nan)],
+)
+def test_a_distance_along_the_route_that_is_none_is_refused(distance):
+    task = advancing()
+    task.objective.path_distance = lambda head: distance
+    batch = BatchSimulation(task, 2, num_threads=1)
+    words = r"path_distance\(\) of Advance returns .*finite.*\(2,\)"
+    with pytest.raises(ValueError, match=words):
+        batch.reset()
+
+
 @pytest.mark.parametrize("hook", ["task_observables", "action_spec"])
 def test_what_an_agent_sees_and_does_is_the_rollouts(hook):
     task = suite.make_task("simple1_bca")

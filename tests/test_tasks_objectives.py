@@ -1,6 +1,8 @@
 """The meaning of a task: success, reward, start and actions, as functions of arrays."""
 
+import copy
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -22,6 +24,10 @@ PATH_REWARD = {"path": -1.0, "success": 10.0}
 @pytest.fixture(scope="module")
 def anatomy():
     return phantoms.load("simple1")
+
+
+def pickled(value):
+    return pickle.loads(pickle.dumps(value))
 
 
 def cannulation(anatomy, goal="bca", **options):
@@ -286,3 +292,16 @@ def test_a_success_rule_of_ones_own_sees_the_forces(anatomy):
     outcome = judge(task, heads, mean_max=np.array([0.05, 0.2, 0.05]))
     assert outcome.success.tolist() == [True, False, False]
     assert outcome.reward[0] == 10.0 and (outcome.reward[1:] <= 0.0).all()
+
+
+@pytest.mark.parametrize("way", [copy.copy, copy.deepcopy, pickled])
+def test_an_objective_is_copied_and_pickled(anatomy, way):
+    objective = cannulation(anatomy, reward=PATH_REWARD)
+    other = way(objective)
+    assert other.weights == objective.weights
+    with pytest.raises(TypeError):
+        other.weights["force"] = 1.0
+    head = objective.route.points[::40]
+    np.testing.assert_array_equal(
+        other.lumen_distance(head), objective.lumen_distance(head)
+    )

@@ -152,6 +152,31 @@ def judge(
     return Outcome(reward, success, terms)
 
 
+def path_distances(groups: Groups, head: np.ndarray) -> np.ndarray:
+    """Lengths (N,) of the routes from heads (N, 3) at the start to the goals, m.
+
+    Args:
+        groups: See `judge`.
+        head: World frame, m.
+
+    Raises:
+        ValueError: if an objective returns another type or shape, or is not finite.
+    """
+    found = np.empty(len(head))
+    for objective, rows in groups:
+        own = objective.path_distance(head[rows])
+        shape = head[rows].shape[:1]
+        numbers = type(own) is np.ndarray and own.dtype.kind in "fiu"
+        if not numbers or own.shape != shape or not np.isfinite(own).all():
+            raise ValueError(
+                f"path_distance() of {type(objective).__name__} returns "
+                f"{bounds.shown(own)}; it must return an array of finite numbers of "
+                f"shape {shape}, m"
+            )
+        found[rows] = own
+    return found
+
+
 def _refuse(objective: Objective, given: str) -> NoReturn:
     raise ValueError(
         f"outcome() of {type(objective).__name__} returns {given}; it must return an "
@@ -256,6 +281,13 @@ class Cannulation(Shiftable, Routed):
             bounds.refuse("reward", self.weights, f"some of {', '.join(known)}")
         weights = {n: bounds.number(f"reward {n}", w) for n, w in self.weights.items()}
         object.__setattr__(self, "weights", MappingProxyType(weights))
+
+    def __getstate__(self):
+        """State of copies and pickles, which hold no read-only view of a mapping."""
+        return {**vars(self), "weights": dict(self.weights)}
+
+    def __setstate__(self, state):
+        vars(self).update(state, weights=MappingProxyType(state["weights"]))
 
     @classmethod
     def to(

@@ -27,7 +27,12 @@ from cathsim_dmc.tasks.cases import Case, objectives_of
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors
-from cathsim_dmc.tasks.objectives import Measurement, judge, straight
+from cathsim_dmc.tasks.objectives import (
+    Measurement,
+    judge,
+    path_distances,
+    straight,
+)
 from cathsim_dmc.tasks.observation_kind import Frame, Observation
 from cathsim_dmc.tasks.progress import Progress
 from cathsim_dmc.tasks.restorable import Restorable, describe
@@ -232,9 +237,7 @@ class Rollout(Restorable):
         # The others have not moved and keep their measurements.
         self._measure(self._stepper.still(indices), indices)
         self._way[indices] = 0.0
-        shortest = np.empty(len(self._way))
-        for objective, rows in self.objectives:
-            shortest[rows] = objective.path_distance(self.resting.head[rows])
+        shortest = path_distances(self.objectives, self.resting.head)
         self._shortest[indices] = shortest[indices]
         begun = set(indices.tolist())
         self._errors = tuple(
