@@ -1,14 +1,19 @@
 """Arguments that no check of a type refuses, and state that is not there yet."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
+from dm_control import composer
 
 import cathsim_dmc
 from cathsim_dmc import bounds, suite
+from cathsim_dmc.entities import devices
+from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.play.session import play
+from cathsim_dmc.tasks.config import NavigationConfig
 
 TASK = "simple1_bca"
 
@@ -103,3 +108,62 @@ def test_help_names_the_keys_that_a_task_has(controls, shown, hidden):
         assert word in controls.help
     for word in hidden:
         assert word not in controls.help
+
+
+@pytest.mark.parametrize("call", ["reset", "step", "restore"])
+def test_a_task_is_not_stepped_by_an_environment_that_has_lost_it(call):
+    """Composer gives a task to any number of environments; the last one keeps it."""
+    task = suite.make_task("simple1_bca", random=0)
+    first = suite.environment(task)
+    first.reset()
+    calls = {
+        "reset": first.reset,
+        "step": lambda: first.step(np.zeros(task.num_actions)),
+        "restore": lambda: first.restore(snapshot),
+    }
+    snapshot = first.snapshot()
+    last = composer.Environment(task, random_state=0)
+    last.reset()
+    state = last.physics.get_state().copy()
+    with pytest.raises(
+        ValueError, match=r"simple1_bca.*another environment.*make_task"
+    ):
+        calls[call]()
+    np.testing.assert_array_equal(last.physics.get_state(), state)
+    last.step(np.zeros(task.num_actions))
+
+
+@pytest.mark.parametrize("friction", [1.0, 2.0])
+def test_the_friction_of_a_device_is_refused_with_its_ratio(friction):
+    rough = dataclasses.replace(devices.get("steerable_5f"), name="r", friction_ratio=3)
+    with pytest.raises(ValueError, match=rf"friction is {friction:g}.*'r'.* 3.*most 2"):
+        suite.make_task("simple1_bca", device=rough, friction=friction)
+
+
+def test_options_do_not_change_with_what_they_were_given_as():
+    shares, effects = np.array([0.1, 0.2]), [Effect()]
+    config = NavigationConfig(start_along_route=shares, effects=effects)
+    shares[:], effects[:] = 0.9, []
+    assert config.start_along_route == (0.1, 0.2)
+    assert len(config.effects) == 1
+
+
+@pytest.mark.parametrize("ratio", [-1.0, -2.0, 0.6, np.nan, "0.3"])
+def test_a_ratio_that_is_not_poissons_is_refused(ratio):
+    with pytest.raises(ValueError, match="poisson_ratio is .*0 to 0.5"):
+        devices.Section.isotropic(1e-6, ratio)
+
+
+@pytest.mark.parametrize("pair", [False, True])
+def test_what_a_task_shows_is_not_its_state(pair):
+    name = "type1_lcca_pair" if pair else "simple1_bca"
+    env = suite.load("cathsim", name, {"observation": ["tracking", "goal"]})
+    env.reset()
+    shown = {**env.task.observation, "readings": env.task.readings.head}
+    if pair:
+        shown |= env.task.devices._asdict()
+    kept = env.snapshot().arrays
+    for each in shown.values():
+        each += 1.0
+    for name, array in env.snapshot().arrays.items():
+        np.testing.assert_array_equal(array, kept[name], name)

@@ -4,8 +4,8 @@ from typing import Any
 
 from cathsim_dmc import bounds
 
-# Coulomb coefficient of lubricated silicone.
-FRICTION = 0.037
+# Coulomb coefficient of lubricated silicone, and the largest one.
+FRICTION, MOST_FRICTION = 0.037, 2.0
 # Contact law of all devices. MuJoCo takes the impedance d at the beginning of a step.
 # Under a dead load with the equilibrium depth r₀, a depth r becomes
 # (1 - α) r + α r₀ (r / r₀)^-m, with α = k d h / (k d h + b) for stiffness k, damping b
@@ -29,7 +29,7 @@ def wall_contact(friction: float) -> dict[str, Any]:
         "contype": 1,
         "conaffinity": 0,
         "condim": 3,
-        "friction": (bounds.number("friction", friction, 0.0, 2.0), 0, 0),
+        "friction": (bounds.number("friction", friction, 0.0, MOST_FRICTION), 0, 0),
         "solref": CONTACT_SOLREF,
         "solimp": CONTACT_SOLIMP,
     }

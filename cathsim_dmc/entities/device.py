@@ -40,6 +40,7 @@ class Section:
     @classmethod
     def isotropic(cls, bending_stiffness: float, poisson_ratio: float) -> "Section":
         """A round section of one isotropic material: GJ = EI / (1 + ν)."""
+        bounds.number("poisson_ratio", poisson_ratio, 0.0, 0.5)
         return cls(bending_stiffness, bending_stiffness / (1 + poisson_ratio))
 
 

@@ -285,7 +285,11 @@ class Stepper(abc.ABC):
 
 
 class SingleStepper(Stepper):
-    """One simulation, stepped by `step`, or by composer, which calls `keep`."""
+    """One simulation, stepped by `step`, or by composer, which calls `keep`.
+
+    Attributes:
+        data: The simulation.
+    """
 
     has_snapshots = True
 
@@ -298,7 +302,7 @@ class SingleStepper(Stepper):
     ):
         """Takes views, which stay valid as long as `data` lives."""
         super().__init__(model, 1, substeps)
-        self._model, self._data = model, data
+        self._model, self.data = model, data
         views = {name: getattr(data, name) for name in (*fields, "ctrl", "userdata")}
         self.arrays = types.SimpleNamespace(**{n: v[None] for n, v in views.items()})
         self.warnings = data.warning.number[None]
@@ -335,17 +339,17 @@ class SingleStepper(Stepper):
             case.write(self._model)
             self._case = case
         # Clears the results of a pass in the last anatomy.
-        mujoco.mj_resetData(self._model, self._data)
+        mujoco.mj_resetData(self._model, self.data)
 
     def states(self, indices: np.ndarray | slice = _ALL) -> np.ndarray:
         """State (1, nstate), mjSTATE_INTEGRATION, a copy."""
         state = np.empty((1, self._size))
-        mujoco.mj_getState(self._model, self._data, state[0], _STATE)
+        mujoco.mj_getState(self._model, self.data, state[0], _STATE)
         return state
 
     def set_states(self, indices: np.ndarray, states: np.ndarray) -> None:
         """Writes the state (1, nstate)."""
-        mujoco.mj_setState(self._model, self._data, states[0], _STATE)
+        mujoco.mj_setState(self._model, self.data, states[0], _STATE)
 
     def step(self) -> None:
         """Does a physics step, and keeps its contacts."""
@@ -361,7 +365,7 @@ class SingleStepper(Stepper):
     def _advance(self, row: np.ndarray) -> None:
         """Does a physics step; none after a warning, as in a batch."""
         if not self._stopped:
-            mujoco.mj_step(self._model, self._data)
+            mujoco.mj_step(self._model, self.data)
             self._stopped = self.warnings.tobytes() != self._known_warnings
         row[:] = 0.0 if self._stopped else self._sensor
 
@@ -380,4 +384,4 @@ class SingleStepper(Stepper):
         self._rows[:-1], self._rows[-1], self._sensor[:] = 0.0, rows[0], rows[0]
 
     def _forward(self, indices: np.ndarray) -> None:
-        mujoco.mj_forward(self._model, self._data)
+        mujoco.mj_forward(self._model, self.data)

@@ -11,7 +11,7 @@ import numpy as np
 from cathsim_dmc import bounds
 from cathsim_dmc.entities.arena import SOLVER_TOLERANCE
 from cathsim_dmc.entities.chain import Chain
-from cathsim_dmc.entities.contact import FRICTION
+from cathsim_dmc.entities.contact import FRICTION, MOST_FRICTION
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import LEAD, LUMEN_FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
@@ -29,7 +29,7 @@ from cathsim_dmc.tasks.cameras import CameraOptions
 
 MAX_STEPS = 2000  # published
 WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
-_FRICTION = (0.0, 2.0, "")  # Coulomb coefficient
+_FRICTION = (0.0, MOST_FRICTION, "")  # Coulomb coefficient
 # Allowed ranges (low, high, unit). A link of the shaft is longer than its radius and
 # shorter than the diameter of a large vessel.
 _NUMBERS = {
@@ -150,6 +150,7 @@ class NavigationConfig:
             isinstance(effect, Effect) for effect in self.effects
         ):
             bounds.refuse("effects", self.effects, "a list of physics.effects.Effect")
+        object.__setattr__(self, "effects", tuple(self.effects))
 
     def effects_on(self, chain: Chain) -> list[Effect]:
         """Returns new effects for one rollout, in the order in which they act."""
@@ -197,7 +198,9 @@ class NavigationConfig:
         bounds.switch("give_up", self.give_up)
         bounds.whole("max_steps", self.max_steps, 1, bounds.MOST_STEPS)
         if (shares := self.start_along_route) is not None:
-            bounds.interval("start_along_route", shares, 0.0, bounds.MOST_START_SHARE)
+            most = bounds.MOST_START_SHARE
+            shares = bounds.interval("start_along_route", shares, 0.0, most)
+            object.__setattr__(self, "start_along_route", shares)
         timestep = bounds.number("physics_timestep", self.physics_timestep)
         substeps, (least, most) = CONTROL_TIMESTEP / (timestep or np.inf), _SUBSTEPS
         within = least - 1e-6 <= substeps <= most + 1e-6

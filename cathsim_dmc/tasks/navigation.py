@@ -168,13 +168,18 @@ class Navigation(composer.Task, NotCopied):
     def task_observables(self):
         """One observable per entry of the chosen observations."""
         return {
-            key: FrameObservable(lambda _, key=key: self.observation[key][0], spec)
+            key: FrameObservable(lambda _, key=key: self._seen[key][0], spec)
             for key, spec in self.observation_specs.items()
         }
 
     @property
     def observation(self) -> Mapping[str, np.ndarray]:
         """Observation after the last control step or at the start, arrays (1, ...)."""
+        return {key: np.array(value) for key, value in self._seen.items()}
+
+    @property
+    def _seen(self) -> Mapping[str, np.ndarray]:
+        """The observation, which may share memory with the readings."""
         return self._current().observation
 
     @property
@@ -226,6 +231,7 @@ class Navigation(composer.Task, NotCopied):
 
     def initialize_episode(self, physics, random_state):
         """Draws the episode and lays the device in its start posture."""
+        self._require(physics)
         self._step = None
         self.rollout.begin(_ONLY, [random_state])
         self._place_goal(physics)
@@ -238,9 +244,18 @@ class Navigation(composer.Task, NotCopied):
 
     def restore(self, physics, snapshot: Snapshot, random_state) -> None:
         """Restores a snapshot; see `Environment.restore`."""
+        self._require(physics)
         self._current()  # measures the start if no observable has done so
         self._step = self.rollout.restore(_ONLY, snapshot, [random_state])
         self._place_goal(physics)
+
+    def _require(self, physics) -> None:
+        """Raise ValueError unless physics is that of the last environment."""
+        if physics.data.ptr is not self.stepper.data:
+            raise ValueError(
+                f"{self!r} belongs to another environment, which was made of it later; "
+                "make a task for each environment, by suite.make_task or suite.load"
+            )
 
     def _place_goal(self, physics) -> None:
         goal = self._scene.phantom.goals.get(self._scene.goal.name)
@@ -249,7 +264,8 @@ class Navigation(composer.Task, NotCopied):
 
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
-        del physics, random_state
+        del random_state
+        self._require(physics)
         self._current()  # measures the start if no observable has done so
         self.rollout.command(bounds.actions(action, (self.num_actions,))[None])
 
@@ -335,7 +351,7 @@ class Navigation(composer.Task, NotCopied):
     def devices(self) -> CoaxialReadings | None:
         """State of coaxial devices, without a leading axis; None for a single one."""
         self._current()
-        return part(self.rollout.devices, 0)
+        return copied(part(self.rollout.devices, 0))
 
     @property
     def termination(self) -> str | None:

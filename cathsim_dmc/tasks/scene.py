@@ -8,6 +8,7 @@ from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.chain import Chain
+from cathsim_dmc.entities.contact import MOST_FRICTION
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
@@ -86,7 +87,7 @@ class Scene:
         )
         friction = config.friction
         if config.devices is None:  # in a stack, it differs from link to link
-            friction *= chosen[0].friction_ratio
+            friction *= _friction_ratio(chosen[0], friction)
         catheter = _chain(chosen, place, config, friction)
         if config.vessel.wall is not None:
             soften(catheter)
@@ -162,6 +163,18 @@ def count_actions(config: NavigationConfig) -> int:
 def longest_tip(chosen: Sequence[devices.Device]) -> devices.Device:
     """The device with the longest tip, which limits the start depth."""
     return max(chosen, key=lambda device: device.tip_length)
+
+
+def _friction_ratio(device: devices.Device, friction: float) -> float:
+    """The friction ratio of a device; ValueError if its friction is out of range."""
+    ratio = device.friction_ratio
+    if ratio * friction > MOST_FRICTION:
+        raise ValueError(
+            f"friction is {friction:g} for an uncoated device, and device "
+            f"{device.name!r} has a friction_ratio of {ratio:g}; their product must be "
+            f"at most {MOST_FRICTION:g}"
+        )
+    return ratio
 
 
 def _chain(
