@@ -192,16 +192,35 @@ def test_an_outcome_that_is_none_is_refused_by_the_name_of_its_objective(
 
 
 @pytest.mark.parametrize(
+    "name", ["goal", "goal_radius", "terms", "outcome", "path_distance"]
+)
+def test_an_objective_that_lacks_something_is_told_what(name):
+    scene = suite.make_task("simple1_lcca").scene
+    parts = {n: v for n, v in vars(Advance).items() if n != name and n[0] != "_"}
+    parts |= {} if name == "goal" else {"goal": scene.goal.position}
+    task = Navigation(scene, type("Partial", (), parts)(), NavigationConfig())
+    with pytest.raises(ValueError, match=rf"Partial lacks {name}; .*path_distance"):
+        suite.environment(task)
+
+
+@pytest.mark.parametrize("goal", [None, "lcca", np.zeros(2), np.full(3, np.nan)])
+def test_a_goal_that_is_no_place_is_refused(goal):
+    scene = suite.make_task("simple1_lcca").scene
+    task = Navigation(scene, Advance(goal), NavigationConfig())
+    with pytest.raises(ValueError, match=r"goal of Advance is .*finite.*3\)"):
+        suite.environment(task)
+
+
+@pytest.mark.parametrize(
     "distance",
     [None, 0.1, [0.1, 0.1], np.zeros(3), np.zeros((2, 1)), np.full(2, np.nan)],
 )
 def test_a_distance_along_the_route_that_is_none_is_refused(distance):
     task = advancing()
     task.objective.path_distance = lambda head: distance
-    batch = BatchSimulation(task, 2, num_threads=1)
     words = r"path_distance\(\) of Advance returns .*finite.*\(2,\)"
     with pytest.raises(ValueError, match=words):
-        batch.reset()
+        BatchSimulation(task, 2, num_threads=1).reset()
 
 
 @pytest.mark.parametrize("hook", ["task_observables", "action_spec"])

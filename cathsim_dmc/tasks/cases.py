@@ -12,6 +12,7 @@ from typing import cast
 import mujoco
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.imaging import views
 from cathsim_dmc.imaging.angiograph import Angiograph
@@ -44,7 +45,12 @@ class Case:
         config: NavigationConfig,
         fields: Fields | None = None,
     ):
-        """Settles the device; `fields` are the model fields that `write` copies."""
+        """Settles the device; `fields` are the model fields that `write` copies.
+
+        Raises:
+            ValueError: if the objective lacks something, or its goal is no place.
+        """
+        _check_objective(objective)
         self.scene, self.objective = scene, objective
         index = ModelIndex(model, scene.catheter, scene.robot)
         if isinstance(scene.catheter, DeviceStack):
@@ -102,6 +108,21 @@ def objectives_of(
         found.append((objective, rows))
         goals[rows] = objective.goal
     return found, goals
+
+
+def _check_objective(objective: Objective) -> None:
+    """Raise ValueError if an objective lacks an attribute, or its goal is no place."""
+    name = type(objective).__name__
+    parts = "goal", "goal_radius", "terms", "outcome", "path_distance"
+    if lacking := [part for part in parts if not hasattr(objective, part)]:
+        raise ValueError(
+            f"the objective {name} lacks {', '.join(lacking)}; an objective has "
+            f"{', '.join(parts)}, see tasks.objectives.Objective"
+        )
+    if np.shape(goal := objective.goal) == (3,):
+        bounds.array(f"the goal of {name}", goal, shape=(3,))
+    else:
+        bounds.array(f"the goal of {name}", goal, shape=(-1, 3))
 
 
 def compile_together(
