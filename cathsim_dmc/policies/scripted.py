@@ -28,7 +28,12 @@ class _Scripted(Policy):
         return type(self)(self._seed + first)
 
     def act(self, observation: Any) -> np.ndarray:
+        self._require_reset()
         return self._action.copy()  # noise on it must not stay
+
+    def _require_reset(self) -> None:
+        if not self._generators:
+            raise RuntimeError(f"the policy {self.name!r} must be reset before it acts")
 
 
 class Random(_Scripted):
@@ -38,6 +43,7 @@ class Random(_Scripted):
 
     def act(self, observation: Any) -> np.ndarray:
         """Actions (N, A), independent of the observation."""
+        self._require_reset()
         size = self._action.shape[1]
         return np.stack([g.uniform(-1, 1, size) for g in self._generators])
 

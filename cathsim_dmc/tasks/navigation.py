@@ -238,7 +238,7 @@ class Navigation(composer.Task, NotCopied):
 
     def snapshot(self) -> Snapshot:
         """The state between two steps; see `Environment.snapshot`."""
-        if self.rollout.begun:
+        if not self._compiled or self.rollout.begun:
             self._current()
         return self.rollout.snapshot(_ONLY)
 
@@ -286,6 +286,10 @@ class Navigation(composer.Task, NotCopied):
 
     def _current(self) -> Step:
         """Returns the last control step, or measures the start of the episode once."""
+        if not self._compiled:
+            raise RuntimeError(
+                f"{self!r} has no environment yet; make one by suite.environment(task)"
+            )
         if self._step is None:
             self._step = self.rollout.start(_ONLY)
         return self._step
