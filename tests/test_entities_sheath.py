@@ -158,7 +158,7 @@ def test_a_device_goes_round_a_bend_without_jam(bent_rig):
 def test_lines_that_no_sheath_follows(line, message):
     with pytest.raises(ValueError, match=message):
         Sheath(np.asarray(line, float), 0.8e-3)
-    with pytest.raises(ValueError, match="must be positive"):
+    with pytest.raises(ValueError, match="device_radius is 0.0.*above 0"):
         Sheath(straight(0.1), 0.0)
 
 

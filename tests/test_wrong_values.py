@@ -10,10 +10,18 @@ from dm_control import composer
 import cathsim_dmc
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.arena import AngiographyArena
+from cathsim_dmc.entities.catheter import Catheter
+from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.entities.phantom import Phantom
+from cathsim_dmc.entities.robot import Robot
+from cathsim_dmc.entities.sheath import Sheath, straight
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.play.session import play
+from cathsim_dmc.policies import POLICIES, make_policy
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.scene import Scene
 
 TASK = "simple1_bca"
 
@@ -167,3 +175,45 @@ def test_what_a_task_shows_is_not_its_state(pair):
         each += 1.0
     for name, array in env.snapshot().arrays.items():
         np.testing.assert_array_equal(array, kept[name], name)
+
+
+AXIS = straight(0.2)
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (lambda: Sheath(AXIS, "5F"), "device_radius is '5F'.*above 0, at most 0.01 m"),
+        (lambda: Sheath(AXIS, 0.8), "device_radius is 0.8.*at most 0.01 m"),
+        (lambda: Sheath(AXIS, 8e-4, clearance=-1e-3), "clearance is -0.001.*at least 0"),
+        (lambda: Sheath(AXIS, 8e-4, clearance="x"), "clearance is 'x'.*at least 0"),
+        (lambda: Sheath(AXIS, 8e-4, math.nan), "link_length is nan.*at least 0"),
+        (lambda: Robot(-1.0), "device_radius is -1.0.*above 0"),
+        (lambda: Catheter(timestep=math.nan), "timestep is nan.*above 0"),
+        (lambda: Catheter(discretisation=3), "discretisation is 3.*a Discretisation"),
+        (lambda: DeviceStack(lead=-0.1), "lead is -0.1.*at least 0"),
+        (lambda: DeviceStack(lumen_friction=math.nan), "lumen_friction is nan.*0 to 2"),
+        (lambda: DeviceStack(()), "devices is \\(\\).*at least one"),
+        (lambda: DeviceStack("wire_035_glide"), "devices is 'wire_035_glide'.*names"),
+        (lambda: AngiographyArena(0.0), "device_density is 0.0.*above 0"),
+        (lambda: AngiographyArena(tolerance=-1), "tolerance is -1.*above 0"),
+        (lambda: Phantom("type1"), "anatomy is 'type1'.*an Anatomy"),
+        (lambda: Scene.build("type1", "lcca", {}), "config is {}.*a NavigationConfig"),
+    ],
+)
+def test_wrong_arguments_of_entities_are_refused(build, words):
+    with pytest.raises(ValueError, match=words):
+        build()
+
+
+@pytest.mark.parametrize("name", sorted(POLICIES))
+def test_a_policy_without_a_reset_says_so(name):
+    with pytest.raises(RuntimeError, match="must be reset before it acts"):
+        make_policy(name).act(None)
+
+
+def test_a_task_without_an_environment_says_so():
+    task = suite.make_task("simple1_bca")
+    for show in (lambda: task.readings, task.info, task.snapshot):
+        with pytest.raises(RuntimeError, match=r"no environment.*suite.environment"):
+            show()

@@ -3,6 +3,7 @@
 import numpy as np
 from dm_control import composer
 
+from cathsim_dmc import bounds
 from cathsim_dmc.entities.contact import FRICTION_STIFFNESS
 
 BLOOD_DENSITY = 1060.0  # kg/m^3
@@ -29,6 +30,11 @@ class AngiographyArena(composer.Arena):
                 its buoyancy in blood.
             tolerance: tolerance of the contact solver.
         """
+        for name, value in (
+            ("device_density", device_density),
+            ("tolerance", tolerance),
+        ):
+            bounds.number(name, value, positive=True)
         super()._build(name="arena")
         root = self._mjcf_root
         # composer.Arena bounds masses and inertias from below and sets no-slip

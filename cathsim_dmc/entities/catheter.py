@@ -38,7 +38,7 @@ class Catheter(Chain):
         """
         device = devices.get(device)
         self.devices = (device,)
-        division = discretisation or devices.Discretisation()
+        division = devices.discretised(discretisation)
         lengths = division.link_lengths(device)
         first = len(lengths) - device.tip_links
         # A joint bends like two half links.

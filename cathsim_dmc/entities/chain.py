@@ -150,6 +150,7 @@ class Chain(composer.ModelWrapperEntity):
     ) -> None:
         """Builds base, links, head, motors and sensors; `devices` must be set."""
         bounds.number("stroke", stroke, unit="m", positive=True)
+        bounds.number("timestep", timestep, unit="s", positive=True)
         self.device = self.devices[-1]
         self.stroke, self.timestep, self.link_lengths = stroke, timestep, links.lengths
         self.distal_shares = links.lengths[1:] / (

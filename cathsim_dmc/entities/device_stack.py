@@ -4,12 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.entities import devices as library
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.armature import hinge_armatures
 from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
 from cathsim_dmc.entities.coaxial import Stack, carried_mass, weight_density
-from cathsim_dmc.entities.contact import FRICTION, device_contact
+from cathsim_dmc.entities.contact import FRICTION, MOST_FRICTION, device_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.torsion import rods_of
 from cathsim_dmc.laws.hinges import unloaded_hinges
@@ -66,6 +67,11 @@ class DeviceStack(Chain):
         Raises:
             ValueError: if a device does not fit into the next one, or is steerable.
         """
+        if isinstance(devices, str) or not devices:
+            wanted = "names of devices from the innermost outwards, at least one"
+            bounds.refuse("devices", devices, wanted)
+        bounds.number("lead", lead, 0.0, unit="m")
+        bounds.number("lumen_friction", lumen_friction, 0.0, MOST_FRICTION)
         self.devices = tuple(library.get(device) for device in devices)
         for device in self.devices:
             if device.steerable:
@@ -74,7 +80,7 @@ class DeviceStack(Chain):
                     "devices must be passive; give a passive one, or the option "
                     "`device` for a single steerable device"
                 )
-        division = discretisation or library.Discretisation()
+        division = library.discretised(discretisation)
         self.friction, self.lumen_friction = friction, lumen_friction
         self.stack = Stack(self.devices, division.link_lengths(*self.devices))
         self.rods = rods_of(self.devices, self.stack.nodes)

@@ -242,6 +242,11 @@ def get(device: "str | Device", option: str = "device") -> Device:
     return DEVICES[bounds.choice(option, device, DEVICES)]
 
 
+def discretised(given: "Discretisation | None") -> "Discretisation":
+    """Returns the division into links as given; that of the default for None."""
+    return bounds.instance("discretisation", given or Discretisation(), Discretisation)
+
+
 @dataclasses.dataclass(frozen=True)
 class Discretisation:
     """Division of a device into rigid links.

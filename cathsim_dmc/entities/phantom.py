@@ -3,6 +3,7 @@
 import numpy as np
 from dm_control import composer, mjcf
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.contact import DRAWN, FRICTION, wall_contact
@@ -42,6 +43,8 @@ class Phantom(composer.ModelWrapperEntity):
             drawn: whether the surface is drawn; otherwise a point replaces it, so that
                 all models have the same number of geoms.
         """
+        bounds.instance("anatomy", anatomy, Anatomy)
+        bounds.number("goal_radius", goal_radius, unit="m", positive=True)
         self.anatomy, self._friction = anatomy, friction
         root = mjcf.RootElement(model="phantom")
         super()._build(root)

@@ -17,7 +17,9 @@ import numpy as np
 from dm_control import composer, mjcf
 from numpy.typing import NDArray
 
+from cathsim_dmc import bounds
 from cathsim_dmc.compiled import compiled
+from cathsim_dmc.entities.device import THICKEST
 
 # The clamp-advance-release cycle, in metres of insertion.
 # The stroke fits a rail of 0.35 m, and the clamps change about once a second at the
@@ -135,6 +137,8 @@ class Robot(composer.ModelWrapperEntity):
         Args:
             device_radius: radius of the device between jaws and rollers, m.
         """
+        most = THICKEST
+        bounds.number("device_radius", device_radius, 0.0, most, "m", positive=True)
         root = mjcf.from_path(str(MODEL))
         super()._build(root)
         for joint in JOINTS:

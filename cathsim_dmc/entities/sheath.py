@@ -5,9 +5,11 @@ import itertools
 import numpy as np
 from dm_control import composer, mjcf
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.contact import DRAWN, sheath_contact
+from cathsim_dmc.entities.device import THICKEST
 
 # Radial clearance between device and bore, m: assumed, for lack of a source.
 CLEARANCE = 0.35e-3
@@ -63,14 +65,15 @@ class Sheath(composer.ModelWrapperEntity):
 
         Raises:
             ValueError: if the line has fewer than two points, repeats a point or bends
-                with a radius below 10 mm, or if a size is not positive.
+                with a radius below 10 mm, or if a size is out of range.
         """
-        if not device_radius > 0:
-            raise ValueError(f"device_radius is {device_radius} m; it must be positive")
-        self.touches = clearance is not None
-        self.bore_radius = device_radius + (
-            CLEARANCE if clearance is None else clearance
-        )
+        most = THICKEST
+        bounds.number("device_radius", device_radius, 0.0, most, "m", positive=True)
+        bounds.number("link_length", link_length, 0.0, unit="m")
+        self.touches, play = clearance is not None, CLEARANCE
+        if clearance is not None:
+            play = bounds.number("clearance", clearance, 0.0, unit="m")
+        self.bore_radius = device_radius + play
         line = Centreline(centreline, np.full(len(centreline), self.bore_radius))
         _refuse_sharp_bends(line)
         self.vertices, self.length = line.points, line.length

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
@@ -74,6 +75,7 @@ class Scene:
         Raises:
             ValueError: if goal, device or vessel options do not fit the anatomy.
         """
+        bounds.instance("config", config, NavigationConfig)
         goal = placement.resolve_goal(anatomy, goal)
         config.vessel.check(anatomy)
         chosen, length = chosen_devices(config), config.working_length
