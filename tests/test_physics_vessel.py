@@ -307,3 +307,25 @@ def test_what_cannot_flow_or_be_observed_is_refused():
         VesselOptions.make("living").check(anatomy)
     with pytest.raises(ValueError, match="'vessel' needs a living vessel"):
         suite.make_task("simple1_bca", observation="vessel")
+
+
+def test_a_flow_without_inflow_is_the_limit_of_a_small_one():
+    """A peak of 0 in the law stands for a steady flow, of 1 m³/s here."""
+
+    def pushed(peak):
+        task = suite.make_task(
+            "simple1_bca",
+            random=0,
+            vessel={"flow": {"peak": peak}},
+            observation="vessel",
+        )
+        env = suite.environment(task)
+        env.reset()
+        for _ in range(8):
+            step = env.step(np.eye(task.num_actions)[-1])
+        assert task.error is None
+        return task.readings.centreline, step.observation["blood_velocity"]
+
+    still, slow = pushed(0.0), pushed(1e-12)
+    np.testing.assert_allclose(still[0], slow[0], atol=1e-9)
+    np.testing.assert_array_equal(still[1], 0.0)

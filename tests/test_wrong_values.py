@@ -185,7 +185,10 @@ AXIS = straight(0.2)
     [
         (lambda: Sheath(AXIS, "5F"), "device_radius is '5F'.*above 0, at most 0.01 m"),
         (lambda: Sheath(AXIS, 0.8), "device_radius is 0.8.*at most 0.01 m"),
-        (lambda: Sheath(AXIS, 8e-4, clearance=-1e-3), "clearance is -0.001.*at least 0"),
+        (
+            lambda: Sheath(AXIS, 8e-4, clearance=-1e-3),
+            "clearance is -0.001.*at least 0",
+        ),
         (lambda: Sheath(AXIS, 8e-4, clearance="x"), "clearance is 'x'.*at least 0"),
         (lambda: Sheath(AXIS, 8e-4, math.nan), "link_length is nan.*at least 0"),
         (lambda: Robot(-1.0), "device_radius is -1.0.*above 0"),

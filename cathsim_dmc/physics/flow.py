@@ -237,6 +237,8 @@ def _fill(found, speed, radii, flowing, blood):
             blood.space_velocity[index, n] = row[5:]
             if flowing:
                 blood.velocity[index, n] = row[:3]
+                if blood.peak[index] == 0.0:  # stands for a steady flow in the law
+                    blood.velocity[index, n] = 0.0
                 blood.delay[index, n] = row[3] / speed[index]
                 blood.friction[index, n] = 0.0
                 if row[4] > 0.0:
