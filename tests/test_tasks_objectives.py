@@ -305,3 +305,15 @@ def test_an_objective_is_copied_and_pickled(anatomy, way):
     np.testing.assert_array_equal(
         other.lumen_distance(head), objective.lumen_distance(head)
     )
+
+
+def test_a_simulation_that_has_diverged_does_not_keep_others_from_beginning():
+    class Far:
+        def path_distance(self, head):
+            return np.linalg.norm(head, axis=-1)
+
+    head = np.array([[3.0, 4.0, 0.0], [np.nan, 0.0, 0.0]])
+    groups = [(Far(), slice(None))]
+    assert objectives.path_distances(groups, head, np.array([0]))[0] == 5.0
+    with pytest.raises(ValueError, match="finite"):
+        objectives.path_distances(groups, head, np.array([1]))

@@ -152,22 +152,24 @@ def judge(
     return Outcome(reward, success, terms)
 
 
-def path_distances(groups: Groups, head: np.ndarray) -> np.ndarray:
+def path_distances(groups: Groups, head: np.ndarray, begun: np.ndarray) -> np.ndarray:
     """Lengths (N,) of the routes from heads (N, 3) at the start to the goals, m.
 
     Args:
         groups: See `judge`.
         head: World frame, m.
+        begun: (K,) simulations that begin an episode; others may have diverged.
 
     Raises:
-        ValueError: if an objective returns another type or shape, or is not finite.
+        ValueError: if an objective returns another type or shape, or if a length from a
+            start is not finite.
     """
-    found = np.empty(len(head))
+    found, starts = np.empty(len(head)), np.isin(np.arange(len(head)), begun)
     for objective, rows in groups:
         own = objective.path_distance(head[rows])
-        shape = head[rows].shape[:1]
-        numbers = type(own) is np.ndarray and own.dtype.kind in "fiu"
-        if not numbers or own.shape != shape or not np.isfinite(own).all():
+        shape, given = head[rows].shape[:1], getattr(own, "shape", None)
+        fits = type(own) is np.ndarray and own.dtype.kind in "fiu" and given == shape
+        if not fits or not np.isfinite(own[starts[rows]]).all():
             raise ValueError(
                 f"path_distance() of {type(objective).__name__} returns "
                 f"{bounds.shown(own)}; it must return an array of finite numbers of "

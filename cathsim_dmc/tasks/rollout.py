@@ -237,7 +237,7 @@ class Rollout(Restorable):
         # The others have not moved and keep their measurements.
         self._measure(self._stepper.still(indices), indices)
         self._way[indices] = 0.0
-        shortest = path_distances(self.objectives, self.resting.head)
+        shortest = path_distances(self.objectives, self.resting.head, indices)
         self._shortest[indices] = shortest[indices]
         begun = set(indices.tolist())
         self._errors = tuple(
