@@ -1,5 +1,6 @@
 """Files of other programs: VTK's surfaces and centrelines, label maps, and images."""
 
+import re
 import struct
 import zlib
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from synthetic_scans import marched, y_tree
 
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.curves import read_curves
 from cathsim_dmc.anatomy.scan.labels import label_surface
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
@@ -158,6 +160,94 @@ def test_an_image_of_itk_that_is_cut_off_is_refused(tmp_path, packed):
         label_surface(path)
 
 
+def slices(folder, named, *listed, **entries):
+    """A MetaImage of the ball whose voxels are in the files slice0.raw to slice21.raw.
+
+    They are in all.raw, too.
+    """
+    path = meta(folder / "map.mhd", ball(), packed=False)
+    head = path.read_bytes().partition(b"ElementDataFile")[0].decode()
+    for key, value in entries.items():
+        head = re.sub(f"{key} = .*", f"{key} = {value}", head)
+    path.write_text(head + "\n".join([f"ElementDataFile = {named}", *listed, ""]))
+    for number in range(22):
+        data = ball()[:, :, number].transpose().tobytes()
+        (folder / f"slice{number}.raw").write_bytes(data)
+    (folder / "all.raw").write_bytes(ball().transpose().tobytes())
+    return path
+
+
+NAMES = [f"slice{number}.raw" for number in range(22)]
+
+
+@pytest.mark.parametrize(
+    ("named", "listed"),
+    [
+        ("all.raw", ()),
+        ("LIST", NAMES),
+        ("LIST 2", [*NAMES, "more.raw"]),
+        ("slice%d.raw 0", ()),
+        ("./slice%d.raw 0 21 1", ()),
+    ],
+)
+def test_the_slices_of_a_metaimage_may_have_their_own_files(tmp_path, named, listed):
+    pytest.importorskip("vtkmodules")
+    whole = label_surface(meta(tmp_path / "map.mha", ball(), packed=False)).vertices
+    path = slices(tmp_path, named, *listed)
+    assert np.array_equal(label_surface(path).vertices, whole)
+
+
+def test_an_axis_of_negative_spacing_runs_backwards(tmp_path):
+    """As ITK reads it: a voxel's place is its index times the spacing."""
+    pytest.importorskip("vtkmodules")
+    path = slices(tmp_path, "all.raw", ElementSpacing="0.8 -0.9 1.0")
+    vertices, faces, *_ = label_surface(path)
+    middle = ORIGIN + (np.array((16, 11, 10)) * SPACING * (1, -1, 1)) @ TURN
+    np.testing.assert_allclose(vertices.mean(axis=0), 1e-3 * middle, atol=0.1e-3)
+    assert Surface(vertices, faces).volume > 0.0
+
+
+@pytest.mark.parametrize(
+    ("named", "listed", "words"),
+    [
+        ("LIST", NAMES[:9], "its list names 9 files for 22 slices"),
+        ("LIST", [*NAMES[:9], "", *NAMES[9:]], "its list names 21 files for 22"),
+        ("LIST", ["\n".join(NAMES)], "its list names 21 files for 22"),
+        ("LIST 3", ["all.raw"], "list one file for each slice"),
+        ("LIST", [*NAMES[:-1], "../slice21.raw"], "outside its folder"),
+        ("slice%d.raw 3 21 1", (), "names 19 of 22 slices"),
+        ("slice%d.raw 0 21", (), "the last slice and the step"),
+        ("slice%d.raw 0 21 0", (), "the last slice and the step"),
+        ("slice%d.raw 0 21 -1", (), "the last slice and the step"),
+        ("slice%s.raw 0", (), "give one %d"),
+        ("slice%d%d.raw 0", (), "give one %d"),
+        ("../all.raw", (), "outside its folder"),
+        ("/all.raw", (), "outside its folder"),
+    ],
+)
+def test_files_of_voxels_that_are_missing_or_elsewhere_are_refused(
+    tmp_path, named, listed, words
+):
+    """VTK leaves their voxels undefined, or divides by zero."""
+    pytest.importorskip("vtkmodules")
+    path = slices(tmp_path, named, *listed)
+    if len(listed) == 1 and listed[0].count("\n") == 21:  # VTK skips the last line
+        path.write_bytes(path.read_bytes().removesuffix(b"\n"))
+    with pytest.raises(ValueError, match=words):
+        label_surface(path)
+
+
+def test_a_packed_slice_that_is_damaged_is_refused(tmp_path):
+    pytest.importorskip("vtkmodules")
+    path = slices(tmp_path, "LIST", *NAMES, CompressedData="True")
+    for name in NAMES:
+        data = zlib.compress((tmp_path / name).read_bytes())
+        (tmp_path / name).write_bytes(data)
+    (tmp_path / NAMES[11]).write_bytes(data[:-1])
+    with pytest.raises(ValueError, match="damaged or cut off"):
+        label_surface(path)
+
+
 @pytest.mark.parametrize("kind", ["nii.gz", "mha"])
 def test_a_label_map_whose_packed_voxels_are_damaged_is_refused(tmp_path, kind):
     """They unpack to other labels, which only the checksum at the end tells."""
@@ -223,9 +313,10 @@ def test_a_header_names_no_file_elsewhere(tmp_path):
     text = path.read_bytes()
     start = text.index(b"data file: ") + 11
     stop = text.index(b"\n", start)
-    path.write_bytes(text[:start] + b"/etc/hostname" + text[stop:])
-    with pytest.raises(ValueError, match="its voxels are in another file"):
-        label_surface(path)
+    for elsewhere in (b"/etc/hostname", b"../map.raw.gz"):
+        path.write_bytes(text[:start] + elsewhere + text[stop:])
+        with pytest.raises(ValueError, match="another file, .* outside its folder"):
+            label_surface(path)
 
 
 @pytest.mark.parametrize(

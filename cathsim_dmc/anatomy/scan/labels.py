@@ -13,6 +13,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from cathsim_dmc import bounds
+from cathsim_dmc.anatomy.scan import voxel_files
 from cathsim_dmc.anatomy.scan.mesh import parsed
 from cathsim_dmc.anatomy.scan.units import UNITS, to_lps
 
@@ -23,6 +24,7 @@ _MOST_LABELS = 500
 _DIFFER = 0.3  # least share of differing neighbours in an image; labels: far less
 _MOST_UNEVEN = 1e4  # condition number of the matrix of a voxel; usual ones: below 10
 _HEADER = 16_384  # bytes of a MetaImage that hold its header
+_MOST_LISTED = 2**20  # bytes of its list of files
 # Types of voxels that VTK reads from a MetaImage. With others, such as MET_LONG_LONG,
 # it returns undefined numbers or writes beyond its memory.
 _TYPES = [
@@ -258,13 +260,11 @@ def _nrrd(path: Path) -> _Voxels:
     header = nrrd.read_header(str(path))
     data, detached = path, {"datafile", "data file"} & set(header)
     if detached:
-        # Only a file in the same folder is read: a header may name any path.
-        named = str(header[detached.pop()])
-        data = path.parent / named
-        if path.suffix.lower() != ".nhdr" or Path(named).name != named:
+        if path.suffix.lower() != ".nhdr":
             raise ValueError(
                 "its voxels are in another file; save both as one .nrrd file"
             )
+        data = voxel_files.beside(path, str(header[detached.pop()]))
     count = _require_few(np.atleast_1d(header["sizes"]).tolist())
     with data.open("rb") as stream:
         while data is path and stream.readline().strip():
@@ -312,6 +312,7 @@ def _meta(path: Path) -> _Voxels:
             key, _, value = os.fsdecode(stream.readline(_HEADER)).partition("=")
             entries[key.strip()] = value.split()
         start = stream.tell()
+        listed = stream.read(_MOST_LISTED)
     sizes = [int(size) for size in entries.get("DimSize", [])]
     if entries.get("NDims") != ["3"] or len(sizes) != 3:
         raise ValueError("its header does not say NDims = 3 and three sizes (DimSize)")
@@ -323,10 +324,12 @@ def _meta(path: Path) -> _Voxels:
             f"its voxels are {channels} x {kind or 'of no type'}; save them as one "
             f"channel of {', '.join(_TYPES)}"
         )
+    named = " ".join(entries.get("ElementDataFile", []))
+    others = voxel_files.of_meta(path, named, listed, sizes)
     if entries.get("CompressedData", ["False"])[0][:1] in "Tt1":
-        named = " ".join(entries["ElementDataFile"])
-        if named.upper() != "LOCAL":
-            _require_whole(path.parent / named, 0, 8 * count)
+        if others:
+            for other in others:
+                _require_whole(other, 0, 8 * count)
         elif "CompressedDataSize" in entries:
             _require_whole(path, start, 8 * count)
         else:
