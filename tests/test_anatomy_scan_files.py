@@ -390,3 +390,69 @@ def test_polygons_of_a_binary_ply_differ_in_their_corners(tmp_path, order):
     path.write_bytes(whole[:-20])
     with pytest.raises(ValueError, match="it ends early, 2 of 27 rows are missing"):
         read_triangles(path)
+
+
+def lines_of_obj():
+    points, faces = marched(y_tree(), 3e-3)
+    rows = [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in points]
+    return rows, [f"f {a} {b} {c}" for a, b, c in faces + 1]
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("comment", ["", " # side 3", "#1,5"])
+def test_an_obj_file_of_any_program_is_the_same_surface(tmp_path, comment, end):
+    points, faces = lines_of_obj()
+    (tmp_path / "plain.obj").write_text("\n".join([*points, *faces, ""]))
+    vertices, triangles = read_triangles(tmp_path / "plain.obj")
+    rows = ["# SPACE=RAS", *(row + comment for row in points), "g a#1"]
+    rows += [row + comment for row in faces[:400]] + faces[400:]
+    path = tmp_path / "other.obj"
+    path.write_bytes(end.join([*rows, ""]).encode())
+    other, corners = read_triangles(path)
+    assert np.array_equal(other, vertices) and np.array_equal(corners, triangles)
+    path.write_bytes(end.join(rows)[:-3000].encode())
+    with pytest.raises(ValueError, match="it ends early, in 'f"):
+        read_triangles(path)
+
+
+def lines_of_stl(name, corners):
+    rows = [f"solid {name}"]
+    for triangle in corners:
+        rows += ["facet normal 0 0 0", "outer loop"]
+        rows += [f"vertex {x:.4f} {y:.4f} {z:.4f}" for x, y, z in triangle]
+        rows += ["endloop", "endfacet"]
+    return [*rows, f"endsolid {name}"]
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_the_solids_of_a_text_stl_are_one_surface(tmp_path, end):
+    points, faces = marched(y_tree(), 3e-3)
+    corners = points[faces]
+    rows = lines_of_stl("a", corners[:400]) + lines_of_stl("b", corners[400:])
+    path = tmp_path / "solids.stl"
+    path.write_bytes(end.join([*rows, ""]).encode())
+    vertices, triangles = read_triangles(path)
+    np.testing.assert_allclose(vertices[triangles], corners, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["obj", "stl", "ply"])
+def test_decimal_commas_are_named(tmp_path, kind):
+    rows, front = [row for group in lines_of_obj() for row in group], ""
+    if kind == "stl":
+        points, faces = marched(y_tree(), 3e-3)
+        rows = lines_of_stl("a", points[faces])
+    if kind == "ply":
+        points, faces = lines_of_obj()
+        front = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
+        front += "".join(f"property float {axis}\n" for axis in "xyz")
+        front += f"element face {len(faces)}\nproperty list uchar int vertex_indices\n"
+        front += "end_header\n"
+        rows = [row[2:] for row in points]
+        rows += [f"3 {a} {b} {c}" for a, b, c in marched(y_tree(), 3e-3)[1]]
+    text = "\n".join([*rows, ""])
+    path = tmp_path / f"lumen.{kind}"
+    path.write_text(front + text)
+    assert len(read_triangles(path)[1]) > 1000
+    path.write_text(front + text.replace(".", ","))
+    with pytest.raises(ValueError, match=r"decimal commas \(\d+,\d+\)"):
+        read_triangles(path)
