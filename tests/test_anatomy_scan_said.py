@@ -9,7 +9,7 @@ import trimesh
 from synthetic_scans import marched, write_markup, write_obj, y_tree
 from test_anatomy_scan_files import ball, poly_data, written
 
-from cathsim_dmc.anatomy.scan import topology
+from cathsim_dmc.anatomy.scan import bodies, topology
 from cathsim_dmc.anatomy.scan.curves import read_curve, read_curves
 from cathsim_dmc.anatomy.scan.labels import label_surface
 from cathsim_dmc.anatomy.scan.lumen import guess_units, read_lumen
@@ -324,13 +324,45 @@ def test_files_of_other_kinds_are_named(tmp_path, name, content, words):
 
 def test_bodies_that_overlap_are_to_be_united(y_mesh):
     vertices, faces = 1e-3 * y_mesh[0], y_mesh[1]
-    bodies = [vertices, vertices + (5e-3, 0.0, 0.0)]
+    points = [vertices, vertices + (5e-3, 0.0, 0.0)]
     both = np.concatenate([faces, faces + len(vertices)])
     with pytest.raises(ValueError, match="Some of them overlap: unite these"):
-        mend("two", np.concatenate(bodies), both)
-    bodies[1] = vertices + 0.2
+        mend("two", np.concatenate(points), both)
+    points[1] = vertices + 0.2
     with pytest.raises(ValueError, match="Keep the largest island"):
-        mend("two", np.concatenate(bodies), both)
+        mend("two", np.concatenate(points), both)
+
+
+@pytest.mark.parametrize("far", [60e-3, 5e-3], ids=["beside", "overlapping"])
+def test_bodies_that_touch_in_a_point_are_two(y_mesh, far):
+    """No device passes the point; one of them was taken, and the other was a ghost."""
+    vertices, faces = 1e-3 * y_mesh[0], y_mesh[1]
+    other, there = vertices + (far, 0.0, 0.0), vertices[:, 0].argmax()
+    other[np.linalg.norm(other - vertices[there], axis=1).argmin()] = vertices[there]
+    both = np.concatenate([faces, faces + len(vertices)])
+    words = "unite these" if far < 0.01 else "Keep the largest island"
+    with pytest.raises(ValueError, match=f"2 separate parts, .* {words}"):
+        mend("two", np.concatenate([vertices, other]), both)
+
+
+@pytest.mark.parametrize("what", ["small body", "wall"])
+def test_what_touches_a_lumen_in_a_point_may_belong_to_it(y_mesh, what):
+    vertices, faces = 1e-3 * y_mesh[0], y_mesh[1]
+    there = vertices[:, 0].argmax()
+    if what == "wall":
+        more, rows = vertices + 0.1e-3 * normals(vertices, faces), faces
+        more[there] = vertices[there]
+    else:
+        ball = trimesh.creation.icosphere(subdivisions=1, radius=1e-3)
+        more, rows = np.array(ball.vertices), ball.faces
+        more += vertices[there] - more[more[:, 0].argmin()]
+    both = np.concatenate([faces, rows + len(vertices)])
+    one = bodies.found(*topology.merged(np.concatenate([vertices, more]), both))
+    assert one.label.max() == 0
+
+
+def normals(vertices, faces):
+    return trimesh.Trimesh(vertices, faces, process=False).vertex_normals
 
 
 @pytest.mark.parametrize("where", ["inside", "in the wall", "outside"])

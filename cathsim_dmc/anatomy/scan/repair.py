@@ -5,17 +5,11 @@ from typing import NamedTuple
 import numpy as np
 
 from cathsim_dmc.anatomy.parts import Inlet, Surface
-from cathsim_dmc.anatomy.scan import topology
+from cathsim_dmc.anatomy.scan import bodies, topology
 from cathsim_dmc.anatomy.scan.places import cut_open
 from cathsim_dmc.anatomy.scan.units import enlargement, mm, shown
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
-# A separate part is dropped if its share of the area is at most PART_AREA, and it is at
-# most PART_WIDTH, m, wide or more than PART_INSIDE of it lies in the largest part.
-PART_AREA = 0.03
-PART_WIDTH = 12e-3
-PART_INSIDE = 0.25
-MOST_SHOWN = 4  # separate parts whose places an error names
 NON_MANIFOLD = 0.01  # largest share of triangles at non-manifold edges to cut out
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
@@ -91,14 +85,8 @@ class _Work:
 
     def keep_one_part(self, quiet: bool = False) -> None:
         """Drops small parts; keeps the inner of the two surfaces of a wall."""
-        label = topology.parts(self.faces)
-        area = topology.areas(self.vertices, self.faces)
-        share = np.bincount(label, area) / area.sum()
-        wide = topology.widths(self.vertices, self.faces, label) > PART_WIDTH
-        # Parts inside the lumen or its wall, such as calcifications, are no vessels.
-        inside = topology.inside(self.vertices, self.faces, label, int(share.argmax()))
-        inside = inside > PART_INSIDE
-        large = np.flatnonzero((share > PART_AREA) | (wide & ~inside))
+        found = bodies.found(self.vertices, self.faces)
+        label, share, large = found
         inner = None
         if len(large) == 2 and not quiet:
             shells = [self.faces[label == k] for k in large]
@@ -108,24 +96,7 @@ class _Work:
             self.walled = True
             large = large[[inner]]
         elif len(large) > 1:
-            remedy = (
-                "Keep the largest island (3D Slicer: Segment Editor, Islands), or join "
-                "them where a vessel is interrupted"
-            )
-            if topology.overlap(self.vertices, self.faces, label, large):
-                remedy = (
-                    "Some of them overlap: unite these (Blender: modifier Boolean, "
-                    "Union; 3D Slicer: import them as one segment)"
-                )
-            around = [
-                shown(self.vertices[self.faces[label == k]].mean(axis=(0, 1)))
-                for k in large[np.argsort(-share[large])][:MOST_SHOWN]
-            ]
-            raise ValueError(
-                f"{self.name} has {len(large)} separate parts, the largest around "
-                f"{', '.join(around)}; one connected lumen is needed. {remedy}, and "
-                "export again."
-            )
+            raise bodies.refusal(self.name, self.vertices, self.faces, found)
         elif len(share) > 1 and not quiet:
             self.notes.append(
                 f"{len(share) - 1} small parts beside the lumen dropped "
@@ -174,7 +145,9 @@ class _Work:
     def _drop_small_parts(self) -> None:
         label = topology.parts(self.faces)
         share = np.bincount(label, topology.areas(self.vertices, self.faces))
-        self._keep(np.isin(label, np.flatnonzero(share > PART_AREA * share.sum())))
+        self._keep(
+            np.isin(label, np.flatnonzero(share > bodies.PART_AREA * share.sum()))
+        )
 
     def orient(self) -> None:
         """Gives neighbouring triangles the same orientation."""

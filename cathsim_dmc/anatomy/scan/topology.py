@@ -103,10 +103,15 @@ def handles(faces: np.ndarray) -> int:
     return 1 - igl.euler_characteristic(np.ascontiguousarray(faces)) // 2
 
 
-def parts(faces: np.ndarray) -> np.ndarray:
-    """Label (F,) of the connected part that each triangle belongs to, from 0."""
+def parts(faces: np.ndarray, by_edges: bool = False) -> np.ndarray:
+    """Label (F,) of the connected part that each triangle belongs to, from 0.
+
+    Triangles are connected where they share a vertex, or an edge with `by_edges`.
+    """
     import igl
 
+    if by_edges:
+        return igl.facet_components(np.ascontiguousarray(faces))[1]
     label = igl.vertex_components(np.ascontiguousarray(faces))[faces[:, 0]]
     return np.unique(label, return_inverse=True)[1]
 
