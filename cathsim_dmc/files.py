@@ -115,11 +115,22 @@ def _check_folder(folder: Path) -> None:
     if not folder.is_dir():
         if folder.exists():
             raise NotADirectoryError(f"{folder} is a file; give a directory (--out)")
+        _refuse_home(folder)
         raise FileNotFoundError(f"no directory {folder}; create it first")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise PermissionError(
             f"{folder} cannot be written to: it is read-only for this user; choose "
             f"another directory, or allow it (chmod u+wx {folder})"
+        )
+
+
+def _refuse_home(folder: Path) -> None:
+    """Raise FileNotFoundError for `~/data` where a folder `~` would be made."""
+    meant = os.path.expanduser(folder)
+    if meant != str(folder) and not Path(folder.parts[0]).exists():
+        raise FileNotFoundError(
+            f"no directory {folder}: only a shell takes {folder.parts[0]} for the home "
+            f"directory; give {meant}"
         )
 
 
@@ -141,6 +152,7 @@ def require_place(folder: str | os.PathLike[str]) -> Path:
         OSError: as `require_folder`, for the folder or its nearest existing parent.
     """
     place = Path(folder)
+    _refuse_home(place)
     while not (place.exists() or place.is_symlink()) and place != place.parent:
         place = place.parent
     require_folder(place)

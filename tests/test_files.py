@@ -34,6 +34,26 @@ def test_wrong_paths_are_refused_before_the_work(tmp_path):
             raise AssertionError
 
 
+def test_a_home_that_no_shell_has_expanded_is_refused(tmp_path, monkeypatch):
+    """A folder called ~ would be made: deleting it by name deletes the home."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    words = f"only a shell takes ~ .*; give {tmp_path}/home/data"
+    for require in (
+        files.require_place,
+        lambda folder: files.require_folder(folder, make=True),
+        lambda folder: files.require_file(folder / "a", later=True),
+        lambda folder: files.write_text(folder / "a", "text"),
+    ):
+        with pytest.raises(FileNotFoundError, match=words):
+            require(Path("~/data"))
+    assert names(tmp_path) == []
+    # A name may begin so, and a folder may be called so.
+    files.require_folder("~data/x", make=True)
+    (tmp_path / "~").mkdir()
+    files.require_folder("~/data", make=True)
+
+
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
 def test_a_folder_that_takes_no_file_is_refused_whatever_its_bits_say(tmp_path):
     with pytest.raises(PermissionError, match="/proc cannot be written to: "):
