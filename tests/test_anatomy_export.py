@@ -1,6 +1,7 @@
 """Convex wall pieces of an exported anatomy: intrusion, gaps, passage, MJCF."""
 
 import dataclasses
+import io
 import json
 import sys
 from itertools import pairwise
@@ -153,6 +154,31 @@ def test_a_thin_wall_between_two_lumens_stays_out_of_both():
     anatomy = Anatomy.from_tree(tree, "two", goals={})
     found = export.fidelity(anatomy, export.wall_pieces(anatomy))
     assert not found["closed_to_5fr"] and found["intrusion_mm"]["p95"] < 0.4
+
+
+def test_a_model_holds_names_and_places_as_they_are(tube, tmp_path, monkeypatch):
+    """In UTF-8 whatever the locale is, as readers of XML take it."""
+    monkeypatch.setattr(io, "text_encoding", lambda given, *_: given or "ascii")
+    name = "Müller & <Söhne>"
+    folder = tmp_path / "mö del"
+    folder.mkdir()
+    found = export.write_mjcf(
+        dataclasses.replace(tube, name=name), folder / "a b.xml", "prisms"
+    )
+    model = mujoco.MjModel.from_xml_path(str(folder / "a b.xml"))
+    assert model.names.split(b"\0")[0].decode() == name
+    places = {"inlet": tube.inlet, **tube.goals}
+    assert model.nsite == len(places) and model.nmesh == found["pieces"]
+    for key, place in places.items():
+        assert np.array_equal(model.site(key).pos, place.position)
+    assert [file.name for file in folder.iterdir()] == ["a b.xml"]
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for index, piece in enumerate(export.wall_pieces(tube, "prisms")):
+        start, count = model.mesh_vertadr[index], model.mesh_vertnum[index]
+        turn = data.geom_xmat[index].reshape(3, 3)
+        places = model.mesh_vert[start : start + count] @ turn.T + data.geom_xpos[index]
+        np.testing.assert_allclose(np.sort(places, 0), np.sort(piece, 0), atol=1e-6)
 
 
 def test_deviations_are_summed_up_in_millimetres():

@@ -140,4 +140,4 @@ def _summary(card: Mapping[str, Any]) -> str:
 
 def _write_page(folder: Path, name: str, what: str, command: str) -> None:
     page = _PAGE.format(name=name, what=what, command=command)
-    (folder / "README.md").write_text(page)
+    (folder / "README.md").write_text(page, encoding="utf-8")

@@ -350,5 +350,5 @@ def write_mjcf(
         for name, place in {"inlet": anatomy.inlet, **anatomy.goals}.items():
             spec.worldbody.add_site(name=name, pos=place.position.tolist())
         spec.compile()
-        temporary.write_text(spec.to_xml())
+        temporary.write_text(spec.to_xml(), encoding="utf-8")
     return {"pieces": len(pieces), **fidelity(anatomy, pieces)}

@@ -141,7 +141,7 @@ def _settings(arguments: list[str]) -> tuple[agents.TrainingConfig, bool]:
         if path.is_file() and not found.preset:
             text = f"{path} holds no settings of a run"
             with files.refused(ValueError, text, (ValueError, TypeError)):
-                config = config_from_dict(dict(json.loads(path.read_text())))
+                config = config_from_dict(dict(json.loads(files.read_text(path))))
             if found.algo in (None, config.algorithm):
                 return config, True
     given = {"algorithm": found.algo, "preset": found.preset}.items()

@@ -129,7 +129,7 @@ def _begin(out: Path, options: ImageSetOptions) -> None:
     described = out / "dataset.json"
     if out.exists() and not described.is_file() and any(out.iterdir()):
         raise ValueError(f"{out} is not empty and no data set; choose another folder")
-    if described.is_file() and (begun := described.read_text()) != text:
+    if described.is_file() and (begun := files.read_text(described)) != text:
         raise ValueError(
             f"{described} says that {out} was begun with other options or another "
             f"version{_others(begun, text)}; give those, or another folder"
