@@ -1,5 +1,10 @@
 """Files that appear whole or not at all, whoever writes or dies meanwhile."""
 
+import codecs
+import errno
+import io
+import os
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -110,3 +115,55 @@ def test_arrays_from_outside_run_nothing(tmp_path):
         path.write_bytes(data)
         with pytest.raises(ValueError):
             files.read_arrays(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes")
+def test_neither_a_pipe_nor_a_directory_is_replaced(tmp_path):
+    pipe, folder = tmp_path / "pipe", tmp_path / "folder"
+    os.mkfifo(pipe)
+    folder.mkdir()
+    with pytest.raises(ValueError, match="device or a pipe"):
+        files.write_text(pipe, "text")
+    with pytest.raises(IsADirectoryError, match="give a file name in it"):
+        files.write_text(folder, "text")
+    assert pipe.is_fifo() and names(tmp_path) == ["folder", "pipe"]
+
+
+def test_a_name_that_is_too_long_is_no_fault_of_its_folder(tmp_path):
+    with pytest.raises(OSError) as caught:
+        files.write_text(tmp_path / ("a" * 250), "text")
+    assert caught.value.errno == errno.ENAMETOOLONG
+
+
+def test_texts_of_windows_are_read(tmp_path):
+    (tmp_path / "a.json").write_bytes(codecs.BOM_UTF8 + "ü".encode())
+    assert files.read_text(tmp_path / "a.json") == "ü"
+
+
+@pytest.mark.parametrize(("stored", "most"), [(10, 2**28), (2**28, 100 * 2**28)])
+def test_files_may_unpack_to_this_much(stored, most):
+    files.require_room(most, stored)
+    with pytest.raises(ValueError, match="it unpacks to"):
+        files.require_room(most + 1, stored)
+
+
+@pytest.mark.parametrize("size", [0, 5, 2**20, 2**20 + 3])
+def test_a_probe_of_the_disk_is_as_large_as_asked_for(tmp_path, size):
+    files.fill(tmp_path / "probe", size)
+    assert (tmp_path / "probe").stat().st_size == size
+
+
+def test_an_error_keeps_the_file_that_it_names(tmp_path):
+    with pytest.raises(FileNotFoundError) as caught, files.naming(tmp_path / "a"):
+        (tmp_path / "b").read_text()
+    assert caught.value.filename == str(tmp_path / "b")
+
+
+def test_an_array_with_less_data_than_its_header_says_is_refused(tmp_path):
+    stream = io.BytesIO()
+    np.save(stream, np.zeros(10))
+    data = stream.getvalue().replace(b"(10,)", b"(99,)")
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("values.npy", data)
+    with pytest.raises(ValueError, match="holds less than its shape"):
+        files.read_arrays(tmp_path / "a.npz")

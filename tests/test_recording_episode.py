@@ -69,13 +69,29 @@ def test_contacts_must_belong_to_steps_in_order(steps, message):
         )
 
 
-def test_a_later_format_is_refused(tmp_path):
+def test_arrays_of_an_episode_are_copies_that_cannot_be_written():
+    given = np.zeros(6)
+    episode = make_episode(reward=given)
+    given[0] = 1.0
+    assert not episode.reward.any()
+    with pytest.raises(ValueError, match="read-only"):
+        episode.qpos[0] = 1.0
+
+
+def test_every_step_has_a_number_of_contacts():
+    places = {"contact_position": np.zeros((3, 3)), "contact_force": np.zeros((3, 3))}
+    episode = make_episode(6, contact_step=np.array([1, 1, 3]), **places)
+    assert episode.contact_counts.tolist() == [0, 2, 0, 1, 0, 0]
+
+
+@pytest.mark.parametrize("version", [99, True])
+def test_another_format_is_refused(tmp_path, version):
     path = tmp_path / "e.npz"
     make_episode().save(path)
     with np.load(path) as archive:
         arrays = dict(archive)
     header = json.loads(str(arrays["header"]))
-    arrays["header"] = np.array(json.dumps({**header, "version": 99}))
+    arrays["header"] = np.array(json.dumps({**header, "version": version}))
     np.savez(path, **arrays)
-    with pytest.raises(ValueError, match="format 99"):
+    with pytest.raises(ValueError, match=f"format {version}"):
         Episode.load(path)
