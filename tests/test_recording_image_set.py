@@ -6,6 +6,7 @@ import json
 import h5py
 import numpy as np
 import pytest
+from PIL import Image
 
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.imaging.carm import SOURCE_ISOCENTRE
@@ -346,3 +347,30 @@ def test_the_description_of_a_mask_is_that_of_its_pixels(share):
     if len(rows):
         box = [columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1]
     assert found["area"] == len(rows) and found["bbox"] == [int(one) for one in box]
+
+
+def test_two_processes_may_write_the_pictures_of_a_data_set(tmp_path, monkeypatch):
+    path, rows = tmp_path / "train" / "train_000.h5", 3
+    path.parent.mkdir()
+    image = np.random.RandomState(0).randint(256, size=(rows, 16, 16)).astype("u1")
+    shapes = {"sequence": (rows,), "camera_matrix": (rows, 3, 4)}
+    shapes |= {"keypoints": (rows, len(sequences.KEYPOINTS), 3), "mask": image.shape}
+    with h5py.File(path, "w") as file:
+        file["image"] = image
+        for name, shape in shapes.items():
+            file[name] = np.zeros(shape, "u1" if name == "mask" else "f4")
+    save, others = Image.Image.save, []
+
+    def saved(self, target, **options):
+        if not others:  # the other process begins later, and is the first to end
+            others.append(True)
+            others.append(coco.labels(path, 0, pictures=True))
+        save(self, target, **options)
+
+    monkeypatch.setattr(Image.Image, "save", saved)
+    assert coco.labels(path, 0, pictures=True) == others[1]
+    files = sorted((tmp_path / "train" / "train_000").iterdir())
+    assert [file.name for file in files] == [f"{row:06d}.png" for row in range(rows)]
+    for file, wanted in zip(files, image, strict=True):
+        assert np.array_equal(np.asarray(Image.open(file)), wanted)
+    assert len(list((tmp_path / "train").iterdir())) == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,11 @@ def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[An
                     "num_keypoints": known[row],
                 })  # fmt: skip
         if pictures and not (folder := path.with_suffix("")).exists():
-            with files.atomic_directory(folder) as temporary:
+            # Another process of this data set may have written the same ones meanwhile.
+            with (
+                contextlib.suppress(FileExistsError),
+                files.atomic_directory(folder) as temporary,
+            ):
                 for row, image in enumerate(file["image"]):
                     picture = Image.fromarray(image)
                     picture.save(temporary / f"{row:06d}.png", compress_level=1)
