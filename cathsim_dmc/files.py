@@ -192,6 +192,26 @@ def _refuse_special(path: str | os.PathLike[str]) -> None:
         raise ValueError(f"{path} is a device or a pipe; give the name of a file")
 
 
+def require_source(path: str | os.PathLike[str], what: str) -> Path:
+    """Check that a file to read is there; return its path.
+
+    Args:
+        what: What to give instead, for the message: "a file of ...".
+
+    Raises:
+        FileNotFoundError, IsADirectoryError: there is no such file, or it is a
+            directory.
+        ValueError: it is a device or a pipe.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a directory; give {what}")
+    if not path.exists():
+        raise FileNotFoundError(f"no file {path}; give {what}")
+    _refuse_special(path)
+    return path
+
+
 def read_text(path: str | os.PathLike[str]) -> str:
     """Return the UTF-8 text of a file, with or without a byte order mark of Windows.
 

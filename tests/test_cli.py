@@ -107,7 +107,7 @@ def test_a_command_says_which_file_it_replaces(
 def test_a_variant_that_would_change_nothing_is_refused(cathsim, tmp_path, kind, more):
     out = "--out", tmp_path / "x"
     code, _, err = cathsim("phantom", "generate", *kind, *more, *out)
-    assert code == 2 and "which I, II and III take alone" in err
+    assert code == 2 and "which only I, II and III take" in err
     assert not list(tmp_path.iterdir())
 
 

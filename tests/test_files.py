@@ -59,6 +59,28 @@ def test_a_home_that_no_shell_has_expanded_is_refused(tmp_path, monkeypatch):
     files.require_folder("~/data", make=True)
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("replay-error", "{}"),
+        ("phantom", "build", "{}", "--out", "d"),
+        ("submit", "{}", "--out", "d.json"),
+        ("eval", "expert", "--task", "type1_bca", "--start", "{}"),
+        ("validate", "forces", "--episode", "{}"),
+        ("replay", "{}"),
+    ],
+    ids=lambda arguments: " ".join(arguments[:2]),
+)
+def test_a_missing_file_is_named_with_what_to_give(cathsim, tmp_path, arguments):
+    (tmp_path / "folder.npz").mkdir()
+    for name, text in ("none.npz", "no file "), ("folder.npz", "is a directory"):
+        path = str(tmp_path / name)
+        code, _, error = cathsim(*(one.format(path) for one in arguments))
+        assert code == 2
+        assert path in error and text in error and "; give a" in error
+        assert "Errno" not in error
+
+
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
 def test_a_folder_that_takes_no_file_is_refused_whatever_its_bits_say(tmp_path):
     with pytest.raises(PermissionError, match="/proc cannot be written to: "):

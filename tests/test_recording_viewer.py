@@ -24,7 +24,7 @@ def recording(tmp_path_factory):
 def test_only_recordings_are_opened(recording, tmp_path):
     assert check_recording(recording) == recording.resolve()
     other = tmp_path / "e.rrd"
-    with pytest.raises(FileNotFoundError, match="no recording"):
+    with pytest.raises(FileNotFoundError, match="give a recording"):
         check_recording(other)
     other.write_text("hello")
     with pytest.raises(ValueError, match="not a whole Rerun recording"):

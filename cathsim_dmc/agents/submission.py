@@ -139,7 +139,7 @@ def digest_of(policy: str) -> str | None:
         return None
     path = pretrained.pretrained_path(policy)
     if policy.endswith(RECORDED):
-        path = Path(policy)
+        path = files.require_source(policy, "a file of agents.record_actions")
     if path is not None:
         return file_digest(path)
     sums = json.dumps(dict(Checkpoint.open(policy).sha256), sort_keys=True)

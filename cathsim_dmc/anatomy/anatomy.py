@@ -248,7 +248,8 @@ class Anatomy:
         path = Path(directory) / _FILE
         if not path.is_file():
             raise FileNotFoundError(
-                f"no {_FILE} in {path.parent}; give a directory that Anatomy.save wrote"
+                f"no {_FILE} in {path.parent}; give a directory written by `cathsim "
+                "phantom import`, `build` or `generate`, or by Anatomy.save"
             )
         try:
             return _unpack(files.read_arrays(path))

@@ -44,7 +44,8 @@ class TreeFile:
 
 
 def read_tree(path: str | os.PathLike[str]) -> TreeFile:
-    """Read a tree file; ValueError names an invalid entry."""
+    """Read a tree file; ValueError names an invalid entry, OSError a missing file."""
+    files.require_source(path, "a tree of centrelines (docs/anatomy_files.md)")
     try:
         content = json.loads(files.read_text(path))
     except (ValueError, RecursionError) as error:

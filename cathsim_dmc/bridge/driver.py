@@ -90,7 +90,10 @@ def connect(address: str) -> Connection:
         sock = socket.create_connection((host.strip("[]"), int(port)), HANDSHAKE)
         return Connection(sock)
     except OSError as error:
-        raise OSError(f"no device answers at {address}: {error}") from error
+        raise OSError(
+            f"no device answers at {address}: {error}; start it first, in another "
+            "terminal, such as with `cathsim serve TASK`"
+        ) from error
 
 
 @dataclasses.dataclass

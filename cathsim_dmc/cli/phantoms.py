@@ -203,7 +203,7 @@ def generate(
             raise ValueError(f"{kind!r} takes {wanted}; --{option} is {value}")
     if needs[kind] != "seed" and (neck or variant != "normal"):
         wrong = "--neck is given" if neck else f"--variant is {variant!r}"
-        raise ValueError(f"{wrong}, which I, II and III take alone")
+        raise ValueError(f"{wrong}, which only I, II and III take; leave it out")
     _require_place(out)
     if seed is not None:
         bounds.seed("seed", seed)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc import bounds
-from cathsim_dmc.files import atomic_path, read_arrays
+from cathsim_dmc.files import atomic_path, read_arrays, require_source
 
 FORMAT = "cathsim-episode"
 FORMAT_VERSION = 1
@@ -170,13 +170,12 @@ class Episode:
         """Read an episode that ``save`` wrote; nothing in the file is executed.
 
         Raises:
-            FileNotFoundError: if there is no such file.
+            OSError: if there is no such file, or it is a directory.
             ValueError: if the file is not an episode, is damaged, or is of a later
                 version.
         """
-        path = Path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"no episode at {path}")
+        way = "a .npz file of `cathsim record`, `cathsim play` or Episode.save"
+        path = require_source(path, way)
         try:
             arrays = read_arrays(path, ("header", *_AXES))
             header = json.loads(str(arrays.pop("header")))

@@ -6,6 +6,8 @@ import socket
 import sys
 from pathlib import Path
 
+from cathsim_dmc import files
+
 # First bytes of every recording of the current format.
 _MAGIC = b"RRF2"
 # Near the end of every complete recording, before a checksum of four bytes.
@@ -21,12 +23,10 @@ def check_recording(path: str | os.PathLike[str]) -> Path:
     """Return the absolute path of a complete recording.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        OSError: there is no such file, or it is a directory.
         ValueError: the file is no complete recording of this version of Rerun.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no recording at {path}")
+    path = files.require_source(path, "a recording (.rrd) of `cathsim record`")
     if path.suffix == ".npz":
         beside = path.with_suffix(".rrd")
         way = f"the viewer opens the recording beside them, {beside}"
@@ -64,7 +64,7 @@ def open_viewer(
             taken; the printed address names it.
 
     Raises:
-        FileNotFoundError, ValueError: see `check_recording`.
+        OSError, ValueError: see `check_recording`.
         ViewerError: there is no viewer, no display for its window, or a port is taken.
     """
     recording = check_recording(path)

@@ -73,10 +73,11 @@ class PhysicsError:
         """Reads a file that `save` has written.
 
         Raises:
-            FileNotFoundError: if there is no such file.
+            OSError: if there is no such file, or it is a directory.
             ValueError: if the file is damaged or holds no physics error.
         """
-        meta, arrays = read_arrays(path, _KIND)
+        way = "a file of the folder errors/ of a training or an evaluation"
+        meta, arrays = read_arrays(files.require_source(path, way), _KIND)
         with files.refused(
             ValueError, f"{path} holds no physics error", (KeyError, TypeError)
         ):

@@ -43,7 +43,8 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> An
     if not Path(anatomy).is_dir():
         raise ValueError(
             f"no anatomy at {str(anatomy)!r}; give a directory written by `cathsim "
-            f"phantom import` or `generate`, or one of {', '.join(phantoms.PHANTOMS)}"
+            "phantom import`, `build` or `generate`, or one of "
+            f"{', '.join(phantoms.PHANTOMS)}"
         )
     return Anatomy.load(anatomy)
 

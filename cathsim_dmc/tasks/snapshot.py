@@ -142,9 +142,10 @@ class Snapshot:
         """Reads a file that `save` has written.
 
         Raises:
-            FileNotFoundError: if there is no such file.
+            OSError: if there is no such file, or it is a directory.
             ValueError: if the file is damaged or holds no snapshot.
         """
+        files.require_source(path, "a file that Snapshot.save wrote")
         meta, arrays = read_arrays(path, "snapshot")
         return cls.of(path, meta, arrays)
 
