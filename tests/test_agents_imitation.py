@@ -309,7 +309,7 @@ def test_a_policy_that_does_not_fit_is_refused(cloned, tmp_path):
 def test_demonstrations_of_another_task_are_refused(dataset, shapes, tmp_path):
     shown = {"demonstrations": dataset, "training_reward": {"path": -1.0}}
     BC(small("bc", **shown), shapes, tmp_path)  # which reads no reward
-    with pytest.raises(DatasetError, match="its reward is the default, not .*path"):
+    with pytest.raises(DatasetError, match="the default, not .*path.* record with"):
         SAC(small("sac", **shown), shapes, tmp_path)
     with pytest.raises(DatasetError, match="its task is '.*_bca', not '.*_lcca'"):
         BC(small("bc", task="simple1_lcca", **shown), shapes, tmp_path)

@@ -108,7 +108,10 @@ def _require_options(own: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
         pair = chosen(own, name), chosen(wanted, name)
         if pair[0] != pair[1]:
             told = ["the default" if one is None else repr(one) for one in pair]
-            raise ValueError(f"its {name} is {told[0]}, not {told[1]}")
+            raise ValueError(
+                f"its {name} is {told[0]}, not {told[1]}; record with the {name} of "
+                "the training, or train with that of the recording"
+            )
 
 
 def metadata_of(path: str | os.PathLike[str]) -> Path:
