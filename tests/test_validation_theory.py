@@ -1,5 +1,6 @@
 """Closed forms against other closed forms, and the report of checks."""
 
+import io
 import itertools
 import json
 import types
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
 from cathsim_dmc.entities.contact import FRICTION
@@ -89,6 +91,16 @@ def test_report_is_one_json_object_without_nan():
     assert plain["findings"] == {"array": [0.0, 1.0], "nan": None}
     assert not report.passed
     assert report.table().row_count == 2
+
+
+@pytest.mark.parametrize("width", [60, 80])
+def test_a_narrow_table_keeps_whole_names(width):
+    name = "first mode of a free end of 120 mm, wire_035_extra_stiff"
+    note = "as in the_worst_of_all_devices_of_the_library"
+    report = Report("r", [Check.at_most(name, 1.0, 2.0, "mm", note)])
+    stream = io.StringIO()
+    Console(file=stream, width=width).print(report.table())
+    assert "…" not in stream.getvalue()
 
 
 # What the checks judge, of measurements that are right but for one of each kind.

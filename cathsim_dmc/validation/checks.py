@@ -97,11 +97,12 @@ class Report:
         from rich.table import Table
         from rich.text import Text
 
-        table = Table("check", title=self.title)
+        table = Table(title=self.title)
+        table.add_column("check", overflow="fold")  # names of devices end differently
         table.add_column("measured", justify="right")
         table.add_column("bound", justify="right")
         table.add_column("")
-        table.add_column("behind it", style="dim")
+        table.add_column("behind it", style="dim", overflow="fold")
         for check in self.checks:
             value = f"{check.value:.3g} {check.unit}".rstrip()
             bound = f"{check.bound} {check.unit}".rstrip()
