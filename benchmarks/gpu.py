@@ -369,7 +369,7 @@ def write(page: Path, found: Mapping[str, Any]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--worlds", type=int, nargs="+")
     parser.add_argument("--steps", type=int, default=30)

@@ -380,13 +380,13 @@ def markdown(result: dict) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("runs/soak"))
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--episodes", type=int)
-    parser.add_argument("--steps", type=int)
+    parser.add_argument("--out", type=Path, default=Path("runs/soak"), help="folder")
+    parser.add_argument("--quick", action="store_true", help="16 by 200 steps")
+    parser.add_argument("--episodes", type=int, help="by default 100")
+    parser.add_argument("--steps", type=int, help="of an episode; 2,000")
     parser.add_argument("--threads", type=int, default=0, help="0: one per core")
     parser.add_argument("--together", type=int, default=8, help="episodes side by side")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--json", action="store_true", help="one JSON object")
     parser.add_argument("--task", action="append", help="repeated for several")
     parser.add_argument(
         "--policy", action="append", choices=list(POLICIES), help="repeated likewise"

@@ -39,9 +39,8 @@ HERE = Path(__file__).parent
 FORMAT = 2
 POINTS = 200  # of the learning curve
 SOLVED = 0.9  # success rate of a solved task
-GUIDED = (
-    0.05  # share of an expert's control steps above which an episode is not counted
-)
+# Share of an expert's control steps above which an episode is not counted.
+GUIDED = 0.05
 # Columns of metrics.csv in the learning curve, if present.
 _CURVE = ("frames", "seconds", "episodes", "episode_reward", "episode_length")
 _CURVE += ("success", "distance", "mean_force", "max_force")
@@ -355,6 +354,9 @@ def main(
     """
     try:
         cells = read_grid(grid)
+        for part in only:
+            if not fnmatch.filter([cell.name for cell in cells], f"*{part}*"):
+                raise ValueError(f"no cell is named like {part!r}; --list names all")
     except ValueError as error:
         print(f"trainings: {error}", file=sys.stderr)
         return BAD_INPUT

@@ -136,6 +136,9 @@ def test_a_cell_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, capsy
     assert trainings.main(*where, only=["bca"]) == 1 and len(did) == 6
     assert trainings.main(*where, list=True) == 0 and len(did) == 6
     assert trainings.main(tmp_path / "none.toml") == 2
+    capsys.readouterr()
+    assert trainings.main(*where, only=["bca", "nonsense"]) == 2 and len(did) == 6
+    assert "no cell is named like 'nonsense'" in capsys.readouterr().err
 
 
 def test_every_result_is_of_a_cell_of_the_grid():
