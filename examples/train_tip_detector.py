@@ -51,6 +51,10 @@ def load(data: Path, split: str):
                 camera[:, 0, :3] - 0.5 * (images[-1].shape[2] - 1) * camera[:, 2, :3]
             )
             scales.append(1e3 * depth / np.linalg.norm(across, axis=1))
+    if not images:
+        raise SystemExit(
+            f"{data / split} holds no .h5 file; give a folder of `cathsim dataset`"
+        )
     picture = torch.from_numpy(np.concatenate(images)[:, None])
     return picture, torch.from_numpy(np.concatenate(tips)), np.concatenate(scales)
 

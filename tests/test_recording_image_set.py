@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -374,3 +375,11 @@ def test_two_processes_may_write_the_pictures_of_a_data_set(tmp_path, monkeypatc
     for file, wanted in zip(files, image, strict=True):
         assert np.array_equal(np.asarray(Image.open(file)), wanted)
     assert len(list((tmp_path / "train").iterdir())) == 2
+
+
+def test_the_detector_says_which_folder_it_takes(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "examples")
+    import train_tip_detector
+
+    with pytest.raises(SystemExit, match="train holds no .h5 file; give a folder of"):
+        train_tip_detector.load(tmp_path, "train")
