@@ -98,8 +98,10 @@ def test_a_command_says_which_file_it_replaces(
     more = {"submit": ("--episodes", 2), "eval": ("--episodes", 1)}.get(words[0], ())
     text = f"{tmp_path / file}, which was there before, is replaced"
     for there in (False, True):
-        code, _, err = cathsim(*words, *short, *more, "--out", tmp_path / place)
+        code, out, err = cathsim(*words, *short, *more, "--out", tmp_path / place)
         assert code == 0 and (text in err) == there, err
+        if words[0] == "submit":
+            assert "2 episodes; success: 100 %; safe success, 0.5 N: 100 %" in out
 
 
 @pytest.mark.parametrize("kind", [("type1",), ("test", "--index", 3)])

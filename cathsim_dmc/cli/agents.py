@@ -180,8 +180,11 @@ def submit(
     how: Any = {"episodes": episodes, "num_threads": threads}
     with told_of_replaced([out, out.with_suffix(submission.RECORDED)]):
         done = submission.submit(policy, out, task, **how)
-    rates = done["summary"]["success"], done["summary"]["safe_success"]
-    print(f"{out}: success {rates[0]}, safe success {rates[1]}, {done['sha256']}")
+    rates = {"success": done["summary"]["success"]}
+    safe = done["summary"]["safe_success"].items()
+    rates |= {f"safe success, {limit}": rate for limit, rate in safe}
+    text = "; ".join(f"{name}: {100 * rate:.0f} %" for name, rate in rates.items())
+    print(f"{out}: {len(done['episodes'])} episodes; {text}; SHA-256 {done['sha256']}")
     return 0
 
 
