@@ -47,14 +47,17 @@ def main() -> None:
         names = [one["name"] for one in welcome["action"]]
         print(f"{welcome['name']}: {len(names)} actions, last {names[-1]}")
         send(sock, "start", seed=options.seed)
-        back = 0
-        while (state := receive(stream))["kind"] == "state" and state["end"] is None:
+        back, step = 0, 0
+        while (state := receive(stream))["kind"] == "state":
+            step = state["step"]
+            if state["end"] is not None:
+                break
             if state["force"].get("largest", 0.0) > LIMIT:  # if it is measured
                 back = WITHDRAWAL
             action = [0.0] * (len(names) - 1) + [-1.0 if back else 1.0]
             back = max(0, back - 1)
-            send(sock, "action", step=state["step"], action=action)
-        print(state.get("end") or state["reason"], "after", state.get("step"), "steps")
+            send(sock, "action", step=step, action=action)
+        print(state.get("end") or state["reason"], "after", step, "steps")
 
 
 if __name__ == "__main__":

@@ -6,9 +6,11 @@ import os
 import signal
 import socket
 import struct
+import sys
 import threading
 import time
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -844,3 +846,30 @@ def test_a_port_that_is_taken_is_refused_before_anything_compiles(cathsim, monke
         port = taken.getsockname()[1]
         code, _, told = cathsim("serve", "type1_lcca", "--port", port)
     assert code == 2 and f"cannot listen on 127.0.0.1:{port}" in told
+
+
+def test_the_example_says_after_how_many_steps_a_device_stops(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "examples")
+    import drive_by_socket as example
+
+    state = {"observation": {}, "force": {}, "end": None}
+
+    def device(server):
+        sock, _ = server.accept()
+        with sock, sock.makefile("rb") as stream:
+            example.receive(stream)
+            example.send(sock, "welcome", name="d", action=[{"name": "insertion"}])
+            for step in range(3):
+                example.receive(stream)
+                example.send(sock, "state", step=step, **state)
+            example.send(sock, "stop", reason="watchdog")
+            example.receive(stream)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=device, args=(server,))
+        thread.start()
+        port = str(server.getsockname()[1])
+        monkeypatch.setattr(sys, "argv", ["drive_by_socket.py", "--port", port])
+        example.main()
+        thread.join(10.0)
+    assert "watchdog after 2 steps" in capsys.readouterr().out
