@@ -94,6 +94,11 @@ def _copied(exported, tmp_path):
     return weights
 
 
+def test_a_missing_file_is_named_as_given(tmp_path):
+    with pytest.raises(CheckpointError, match=r"no policy .*none\.safetensors: it is"):
+        load_policy(tmp_path / "none.safetensors")
+
+
 def test_damaged_weights_are_refused(exported, tmp_path):
     weights = _copied(exported, tmp_path)
     data = bytearray(weights.read_bytes())
@@ -102,7 +107,7 @@ def test_damaged_weights_are_refused(exported, tmp_path):
     with pytest.raises(CheckpointError, match="damaged"):
         load_policy(weights)
     weights.unlink()
-    with pytest.raises(CheckpointError, match="cannot be read"):
+    with pytest.raises(CheckpointError, match="no policy .*it is no file"):
         load_policy(weights)
 
 

@@ -179,7 +179,7 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     if policy in POLICIES:
         return make_policy(str(policy), seed)
     path = pretrained.pretrained_path(policy)
-    if path is None and not Path(policy).exists():
+    if not (path or Path(policy)).exists():
         raise CheckpointError(
             f"no policy {policy}: it is no file or directory, and none of "
             f"{', '.join(POLICIES)}, pretrained:NAME"
