@@ -269,6 +269,7 @@ def without_figures(row):
     return cells[1:3] + cells[7:9]
 
 
+@pytest.mark.slow
 def test_the_page_lists_the_submissions(script):
     """Rows that were replayed with other versions have the figures of the replay."""
     found = [(entries.read(path), None) for path in script.FOLDER.glob("*.json")]

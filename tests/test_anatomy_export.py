@@ -26,6 +26,7 @@ def pieces(tube):
     return export.wall_pieces(tube)
 
 
+@pytest.mark.slow
 def test_pieces_surround_the_lumen(tube, pieces):
     found = export.fidelity(tube, pieces)
     assert found["places"] > 200

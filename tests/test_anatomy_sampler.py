@@ -42,6 +42,7 @@ def test_the_arches_of_the_sets_keep_their_geometry(name):
     assert 1e3 * rows.mean(axis=0) == pytest.approx(FIGURES[name], abs=2e-3)
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_bytes():
     seed = arch.arch_set("train")[5]
     first = arch.build_seed(seed)
@@ -119,6 +120,7 @@ def test_a_neck_has_the_arteries_beyond_the_arch():
     assert np.percentile(error, 99) < 0.02e-3
 
 
+@pytest.mark.slow
 def test_necks_differ_and_are_repeated():
     seeds = arch.arch_set("neck")[:4]
     found = [arch_tree(one.parameters()) for one in seeds]
@@ -148,9 +150,8 @@ def test_arteries_of_a_neck_begin_towards_their_sides():
             assert 0.0 < back < up
 
 
-@pytest.mark.parametrize(
-    "name", ["neck", pytest.param("test_neck", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["neck", "test_neck"])
 def test_the_branches_of_a_neck_begin_in_other_vessels(name):
     """A cross-section that lies outside of them is a lumen without a wall."""
     for seed in arch.arch_set(name)[:28]:

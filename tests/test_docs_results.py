@@ -113,6 +113,7 @@ def test_the_mean_over_seeds_hides_no_task_that_fails(script):
             script.mean_over_seeds(few)
 
 
+@pytest.mark.slow
 def test_means_stand_beside_agents_with_several_seeds_only(page, tmp_path):
     tasks = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
     for task in tasks:

@@ -197,6 +197,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.slow
 def test_an_interrupt_that_is_lost_comes_again_until_it_is_handled():
     done = subprocess.run([sys.executable, "-c", LOST], capture_output=True, text=True)
     assert done.stdout.split() == ["saved", "once", "True"], done.stderr

@@ -228,6 +228,7 @@ for name in ("mjcb_passive", "mjcb_control"):
 """
 
 
+@pytest.mark.slow
 def test_callbacks_that_were_removed_are_put_back_or_missed():
     ended(_LOST)
 

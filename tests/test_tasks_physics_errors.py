@@ -190,6 +190,7 @@ def _failing(task_name, folder, monkeypatch, num_envs=2, **options):
     raise AssertionError("nothing was touched")
 
 
+@pytest.mark.slow
 def test_an_error_leaves_a_file_that_a_command_plays_again(
     tmp_path, monkeypatch, cathsim, caplog
 ):
