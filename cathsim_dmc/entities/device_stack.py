@@ -67,19 +67,9 @@ class DeviceStack(Chain):
         Raises:
             ValueError: if a device does not fit into the next one, or is steerable.
         """
-        if isinstance(devices, str) or not devices:
-            wanted = "names of devices from the innermost outwards, at least one"
-            bounds.refuse("devices", devices, wanted)
         bounds.number("lead", lead, 0.0, unit="m")
         bounds.number("lumen_friction", lumen_friction, 0.0, MOST_FRICTION)
-        self.devices = tuple(library.get(device) for device in devices)
-        for device in self.devices:
-            if device.steerable:
-                raise ValueError(
-                    f"device {device.name!r} has motors in its tip, but coaxial "
-                    "devices must be passive; give a passive one, or the option "
-                    "`device` for a single steerable device"
-                )
+        self.devices = _passive(devices)
         division = library.discretised(discretisation)
         self.friction, self.lumen_friction = friction, lumen_friction
         self.stack = Stack(self.devices, division.link_lengths(*self.devices))
@@ -116,6 +106,22 @@ class DeviceStack(Chain):
             for motion in ("insertion", "rotation")
         )
         self.translations = tuple(range(0, len(self.action_names), 2))
+
+
+def _passive(given: Sequence[str | Device]) -> tuple[Device, ...]:
+    """Devices as given or by name; ValueError if one is steerable, or for none."""
+    if isinstance(given, str) or not given:
+        wanted = "names of devices from the innermost outwards, at least one"
+        bounds.refuse("devices", given, wanted)
+    devices = tuple(library.get(device) for device in given)
+    for device in devices:
+        if device.steerable:
+            raise ValueError(
+                f"device {device.name!r} has motors in its tip, but coaxial devices "
+                "must be passive; give a passive one, or the option `device` for a "
+                "single steerable device"
+            )
+    return devices
 
 
 def _density(devices: Sequence[Device]) -> float:

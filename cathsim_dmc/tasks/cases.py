@@ -20,7 +20,7 @@ from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.chain_fields import write_still
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.objectives import Objective, Shiftable
+from cathsim_dmc.tasks.objectives import Groups, Objective, Shiftable
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.start import StartPosture
 
@@ -84,7 +84,7 @@ class Case:
 
 def objectives_of(
     cases: Sequence[Case], drawn: np.ndarray, shift: np.ndarray | None = None
-) -> tuple[list[tuple[Objective, np.ndarray | slice]], np.ndarray]:
+) -> tuple[Groups, np.ndarray]:
     """Returns the objectives of N simulations, and their goals.
 
     Args:
@@ -119,10 +119,8 @@ def _check_objective(objective: Objective) -> None:
             f"the objective {name} lacks {', '.join(lacking)}; an objective has "
             f"{', '.join(parts)}, see tasks.objectives.Objective"
         )
-    if np.shape(goal := objective.goal) == (3,):
-        bounds.array(f"the goal of {name}", goal, shape=(3,))
-    else:
-        bounds.array(f"the goal of {name}", goal, shape=(-1, 3))
+    shape = (3,) if np.shape(objective.goal) == (3,) else (-1, 3)
+    bounds.array(f"the goal of {name}", objective.goal, shape=shape)
 
 
 def compile_together(

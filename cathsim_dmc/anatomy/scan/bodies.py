@@ -37,12 +37,14 @@ def found(vertices: np.ndarray, faces: np.ndarray) -> Bodies:
     bodies together, of which neither is in the other: no device passes such a point.
     """
     whole = _bodies(vertices, faces, topology.parts(faces))
+    if len(whole.large) != 1:
+        return whole
     label = topology.parts(faces, by_edges=True)
-    if len(whole.large) == 1 and label.max() > whole.label.max():
-        apart = _bodies(vertices, faces, label)
-        if len(apart.large) > 1 and not _nested(vertices, faces, apart):
-            return apart
-    return whole
+    if label.max() == whole.label.max():
+        return whole
+    apart = _bodies(vertices, faces, label)
+    joined = len(apart.large) < 2 or _nested(vertices, faces, apart)
+    return whole if joined else apart
 
 
 def _bodies(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray) -> Bodies:

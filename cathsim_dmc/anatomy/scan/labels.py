@@ -89,26 +89,8 @@ def label_surface(
     unit = units or said or "mm"
     factor = UNITS[unit] / UNITS[said or "mm"]
     matrix, origin = factor * matrix, factor * origin
-    if voxels.ndim != 3:
-        raise ValueError(
-            f"{path} has the shape {voxels.shape}; give one label map in three "
-            "dimensions (3D Slicer: export the segmentation as a label map)."
-        )
-    values, counts = np.unique(voxels, return_counts=True)
-    if grey := _grey(voxels, values):
-        raise ValueError(
-            f"{path} holds {grey}, so it is an image; segment its lumen first (3D "
-            "Slicer, TotalSegmentator) and give the label map."
-        )
-    place = np.column_stack([matrix, origin])
-    if not (np.isfinite(place).all() and np.linalg.cond(matrix) < _MOST_UNEVEN):
-        raise ValueError(
-            f"{path} gives its voxels no place in space: the edges of one are "
-            f"{_rows(1e3 * matrix.T)} mm, the first is at {_rows(1e3 * origin[None])} "
-            "mm. Mend spacing, directions and origin in its header (3D Slicer: "
-            "Volumes), or export it again."
-        )
-    seen = {int(k): int(n) for k, n in zip(values, counts, strict=True) if k != 0}
+    seen = _counted(path, voxels)
+    _require_place(path, matrix, origin)
     chosen = [int(k) for k in labels] or list(seen)
     missing = [k for k in chosen if k not in seen]
     if missing or (not labels and len(seen) != 1):
@@ -140,6 +122,34 @@ def label_surface(
     taken += f"; {_source(units, said)}" + ("" if frame else "; frame is the file's")
     notes = (taken, frame) if frame else (taken,)
     return Labelled(vertices, faces.astype(np.int64), notes, unit)
+
+
+def _counted(path: Path, voxels: np.ndarray) -> dict[int, int]:
+    """Number of voxels of each label but 0; ValueError if it is no label map."""
+    if voxels.ndim != 3:
+        raise ValueError(
+            f"{path} has the shape {voxels.shape}; give one label map in three "
+            "dimensions (3D Slicer: export the segmentation as a label map)."
+        )
+    values, counts = np.unique(voxels, return_counts=True)
+    if grey := _grey(voxels, values):
+        raise ValueError(
+            f"{path} holds {grey}, so it is an image; segment its lumen first (3D "
+            "Slicer, TotalSegmentator) and give the label map."
+        )
+    return {int(k): int(n) for k, n in zip(values, counts, strict=True) if k != 0}
+
+
+def _require_place(path: Path, matrix: np.ndarray, origin: np.ndarray) -> None:
+    """ValueError unless voxels have edges (3, 3), in columns, and an origin (3,), m."""
+    place = np.column_stack([matrix, origin])
+    if not (np.isfinite(place).all() and np.linalg.cond(matrix) < _MOST_UNEVEN):
+        raise ValueError(
+            f"{path} gives its voxels no place in space: the edges of one are "
+            f"{_rows(1e3 * matrix.T)} mm, the first is at {_rows(1e3 * origin[None])} "
+            "mm. Mend spacing, directions and origin in its header (3D Slicer: "
+            "Volumes), or export it again."
+        )
 
 
 def _source(given: str | None, said: str | None) -> str:
