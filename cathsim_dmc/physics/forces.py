@@ -11,10 +11,7 @@ import numpy as np
 CONTACT_SIZE = 1 + 3 + 1 + 3 + 3 + 3
 
 # Note shown with every peak force.
-PEAK_NOTE = (
-    "Peaks depend on the physics step: at 4 ms they read 0.4 to 0.7 times those at "
-    "0.5 ms."
-)
+PEAK_NOTE = "Peaks depend on the physics step: compare them at equal steps only."
 
 # A control step is too coarse if one of its physics steps begins with a contact harder,
 # N, or deeper, m, than this, or if it ends deeper: a device has snapped across the

@@ -35,6 +35,13 @@ CURLS = ((0.0, 0.0), (0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3), (0.2, 0.2
 PUSH = 6.0  # s
 JUDGED_BOUND = 5.0  # % of the mean of the judged force
 FINE = 0.001  # s
+# Largest forces of a physics step under full pushes: one task for each kind of device
+# and arch.
+PEAK_TASKS = ("type1_lcca", "type2_lcca", "type1_lcca_pair", "femoral_type1_lcca_pair")
+PEAK_TASKS += ("type2_lcca_pair",)
+# Rotations of the two devices of a pair.
+TURNS = ((1.0, 0.5), (0.6, 0.3), (0.2, 0.1), (-0.2, -0.1), (-0.6, -0.3), (-1.0, -0.5))
+FINEST = 0.0005  # s
 CURL_TIME = 2.0  # s
 FIGURES = ("path_mean_mm", "path_max_mm", "track_max_mm", "force_mean")
 
@@ -45,7 +52,9 @@ class Script:
 
     name: str  # its course in the type-I arch
     speed: float  # of the base, share of its full speed
-    curl: tuple[float, float]  # commands of tip motors about x and y, after `CURL_TIME`
+    # After `CURL_TIME`: commands of tip motors about x and y, or those of the rotations
+    # of passive devices.
+    curl: tuple[float, float]
     duration: float  # s
 
     def action(self, step: int, task: Any) -> np.ndarray:
@@ -53,8 +62,12 @@ class Script:
         catheter, action = task.scene.catheter, np.zeros(task.num_actions)
         ramp = min(1.0, (step + 1) * CONTROL_TIMESTEP / CURL_TIME)
         motors = len(catheter.tip_motors)
-        action[0:motors:2], action[1:motors:2] = ramp * np.array(self.curl)[:, None]
-        action[list(catheter.translations)] = self.speed
+        curl, ways = ramp * np.array(self.curl), np.array(catheter.translations)
+        if motors:
+            action[0:motors:2], action[1:motors:2] = curl[:, None]
+        else:
+            action[ways + 1] = curl[: len(ways)]
+        action[ways] = self.speed
         return action
 
 
@@ -150,25 +163,56 @@ def checks(results: Sequence[dict[str, Any]]) -> Iterator[Check]:
             yield Check.deviation(what, 1e3 * force, expected, FORCE_BOUND, "mN")
 
 
-def judged(task: str, timestep: float) -> tuple[float, float]:
-    """Judged force of pushes in a task: mean over a control step of the force sum, N.
+def pushed(task: str, timestep: float, speed: float) -> tuple[np.ndarray, np.ndarray]:
+    """Sums of the wall force in pushes with `CURLS`, or `TURNS` of a pair, in a task.
 
     Args:
         task: Name of the task.
         timestep: Physics step, s.
+        speed: Of the base, share of its full speed.
+
+    Returns:
+        Mean over each control step, the judged force, and largest value of its physics
+        steps, (steps, pushes), N.
+    """
+    made = suite.make_task(task, physics_timestep=timestep, observation="tracking")
+    batch = BatchSimulation(made, len(CURLS), num_threads=1, seeds=[0] * len(CURLS))
+    batch.reset()
+    ways = CURLS if made.scene.catheter.tip_motors else TURNS
+    scripts, found = [Script("", speed, way, PUSH) for way in ways], []
+    for step in range(round(PUSH / CONTROL_TIMESTEP)):
+        action = np.stack([script.action(step, made) for script in scripts])
+        force = batch.step(action).wall_force
+        found.append([force.mean_sum, force.peak_sum])
+    mean, peak = np.moveaxis(np.array(found), 1, 0)
+    return mean, peak
+
+
+def judged(task: str, timestep: float) -> tuple[float, float]:
+    """Judged force of pushes at half speed in a task.
 
     Returns:
         Its mean over all control steps and pushes, and the mean over the pushes of its
         largest value, N.
     """
-    made = suite.make_task(task, physics_timestep=timestep, observation="tracking")
-    batch = BatchSimulation(made, len(CURLS), num_threads=1, seeds=[0] * len(CURLS))
-    batch.reset()
-    scripts, found = [Script("", 0.5, curl, PUSH) for curl in CURLS], []
-    for step in range(round(PUSH / CONTROL_TIMESTEP)):
-        action = np.stack([script.action(step, made) for script in scripts])
-        found.append(batch.step(action).wall_force.mean_sum)
-    return float(np.mean(found)), float(np.max(found, axis=0).mean())
+    mean, _ = pushed(task, timestep, 0.5)
+    return float(mean.mean()), float(mean.max(axis=0).mean())
+
+
+def peaks() -> dict[str, dict[str, float]]:
+    """Largest force of full pushes at the default physics step over that at `FINEST`.
+
+    By task: lowest and highest ratio of its pushes.
+    """
+    found = {}
+    for task in PEAK_TASKS:
+        usual, fine = (
+            pushed(task, one, 1.0)[1].max(axis=0)
+            for one in (config.PHYSICS_TIMESTEP, FINEST)
+        )
+        ratio = usual / fine
+        found[task] = {"lowest": float(ratio.min()), "highest": float(ratio.max())}
+    return found
 
 
 def judged_checks() -> Iterator[Check]:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cathsim_dmc.anatomy.field import EDGE
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.contact import FRICTION
@@ -24,6 +25,10 @@ _DROP = 1e-3  # m, from the base to the plate: unloaded links do not touch it
 _SETTLED = 2.0  # s
 _SLID = 0.02  # m, travel after which the whole device slides
 _WATCHED = 0.02  # m, travel that is evaluated
+# Findings: clearances of a device in a round lumen, m; load, N; speed, m/s; number of
+# places of the lumen in the lattice of its field.
+NARROW = (3e-3, 1.5e-3, 1e-3, 0.67e-3, 0.37e-3)
+_NARROW_LOAD, _NARROW_SPEED, _PLACES = 0.2, 0.01, 6
 
 CAPSTAN_BOUND = 3.0  # % of the coefficient of friction
 CAPSTAN_RIPPLE = 3.0  # % of the mean pull, its standard deviation in 5 mm of travel
@@ -52,10 +57,31 @@ _PULL = 0.1  # m, travel of the base
 _PART = 5e-3  # m, travel over which the ripple is taken
 
 
-def _on_plate(device: Any, load: float) -> tuple[Rig, np.ndarray]:
-    """A straight device at rest on a plate under a load (N); loads (nbody,), N."""
+class Lumen(NamedTuple):
+    """A round lumen around a straight device."""
+
+    clearance: float  # of the centred device, m
+    place: tuple[float, float] = (0.0, 0.0)  # in the lattice of its field, m
+
+
+def _on_wall(device: Any, load: float, lumen: Lumen | None) -> tuple[Rig, np.ndarray]:
+    """A straight device at rest under a load (N) in a lumen, or on a plate if None.
+
+    Returns:
+        Rig, and loads (nbody,), N.
+    """
     rig = Rig(device, straight=True)
-    rig.add_plate(rig.device.outer_radius + _DROP)
+    if lumen is None:
+        rig.add_plate(rig.device.outer_radius + _DROP)
+    else:
+        radius = rig.device.outer_radius + lumen.clearance
+
+        def depth(blocks: np.ndarray, points: np.ndarray) -> np.ndarray:
+            x, y, _ = np.moveaxis(blocks[:, None, :] + points, -1, 0)
+            return radius - np.hypot(x, y)
+
+        low, high = np.array([-radius, -radius, -0.5]), (radius, radius, 0.5)
+        rig.add_wall(depth, low - (*lumen.place, 0.0), high)
     rig.compile()
     rig.data.joint(f"{rig.name}/insertion").qpos = 0.09
     hold(rig.model, rig.data)
@@ -68,14 +94,18 @@ def _on_plate(device: Any, load: float) -> tuple[Rig, np.ndarray]:
     return rig, loads
 
 
-def slid(device: Any, load: float, speed: float) -> tuple[float, float]:
-    """Pulls a device (see `Rig`) over a plate under a load, N, with a speed, m/s.
+def slid(
+    device: Any, load: float, speed: float, lumen: Lumen | None = None
+) -> tuple[float, float]:
+    """Pulls a device (see `Rig`) over a wall under a load, N, with a speed, m/s.
+
+    The wall is a plate if there is no lumen.
 
     Returns:
         Acting coefficient of friction, pull over load; standard deviation of the pull
         over its mean.
     """
-    rig, _ = _on_plate(device, load)
+    rig, _ = _on_wall(device, load, lumen)
     rig.data.actuator(f"{rig.name}/insertion").ctrl[0] = -speed / MAX_PUSH_SPEED
     rig.run(_SLID / speed)
     pull = []
@@ -88,12 +118,40 @@ def slid(device: Any, load: float, speed: float) -> tuple[float, float]:
 
 def creep(device: Any) -> float:
     """Creep speed (m/s) of a sticking device under a lateral pull of half the limit."""
-    rig, loads = _on_plate(device, CREEP_LOAD)
+    rig, loads = _on_wall(device, CREEP_LOAD, None)
     rig.data.xfrc_applied[:, 0] = 0.5 * FRICTION * loads
     rig.run(0.5 * _SETTLED)
     before = rig.head_position
     rig.run(_SETTLED)
     return float(np.linalg.norm(rig.head_position - before)) / _SETTLED
+
+
+def narrow_lumens() -> dict[str, dict[str, float]]:
+    """Excess (%) of the friction that acts in round lumens, by clearance.
+
+    The normals of the planes of a contact are tilted, so the magnitudes of their forces
+    sum to more than the load; the sum of the wall force has the same excess. It depends
+    on the place of the lumen in the lattice of its field.
+
+    Returns:
+        Lowest and highest excess of `_PLACES` places.
+    """
+    random, found = np.random.RandomState(0), {}
+    for clearance in NARROW:
+        lumens = [
+            Lumen(clearance, tuple(place))
+            for place in random.uniform(0.0, EDGE, (_PLACES, 2))
+        ]
+        acting = [
+            slid("steerable_5f", _NARROW_LOAD, _NARROW_SPEED, lumen)[0]
+            for lumen in lumens
+        ]
+        excess = 100 * (np.array(acting) / FRICTION - 1)
+        found[f"{1e3 * clearance:g} mm"] = {
+            "lowest": float(excess.min()),
+            "highest": float(excess.max()),
+        }
+    return found
 
 
 class Capstan(NamedTuple):

@@ -17,6 +17,7 @@ from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.forces import Contacts
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import STRICT, Rig
 
@@ -25,7 +26,7 @@ STOPPED_BOUND = 5.0  # % of the push force
 WALL_BOUND = 5.0  # % of the sum of the forces on the wall
 CREEP_BOUND = 5.0  # % of the push force, in `_HELD`
 BEND, ANGLE, TUBE = 0.04, np.pi / 3, 3e-3  # m, rad, m
-# Longer links have a wrong push force in a bend without friction (docs/limits.md).
+# Longer links have a wrong push force in a bend without friction.
 LINK = 5e-3  # m
 # m: distance of the head before the bend; travel of the base, after which the head is
 # in the second arc; length of rod behind the bend.
@@ -37,6 +38,11 @@ _READ = 0.4
 _PIECE = 1e-3  # m, length of a piece of the reference
 # Stiffness of the wall of the reference, N/m for each piece, raised in steps.
 _WALLS = (0.5, 5.0, 50.0, 500.0)
+# Findings: travels of the base, m, without friction; speeds beside the first of
+# `SPEEDS`, m/s; time of rest, s.
+_TRAVELS = np.linspace(0.036, _PUSH, 11)
+_BESIDE = (0.0098, 0.0099, 0.0101, 0.0102)
+_LONG = 8.0
 
 
 class _Line:
@@ -84,6 +90,8 @@ def stopped(
     friction: float,
     later: float = 0.0,
     tolerance: float = SOLVER_TOLERANCE,
+    link: float = LINK,
+    travel: float = _PUSH,
 ) -> Stopped:
     """Pushes a device into an S-bend, stops it, and waits.
 
@@ -92,16 +100,18 @@ def stopped(
         friction: Coulomb coefficient.
         later: Time from rest to the last reading, s.
         tolerance: Tolerance of the solver.
+        link: Length of the links, m.
+        travel: Travel of the base before the stop, m.
     """
     uniform = dataclasses.replace(
         devices.STEERABLE_5F,
         tip=devices.STEERABLE_5F.shaft,
-        tip_links=round(devices.STEERABLE_5F.tip_length / LINK),
+        tip_links=round(devices.STEERABLE_5F.tip_length / link),
         steering_angle=0.0,
     )
-    length = _BEHIND + _PUSH + uniform.tip_length
-    fine = devices.Discretisation(length, LINK)
-    rig = Rig(uniform, fine, stroke=_PUSH + 0.01, friction=friction)
+    length = _BEHIND + travel + uniform.tip_length
+    fine = devices.Discretisation(length, link)
+    rig = Rig(uniform, fine, stroke=travel + 0.01, friction=friction)
     rig.arena.mjcf_model.option.tolerance = tolerance
     line = _Line(_BEFORE)
 
@@ -127,7 +137,7 @@ def stopped(
         last = 1 if command else round(_READ / CONTROL_TIMESTEP)
         return float(np.mean(found[-last:]))
 
-    moving = push(speed / MAX_PUSH_SPEED, _PUSH / speed)
+    moving = push(speed / MAX_PUSH_SPEED, travel / speed)
     rest = push(0.0, _RESTING)
     contacts = Contacts.from_sensor(rig.sensor("wall_contacts"))
     expected, expected_wall = _reference(rig, line, friction)
@@ -204,3 +214,35 @@ def checks() -> Iterator[Check]:
             name = f"S-bend: change of the push by creep in {_HELD:g} s"
             note = f"{1e3 * one.stopped:.2f} mN, then {1e3 * one.held:.2f} mN"
             yield Check.deviation(name, one.held, one.stopped, CREEP_BOUND, "N", note)
+
+
+def _off(one: Stopped) -> float:
+    """Deviation (%) of the push force at rest from that of the reference."""
+    return 100 * (one.stopped / one.expected - 1)
+
+
+def findings() -> dict[str, dict[str, float]]:
+    """Push forces of long links, of stops at neighbouring speeds and of long rests.
+
+    Deviations in %, without friction the largest of several travels; forces in mN.
+    """
+    free = {
+        f"links of {1e3 * link:g} mm": max(
+            abs(_off(stopped(SPEEDS[-1], 0.0, link=link, travel=float(travel))))
+            for travel in _TRAVELS
+        )
+        for link in (LINK, NavigationConfig().shaft_link)
+    }
+    beside = {
+        f"{1e3 * speed:g} mm/s": _off(stopped(speed, FRICTIONS[0])) for speed in _BESIDE
+    }
+    held = stopped(SPEEDS[-1], FRICTIONS[-1], _LONG)
+    name = "push in an S-bend"
+    return {
+        f"{name} without friction, largest deviation, %": free,
+        f"{name} after a stop, friction {FRICTIONS[0]:g}, deviation, %": beside,
+        f"{name} at rest, friction {FRICTIONS[-1]:g}, mN": {
+            "at once": 1e3 * held.stopped,
+            f"after {_LONG:g} s": 1e3 * held.held,
+        },
+    }

@@ -147,4 +147,11 @@ def validate_wall() -> Report:
         convergence.judged_checks(),
     )
     data = {"anatomies": anatomies, "capstans": pulled, "studies": studies}
-    return Report("wall", list(checks), {"convergence": studies}, data)
+    step = f"{1e3 * convergence.FINEST:g} ms"
+    findings = {
+        "convergence": studies,
+        f"largest force of full pushes, over that at {step}": convergence.peaks(),
+        "friction in round lumens, excess by clearance, %": friction.narrow_lumens(),
+        **s_bend.findings(),
+    }
+    return Report("wall", list(checks), findings, data)
