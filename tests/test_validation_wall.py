@@ -75,6 +75,21 @@ def test_sliding_does_not_lift_a_device_off_the_wall():
     assert ripple < 0.05
 
 
+@pytest.mark.parametrize(("clearance", "least", "most"), [(3, -1, 1), (0.37, 8, 25)])
+def test_friction_in_a_round_lumen_is_too_large_only_where_it_is_narrow(
+    clearance, least, most
+):
+    lumen = friction.Lumen(1e-3 * clearance, (1e-3, 2e-3))
+    acting, _ = friction.slid("steerable_5f", 0.2, 0.04, lumen)
+    assert least < 100 * (acting / contact.FRICTION - 1) < most
+
+
+@pytest.mark.parametrize("link", [5e-3, 17.5e-3])
+def test_links_push_through_an_s_bend_without_friction_like_the_elastica(link):
+    one = s_bend.stopped(0.04, 0.0, link=link, travel=0.044)
+    assert one.stopped == pytest.approx(one.expected, rel=0.08)
+
+
 @pytest.mark.slow
 def test_a_device_that_stops_in_an_s_bend_keeps_its_push():
     """It kept 14 to 60 % of it, with friction of the wrong sign."""
