@@ -13,7 +13,7 @@ const AWAY = new THREE.Vector3(0, -0.08, -0.42); // of the arch from the eyes, m
 // second, and each image costs it several milliseconds.
 const SCREEN = { width: 0.2, place: [0.2, 0, 0.02], turn: -0.45, period: 75 };
 const PANEL = { width: 0.155, place: [-0.18, 0, 0.02], turn: 0.45, period: 200 };
-const PEAK_NOTE = "* At 4 ms, peaks read 0.4 to 0.7 times those at 0.5 ms.";
+const PEAK_NOTE = "* Peaks depend on the physics step.";
 const PANEL_PIXELS = [600, 800];
 const SMALLEST = 0.25; // scale of the arch
 const LARGEST = 10;
