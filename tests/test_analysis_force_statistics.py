@@ -15,6 +15,7 @@ from cathsim_dmc.analysis.force_statistics import (
     EpisodeForces,
     ForceTracker,
     Statistics,
+    millinewtons,
     recorded_forces,
 )
 from cathsim_dmc.entities.devices import DEVICES
@@ -99,6 +100,12 @@ def test_episodes_that_end_at_different_steps_keep_apart(seed, steps, count):
                 else:
                     assert touching is None
             begun[simulation] = step + 1
+
+
+def test_forces_are_told_in_three_digits():
+    given = (None,), (0.0,), (9.876e-3,), (0.09876,), (0.9876,), (5e-3, 0.1234)
+    told = ["–", "0.00", "9.88", "98.8", "988", "5 ± 123"]
+    assert [millinewtons(*one) for one in given] == told
 
 
 def test_every_name_in_the_page_of_forces_exists():

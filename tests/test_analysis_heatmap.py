@@ -42,9 +42,11 @@ def test_the_picture_shows_contacts_where_they_are(tmp_path):
     tube, path = make_tube(), tmp_path / "map.png"
     assert heatmap(np.zeros((0, 3)), np.zeros(0), tube, path).count.sum() == 0
     pictures = []
-    for place in ([0.01, 0.0, 0.02], [-0.01, 0.0, 0.01]):
+    # The second in the wall, half a millimetre beyond the lumen.
+    for place in ([0.01, 0.0, 0.02], [-0.0205, 0.0, 0.01]):
         field = heatmap(np.array([place] * 6), np.full(6, 0.4), tube, path)
-        assert np.nanmax(field.mean) == pytest.approx(0.4)
+        assert np.nanmax(field.mean) == pytest.approx(0.4) and not field.outside
+        np.testing.assert_allclose(np.diff(field.x_edges), 2e-3)
         pictures.append(imread(path)[..., :3].sum(axis=-1))
     darker = pictures[0] - pictures[1]
     one, other = np.argwhere(darker < -0.3), np.argwhere(darker > 0.3)
@@ -57,13 +59,16 @@ def test_the_picture_shows_contacts_where_they_are(tmp_path):
         heatmap(np.zeros((1, 3)), np.ones(1), tube, tmp_path / "map.pdf")
 
 
-def test_sides_of_a_patient_that_are_not_known_are_not_named(tmp_path, monkeypatch):
+def test_the_scale_is_in_mn_and_unknown_sides_of_a_patient_are_not_named(
+    tmp_path, monkeypatch
+):
     drawn = []
     monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: drawn.append(self))
     for upright in (True, False):
-        place, force = np.zeros((1, 3)), np.ones(1)
+        place, force = np.zeros((1, 3)), np.full(1, 0.5)
         with contextlib.suppress(RuntimeError):  # nothing is written
             heatmap(place, force, make_tube(), tmp_path / "map.png", upright=upright)
-        axes = drawn[-1].axes[0]
+        axes, bar = drawn[-1].axes
+        assert bar.get_ylim() == (0.0, 500.0) and "mN" in bar.get_ylabel()
         assert ("left" in axes.get_xlabel()) == upright
         assert ("head" in axes.get_ylabel()) == upright

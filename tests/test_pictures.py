@@ -526,8 +526,8 @@ def test_the_scale_of_forces_holds_them_all_and_their_text_has_three_digits():
     assert scales == [0.02, 0.05, 0.1, 0.4]
     lightness = force_colours(np.linspace(0, 0.5, 30), 0.4) @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(lightness[:25]) < 0).all() and np.ptp(lightness[25:]) == 0
-    texts = [force_text(each) for each in (0.0, 0.01234, 0.9, 1.1749)]
-    assert texts == ["0 mN", "12.3 mN", "900 mN", "1.17 N"]
+    texts = [force_text(each) for each in (0.0, 0.01234, 0.9994, 0.9996, 1.1749)]
+    assert texts == ["0 mN", "12.3 mN", "999 mN", "1 N", "1.17 N"]
 
 
 def test_tasks_and_anatomies_say_what_they_are(pushed):
@@ -603,6 +603,7 @@ def test_a_record_keeps_the_options_of_its_task():
     env = suite.load("cathsim", "simple1_bca", task_kwargs=options)
     episode = cathsim_dmc.record(env, "push", seed=1)
     assert episode.meta["task_kwargs"] == {"friction": 0.1, "max_steps": 2}
+    assert (episode.steps, episode.termination) == (2, "truncated")
 
 
 def test_policies_batches_and_episodes_are_shown_by_what_they_are(pushed):

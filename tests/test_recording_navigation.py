@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from conftest import twin
 from recording_samples import same
+from scipy.spatial.transform import Rotation
 from test_own_objective import advancing
+from test_recording_rerun_log import Recording
 
 from cathsim_dmc import suite
 from cathsim_dmc.analysis.force_statistics import recorded_forces
@@ -17,6 +19,9 @@ from cathsim_dmc.recording.rerun_log import write_rrd
 from cathsim_dmc.recording.rerun_scene import body_geoms
 
 STEPS = 40
+# Rerun's shapes by the types of MuJoCo's geoms, and their entities.
+KINDS = {3: "Capsules3D", 5: "Cylinders3D", 6: "Boxes3D"}
+SHAPES = {"Capsules3D": "capsule", "Cylinders3D": "cylinder", "Boxes3D": "box"}
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +54,8 @@ def test_contacts_make_up_the_forces_of_the_task(env, episode):
     assert (peaks >= episode.wall_force_max - 1e-12).all()
     means = np.array(episode.meta["wall_force_mean_max"])
     assert (means <= peaks + 1e-12).all() and 0 < means.max() < peaks.max()
+    forces = recorded_forces(episode)
+    assert (forces.peak_force, forces.max_force) == (peaks.max(), means.max())
     assert episode.push_force[-1] == env.task.readings.push_force
 
 
@@ -85,7 +92,7 @@ def test_the_record_follows_the_simulation(env, episode):
     assert meta["versions"]["mujoco"] == mujoco.__version__
     radius = env.task.scene.catheter.device.outer_radius
     np.testing.assert_allclose(meta["catheter_radius"], radius)
-    assert meta["goal_radius"] == 8e-3
+    assert meta["goal_radius"] == 8e-3 and meta["control_timestep"] == 0.04
     np.testing.assert_array_equal(meta["goal_position"], env.task.goal_position)
     assert set(meta["reward_terms"]) == set(env.task.objective.weights)
     link = meta["body_names"].index("catheter/link_2")
@@ -142,16 +149,55 @@ def test_wrong_actions_are_refused(env):
         recorder.record_episode(bend_and_push, max_steps=0)
 
 
-def test_the_episode_is_drawn_with_its_robot(env, episode, tmp_path):
-    geoms = tuple(body_geoms(env.physics))
-    assert {g.body_name.split("/")[0] for g in geoms} == {"robot", "sheath"}
-    # The tube that is seen, not the thick sides of the bore that the device touches.
-    assert {g.kind for g in geoms if g.body_name.startswith("sheath")} == {"cylinder"}
-    loaded = Episode.load(episode.save(tmp_path / "e.npz"))
-    path = write_rrd(
-        loaded, env.task.scene.anatomy.surface, tmp_path / "e.rrd", robot_geoms=geoms
-    )
-    assert path.stat().st_size < 5e6
-    forces = recorded_forces(loaded)
-    assert 0 < forces.max.mean <= forces.max.maximum <= forces.peak_max.maximum
-    assert forces.sum.mean < forces.sum.mean_in_contact
+def test_the_robot_in_the_file_stands_where_the_simulator_has_it(env, tmp_path):
+    recorded = EpisodeRecorder(env).record_episode(bend_and_push, seed=2, max_steps=3)
+    recorded = Episode.load(recorded.save(tmp_path / "e.npz"))
+    geoms, path = tuple(body_geoms(env.physics)), tmp_path / "e.rrd"
+    surface = env.task.scene.anatomy.surface
+    file = Recording(write_rrd(recorded, surface, path, robot_geoms=geoms))
+    model, data = env.physics.model.ptr, env.physics.data.ptr
+    drawn = {}
+    for geom in np.flatnonzero(model.geom_group < 3):  # as in MuJoCo's viewers
+        name = model.body(model.geom_bodyid[geom]).name
+        if name.startswith(("robot/", "sheath/")):
+            kind = KINDS[model.geom_type[geom]]
+            drawn.setdefault((name, kind), []).append(geom)
+    assert sum(map(len, drawn.values())) == len(geoms) > 80
+    assert {kind for name, kind in drawn if name.startswith("sheath")} == {
+        "Cylinders3D"
+    }
+    moving = set()
+    for (name, kind), own in drawn.items():
+        rows = file.static | file.temporal
+        pose, shape = rows[f"/world/{name}"], rows[f"/world/{name}/{SHAPES[kind]}"]
+        moving |= {name} & {each.removeprefix("/world/") for each in file.temporal}
+        place, turn = (
+            pose[f"Transform3D:{part}"][-1].as_py()[0]
+            for part in ("translation", "quaternion")
+        )
+        shape = {
+            part.partition(":")[2]: np.array(values[-1].as_py())
+            for part, values in shape.items()
+            if part.startswith(kind)
+        }
+        turn, turned = (Rotation.from_quat(q) for q in (turn, shape["quaternions"]))
+        size, middle = shape.get("half_sizes"), shape.get("centers")
+        if size is None:
+            size = np.column_stack([shape["radii"], shape["lengths"] / 2])
+        if middle is None:  # Rerun starts a capsule at its lower end
+            upwards = turned.as_matrix()[..., 2]
+            middle = shape["translations"] + size[:, 1:] * upwards
+        found = turn.apply(middle) + place
+        np.testing.assert_allclose(found, data.geom_xpos[own], atol=1e-6)
+        found = (turn * turned).as_matrix().reshape(-1, 9)
+        np.testing.assert_allclose(found, data.geom_xmat[own], atol=1e-6)
+        wanted = model.geom_size[own][:, : size.shape[1]]
+        np.testing.assert_allclose(size, wanted, rtol=1e-6)
+        material = model.geom_matid[own]
+        rgba = np.where(material[:, None] < 0, model.geom_rgba[own],
+                        model.mat_rgba[material])  # fmt: skip
+        rgba[:, 3] *= 0.3 if name.startswith("sheath") else 1.0
+        found = shape["colors"].astype(">u4").view(np.uint8).reshape(-1, 4)
+        np.testing.assert_array_equal(found, np.round(255 * rgba))
+    assert {"robot/catheter_platform", "robot/catheter_ring"} & moving
+    assert "robot/rail" not in moving  # what stands still is written once

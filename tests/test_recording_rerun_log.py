@@ -43,6 +43,7 @@ def make_recorded():
     place, turn = episode.body_pos.copy(), episode.body_quat.copy()
     place[:, 1], turn[:, 1] = place[0, 1], turn[0, 1]
     values = {"meta": episode.meta | meta, "body_pos": place, "body_quat": turn}
+    values["time"] = np.nextafter(episode.time, 0)  # as the simulator's clock
     return dataclasses.replace(episode, **values)
 
 
@@ -125,7 +126,7 @@ def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
     assert set(recording.temporal) == {*expected, "/events"}
     for entity, rows in expected.items():
         assert recording.values(entity, "step") == rows, entity
-        wanted = [round(episode.time[row] * 1e9) for row in rows]
+        wanted = [40_000_000 * row for row in rows]
         assert recording.nanoseconds(entity) == wanted, entity
 
 
@@ -141,17 +142,22 @@ def test_capsules_span_the_joints_of_the_catheter(written):
     np.testing.assert_allclose(upper, episode.catheter[:, 1:], atol=1e-5)
     head = np.array(recording.values("/world/catheter/head", "Points3D:positions"))
     np.testing.assert_allclose(head[:, 0], episode.head, atol=1e-6)
+    strips = recording.values("/world/catheter/trail", "LineStrips3D:strips")
+    way = np.stack([episode.head[:-1], episode.head[1:]], axis=1)
+    np.testing.assert_allclose(np.array(strips)[:, 0], way, atol=1e-6)
 
 
 def test_arrows_show_the_contacts_of_their_step_only(written):
     episode, _, _, recording = written
     vectors = recording.values("/world/contacts", "Arrows3D:vectors")
     origins = recording.values("/world/contacts", "Arrows3D:origins")
+    heat = recording.values("/world/heat", "Points3D:positions")
     assert [len(v or []) for v in vectors] == [2, 0, 1, 3, 0, 0]
     # An empty row clears the arrows of the step before; a null would keep them.
     assert all(v is not None for v in vectors)
     expected = arrow_scale(episode) * episode.contact_force
-    for rows, wanted in ((vectors, expected), (origins, episode.contact_position)):
+    places = episode.contact_position
+    for rows, wanted in ((vectors, expected), (origins, places), (heat, places)):
         found = np.concatenate([row for row in rows if row])
         np.testing.assert_allclose(found, wanted, atol=1e-6)
 
@@ -229,6 +235,8 @@ def test_blood_goal_and_devices_are_drawn_in_metres(coaxial):
     # An arrow of 20 mm is a metre per second.
     velocity = np.array(vessel["blood_velocity"])
     np.testing.assert_allclose(np.array(blood)[:, 0], 0.02 * velocity, rtol=1e-5)
+    origins = recording.values("/world/blood", "Arrows3D:origins")
+    np.testing.assert_allclose(np.array(origins)[:, 0], episode.head, atol=1e-6)
     way = recording.values("/world/goal", "Transform3D:translation")
     centre, size = (
         np.array(recording.fixed("/world/goal", f"Ellipsoids3D:{name}")[0])
@@ -240,6 +248,14 @@ def test_blood_goal_and_devices_are_drawn_in_metres(coaxial):
     # 15 mm of wire stand out at first, and none when the catheter has passed it.
     np.testing.assert_allclose(radii[0], [0.8e-3, 0.8e-3, 0.8e-3, 0.4e-3], rtol=1e-5)
     np.testing.assert_allclose(radii[-1], 0.8e-3, rtol=1e-5)
+    # Nothing touches the wall at first: the wire is teal, the catheter as it is alone.
+    colours = recording.values("/world/catheter", "Capsules3D:colors")[0]
+    assert [colour >> 8 for colour in colours] == 3 * [0xD7E4FF] + [0x5ADCBE]
+    behind = np.linspace(-0.015, 0.005, STEPS + 1)  # of the wire
+    for name, gap in (("wire", behind), ("catheter", -behind)):
+        places = recording.values(f"/world/catheter/{name}", "Points3D:positions")
+        height = np.array(places)[:, 0, 2]
+        np.testing.assert_allclose(height, 0.04 - gap.clip(0.0), atol=1e-6)
 
 
 def test_events_belong_to_the_states_that_they_lead_to():
@@ -251,6 +267,10 @@ def test_events_belong_to_the_states_that_they_lead_to():
     assert rows["contact with the wall"] == rows["largest force"] == 3
     assert rows["half of the distance to the goal"] == 3
     assert rows["nearest to the goal"] == 5 and rows["end: success"] == STEPS
+    counts = np.zeros(24, int)
+    counts[[0, 10, 21]] = 1  # after 9 steps without contact, and after 10
+    found = rerun_text.events(make_episode(24, counts=counts))
+    assert [row for row, text, _ in found if "contact with" in text] == [1, 22]
 
 
 def test_text_says_what_happens_when(written):
@@ -267,6 +287,15 @@ def test_text_says_what_happens_when(written):
     page = recording.fixed("/info", "TextDocument:text")[0].splitlines()
     assert "| outcome | success |" in page and page[0] == "# type1_bca"
     assert r'| versions | {"a\|b": "1.0"} |' in page
+    away = 1e3 * np.linalg.norm(episode.head - GOAL, axis=1)[[0, -1]]
+    path = 1e3 * np.linalg.norm(np.diff(episode.head, axis=0), axis=1).sum()
+    for name, text in (
+        ("distance to the goal", "{:.1f} to {:.1f} mm".format(*away)),
+        ("last insertion", "100.0 mm"),
+        ("path of the head", f"{path:.1f} mm"),
+        ("simulated time", "0.24 s"),
+    ):
+        assert f"| {name} | {text} |" in page
     assert not any(line.startswith("| distance |") for line in page)
 
 
@@ -315,28 +344,6 @@ def test_the_link_next_to_a_contact_takes_its_colour():
     hot = force_colours(np.array([0.04, 0.01]), 0.05)
     np.testing.assert_array_equal(found[1], [plain[0, 0], hot[0], plain[0, 0], hot[1]])
     np.testing.assert_array_equal(found[[0, 2]], plain[:2])
-
-
-def test_bodies_carry_their_geoms(written):
-    episode, _, _, recording = written
-    moved = "/world/robot/wheel"
-    turns = np.array(recording.values(moved, "Transform3D:quaternion"))[:, 0]
-    xyzw = np.roll(episode.body_quat[:, 2], -1, axis=-1)
-    np.testing.assert_allclose(turns, xyzw, atol=1e-6)
-    places = np.array(recording.values(moved, "Transform3D:translation"))[:, 0]
-    np.testing.assert_allclose(places, episode.body_pos[:, 2], atol=1e-6)
-    # A body that never moves is written once.
-    still = recording.fixed("/world/robot/base", "Transform3D:translation")
-    np.testing.assert_allclose(still[0], episode.body_pos[0, 1], atol=1e-6)
-    capsule = f"{moved}/capsule"
-    lower = recording.fixed(capsule, "Capsules3D:translations")[0]
-    geom = make_geoms()[2]
-    turn = Rotation.from_quat(geom.quaternion, scalar_first=True)
-    centre = np.array(lower) + turn.apply([0, 0, 0.02])
-    np.testing.assert_allclose(centre, geom.position, atol=1e-6)
-    np.testing.assert_allclose(recording.fixed(capsule, "Capsules3D:lengths"), [0.04])
-    half = recording.fixed("/world/robot/base/box", "Boxes3D:half_sizes")
-    np.testing.assert_allclose(half, [[0.01, 0.02, 0.03]])
 
 
 def test_the_scene_is_in_the_patient_frame_with_a_translucent_vessel(written):

@@ -31,11 +31,22 @@ def test_each_row_has_its_turn_once(count):
     assert alone == (count < 512)
 
 
-@pytest.mark.parametrize("count", [40, 4099])
-def test_groups_are_shared_out_when_they_are_many(count):
-    """Each of them is of few."""
-    items = [object() for _ in range(20)]
-    chosen = [items[row % 20] for row in range(count)]
+def test_a_forked_process_has_threads_of_its_own(monkeypatch):
+    """Those of its parent are gone, and to wait for them takes for ever."""
+    used = []
+    for process in (1, 2):
+        monkeypatch.setattr(os, "getpid", lambda process=process: process)
+        names = set()
+        rows.each(2048, lambda _, names=names: names.add(threading.get_ident()))
+        used.append(names)
+    assert not used[0] & used[1]
+
+
+@pytest.mark.parametrize(("count", "kinds"), [(40, 20), (4099, 20), (4099, 1)])
+def test_groups_are_shared_out_when_they_are_many(count, kinds):
+    """Each of them is of few, or one of all."""
+    items = [object() for _ in range(kinds)]
+    chosen = [items[row % kinds] for row in range(count)]
     turns, names = np.zeros(count, int), set()
 
     def act(item, own):
@@ -54,8 +65,9 @@ def test_an_error_in_a_part_is_raised():
         rows.each(2048, lambda part: 1 // (part.start - 512))
 
 
-def test_copies_are_of_the_kind_asked_for():
-    source = np.random.RandomState(0).uniform(size=(2048, 3, 2))[:, ::2]
+@pytest.mark.parametrize("count", [8, 2048])
+def test_copies_are_of_the_kind_asked_for(count):
+    source = np.random.RandomState(0).uniform(size=(2, 3, count)).T[:, ::2]
     found = rows.copied(source, np.float32)
     np.testing.assert_array_equal(found, source.astype(np.float32))
     assert found.dtype == np.float32 and found.flags.c_contiguous

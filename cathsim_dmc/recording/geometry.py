@@ -40,4 +40,5 @@ def along(points: np.ndarray, way: np.ndarray) -> np.ndarray:
 
 def force_text(newtons: float) -> str:
     """Return a force in three digits: millinewtons below 1 N, newtons from there."""
-    return f"{newtons:.3g} N" if newtons >= 1 else f"{1e3 * newtons:.3g} mN"
+    # From 0.9995 N on, three digits of millinewtons would be 1e+03.
+    return f"{newtons:.3g} N" if newtons >= 0.9995 else f"{1e3 * newtons:.3g} mN"
