@@ -1,6 +1,7 @@
 """Device and driver over local sockets: who stops when, and what is refused by name."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import signal
@@ -16,9 +17,11 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import bridge, suite
-from cathsim_dmc.bridge import fit, messages, serving
+from cathsim_dmc.bridge import driver, fit, messages, serving
 from cathsim_dmc.bridge.driver import Driver, connect
 from cathsim_dmc.bridge.records import milliseconds
+from cathsim_dmc.physics.forces import WallForce
+from cathsim_dmc.tasks.navigation import Navigation
 
 PERIOD = 0.02
 WAIT = 20.0  # s, for what must happen, on a busy machine
@@ -155,7 +158,8 @@ def test_a_log_is_never_overwritten(tmp_path):
 
 @pytest.mark.parametrize("side", ["device", "driver"])
 def test_too_much_force_stops_the_device(side):
-    robot = Robot(steps=100, force=lambda count: 2.0 if count == 5 else -0.1)
+    # The limit itself is allowed.
+    robot = Robot(steps=100, force=lambda count: 2.0 if count == 5 else -1.5)
     served = Served(robot, force_limit=1.5 if side == "device" else None, lockstep=True)
     own = bridge.DriveOptions(
         watchdog=WAIT, warm_up=0, force_limit=None if side == "device" else 1.5
@@ -205,11 +209,126 @@ def test_durations_are_told_in_milliseconds():
     found = milliseconds(np.random.RandomState(0).permutation(101) * 1e-3)
     assert found == {"p50": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
     assert milliseconds([]) is None
-    served = Served(Robot())
-    driven = bridge.drive(push, served.address, options=SLOW)
-    served.joined()
-    # Between two states, on a busy machine.
-    assert 0.1 * PERIOD < 1e-3 * driven.period["p50"] < 100 * PERIOD
+
+
+class Scripted:
+    """Link to a device whose states come when they are due, and the clock of both."""
+
+    def __init__(self, end):
+        table = {"action": Robot.action, "observation": Robot.observation}
+        welcome = {"protocol": 1, "name": "x", "period": PERIOD, **table}
+        self.now, self.due = 0.0, [(0.0, {"kind": "welcome", **welcome})]
+        robot = Robot(steps=end)
+        for step in range(end + 1):
+            robot.count = step
+            observation, force, time_, over = robot._state()
+            seen = {k: messages.to_json(v) for k, v in observation.items()}
+            state = {"kind": "state", "step": step, "time": time_, "force": force}
+            self.due.append((time_, {**state, "observation": seen, "end": over}))
+
+    def monotonic(self):
+        return self.now
+
+    def send(self, *_, **__):
+        pass
+
+    def receive(self, until):
+        if not self.due or self.due[0][0] > max(until, self.now) + 1e-9:
+            return None
+        when, message = self.due.pop(0)
+        self.now = max(self.now, when)
+        return message
+
+
+def test_a_driver_tells_its_times_and_what_it_skips(monkeypatch, tmp_path):
+    """States come every 20 ms; the policy takes 10 ms, 30 ms, and once 50 ms."""
+
+    def driven(log, overrun):
+        link, durations = Scripted(6), iter([0.01, 0.03, 0.01, 0.05, 0.01])
+        monkeypatch.setattr(driver, "time", link)
+
+        def choose(observation):
+            link.now += next(durations)
+            return push(observation)
+
+        how = dataclasses.replace(SLOW, overrun=overrun)
+        return Driver(link, log).episode(choose, None, how)
+
+    with bridge.Log(tmp_path / "log") as log:
+        found = driven(log, "latest")
+    assert (found.end, found.steps, found.skipped, found.late) == ("success", 5, 1, 2)
+    # States are received at 0, 20, 50, 60, 110 and 120 ms.
+    assert found.compute == {"p50": 10.0, "p95": 46.0, "p99": 49.2, "max": 50.0}
+    assert found.period == {"p50": 20.0, "p95": 46.0, "p99": 49.2, "max": 50.0}
+    lines = map(json.loads, (tmp_path / "log").read_text().splitlines())
+    told = [line["milliseconds"] for line in lines if line["event"] == "sent"]
+    assert told == [10.0, 30.0, 10.0, 50.0, 10.0]
+    found = driven(None, "stop")
+    assert (found.end, found.steps, found.skipped, found.late) == ("overrun", 2, 0, 1)
+
+
+@pytest.mark.parametrize("overrun", ["latest", "stop"])
+@pytest.mark.parametrize("again", [1, 2])
+def test_a_state_that_came_before_is_out_of_order(overrun, again):
+    """Also if both have come when the first is read."""
+    link, how = Scripted(4), dataclasses.replace(SLOW, overrun=overrun)
+    link.due.insert(4, link.due[again + 1])
+    with pytest.raises(bridge.BridgeError, match=f"state {again} came after state 2"):
+        Driver(link).episode(push, None, how)
+
+
+class Answering(Scripted):
+    """Link to a driver that answers each state late, or not; it wakes 2 ms late."""
+
+    def __init__(self, latencies):
+        self.now, self.due, self.sent = 0.0, [], []
+        self._latencies = iter(latencies)
+
+    def send(self, within, kind, **fields):
+        self.sent.append((round(self.now, 6), kind, fields))
+        late, step = next(self._latencies, None), fields["step"]
+        if late is not None:
+            action = {"kind": "action", "step": step, "action": [0.3 - step, 2.0]}
+            self.due.append((self.now + late, action))
+
+    def receive(self, until):
+        message = super().receive(until)
+        if message is None:
+            self.now = max(self.now, until + 2e-3)
+        return message
+
+
+def test_a_device_keeps_its_clock_and_tells_what_came_in_time(monkeypatch):
+    """Periods of 20 ms; the third answer is missing and the fourth too late.
+
+    Readings take no time, but the second 5 ms and the fifth 70 ms, after which the
+    lost periods are not made up for.
+    """
+    link, robot = Answering([0.005, 0.015, None, 0.03, 0.011]), Robot(steps=7)
+    monkeypatch.setattr(serving, "time", link)
+    read = robot.read
+
+    def slow():
+        link.now += {1: 0.005, 4: 0.07}.get(robot.count, 0.0)
+        return read()
+
+    robot.read = slow
+    options = bridge.ServeOptions(watchdog=1.0)
+    nobody = types.SimpleNamespace(settimeout=lambda _: None)
+    session = serving._Session(robot, link, nobody, options, bridge.Log(None))
+    session._seed, session._turn_away = None, lambda: None
+    found = session.episode()
+    times = [0.0, 0.022, 0.047, 0.062, 0.082, 0.172, 0.174, 0.194]
+    assert [when for when, *_ in link.sent] == times
+    told = [(fields["step"], fields["time"]) for *_, fields in link.sent]
+    assert told == [(step, PERIOD * step) for step in range(8)]
+    assert (found["end"], found["steps"]) == ("success", 7)
+    assert (found["missed"], found["late"]) == (4, 1)
+    assert found["answer"] == {"p50": 11.0, "p95": 14.6, "p99": 14.92, "max": 15.0}
+    assert found["tick"] == dict.fromkeys(("p50", "p95", "p99", "max"), 2.0)
+    held = [[-0.7, 0.0]] * 2, [[-1.0, 0.0]] * 2  # the bend stays, the push does not
+    wanted = [[0.3, 1.0], [-0.7, 1.0], *held[0], [-1.0, 1.0], *held[1]]
+    np.testing.assert_allclose(robot.taken, wanted)
 
 
 def test_a_device_stops_when_its_driver_falls_silent():
@@ -324,24 +443,6 @@ def test_the_end_counts_of_a_device_that_closes_while_the_policy_computes():
     how = bridge.DriveOptions(warm_up=0, watchdog=WAIT)
     assert bridge.drive(choose, address, options=how).end == "success"
     listener.close()
-
-
-def test_a_slow_policy_answers_the_newest_state_or_stops():
-    def slow(observation):
-        time.sleep(4 * PERIOD)
-        return push(observation)
-
-    found = {}
-    for overrun in ("latest", "stop"):
-        served = Served(Robot(steps=20), missed="still")
-        how = bridge.DriveOptions(overrun=overrun, watchdog=WAIT, warm_up=0)
-        found[overrun] = bridge.drive(slow, served.address, options=how)
-        (done,) = served.joined()
-        if overrun == "latest":
-            assert done["missed"] > 5 and done["late"] > 0
-    assert found["latest"].end == "success" and found["latest"].skipped > 5
-    assert found["latest"].late == found["latest"].steps
-    assert found["stop"].end == "overrun" and found["stop"].steps == 1
 
 
 def test_a_driver_that_reads_nothing_is_left():
@@ -708,7 +809,7 @@ def test_another_version_another_program_and_a_stranger_are_refused(monkeypatch)
         with pytest.raises(bridge.BridgeError, match="busy"):
             Driver(connect(served.address))
     first.close()
-    for address in ("localhost", "a:b", ":5", "localhost:0"):
+    for address in ("localhost", "a:b", ":5", "localhost:0", "localhost:65536"):
         with pytest.raises(ValueError, match="host:port"):
             connect(address)
     for _ in range(100):  # until the first one is gone
@@ -827,17 +928,22 @@ def test_the_seeds_of_episodes_that_a_command_drives_count_up(
     assert (tmp_path / "log").read_text().count('"sent"') == 6
 
 
-def test_a_simulated_device_measures_as_a_load_cell_does(shared_environment):
+def test_a_simulated_device_measures_as_a_load_cell_does(
+    shared_environment, monkeypatch
+):
     """The mean over a period, by which the suite judges, not its last moment."""
     env = shared_environment("femoral_type1_lcca", observation="tracking", max_steps=15)
+    force = WallForce(0.9, 0.8, 0.7, 0.6, mean_sum=0.5, mean_max=0.4)
+    monkeypatch.setattr(Navigation, "wall_force", property(lambda _: force))
     device = bridge.SimulatedDevice(env, "femoral_type1_lcca")
-    device.start(0)
+    states = [device.start(0)]
     device.command(np.ones(21))
-    force = [device.read().force for _ in range(10)][-1]
-    measured = env.task.wall_force
-    assert force["largest"] == measured.mean_max != measured.max
-    assert force["sum"] == measured.mean_sum > 0.0
-    assert force["push"] == env.task.readings.push_force != 0.0
+    states += [device.read() for _ in range(3)]
+    given = [state.force for state in states]
+    assert {(one["largest"], one["sum"]) for one in given} == {(0.4, 0.5)}
+    assert given[-1]["push"] == env.task.readings.push_force != 0.0
+    times = [state.time for state in states]
+    np.testing.assert_allclose(times, 0.04 * np.arange(4), atol=1e-9)
 
 
 def test_a_port_that_is_taken_is_refused_before_anything_compiles(cathsim, monkeypatch):

@@ -110,9 +110,7 @@ class _Run:
 
     def arrived(self, message: Mapping[str, Any], now: float) -> None:
         """Count a state; BridgeError if it is not newer than the last one."""
-        if message["step"] <= self.answered:
-            text = f"state {message['step']} came after state {self.answered}"
-            raise BridgeError("out_of_order", text)
+        _require_newer(message["step"], self.answered)
         self.answered = message["step"]
         if math.isfinite(self.before):
             self.gaps.append(now - self.before)
@@ -243,6 +241,8 @@ class Driver:
             newer = None if final else self._link.receive(0.0)
             if newer is None:
                 return message
+            if newer["kind"] == "state":
+                _require_newer(newer["step"], message["step"])
             run.force = max(run.force, _largest(message["force"]))
             message, run.skipped = newer, run.skipped + 1
         raise BridgeError("flood", f"over {MOST_FRAMES} states at once")
@@ -286,6 +286,12 @@ class Driver:
             while (left := self._link.receive(until)) and left["kind"] == "state":
                 if left["end"] is not None:
                     break
+
+
+def _require_newer(step: int, before: int) -> None:
+    if step <= before:
+        text = f"state {step} came after state {before}"
+        raise BridgeError("out_of_order", text)
 
 
 def _largest(force: Mapping[str, Any]) -> float:
