@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import bridge, suite
-from cathsim_dmc.bridge import driver, fit, messages, serving
+from cathsim_dmc.bridge import driver, fit, messages, records, serving
 from cathsim_dmc.bridge.driver import Driver, connect
 from cathsim_dmc.bridge.records import milliseconds
 from cathsim_dmc.physics.forces import WallForce
@@ -243,26 +243,27 @@ class Scripted:
 def test_a_driver_tells_its_times_and_what_it_skips(monkeypatch, tmp_path):
     """States come every 20 ms; the policy takes 10 ms, 30 ms, and once 50 ms."""
 
-    def driven(log, overrun):
+    def driven(path, overrun):
         link, durations = Scripted(6), iter([0.01, 0.03, 0.01, 0.05, 0.01])
-        monkeypatch.setattr(driver, "time", link)
+        for module in (driver, records):
+            monkeypatch.setattr(module, "time", link)
 
         def choose(observation):
             link.now += next(durations)
             return push(observation)
 
         how = dataclasses.replace(SLOW, overrun=overrun)
-        return Driver(link, log).episode(choose, None, how)
+        with bridge.Log(path) as log:
+            return Driver(link, log).episode(choose, None, how)
 
-    with bridge.Log(tmp_path / "log") as log:
-        found = driven(log, "latest")
+    found = driven(tmp_path / "log", "latest")
     assert (found.end, found.steps, found.skipped, found.late) == ("success", 5, 1, 2)
     # States are received at 0, 20, 50, 60, 110 and 120 ms.
     assert found.compute == {"p50": 10.0, "p95": 46.0, "p99": 49.2, "max": 50.0}
     assert found.period == {"p50": 20.0, "p95": 46.0, "p99": 49.2, "max": 50.0}
     lines = map(json.loads, (tmp_path / "log").read_text().splitlines())
-    told = [line["milliseconds"] for line in lines if line["event"] == "sent"]
-    assert told == [10.0, 30.0, 10.0, 50.0, 10.0]
+    told = [(x["t"], x["milliseconds"]) for x in lines if x["event"] == "sent"]
+    assert told == [(0.01, 10), (0.05, 30), (0.06, 10), (0.11, 50), (0.12, 10)]
     found = driven(None, "stop")
     assert (found.end, found.steps, found.skipped, found.late) == ("overrun", 2, 0, 1)
 
@@ -312,7 +313,12 @@ def test_a_device_keeps_its_clock_and_tells_what_came_in_time(monkeypatch):
         link.now += {1: 0.005, 4: 0.07}.get(robot.count, 0.0)
         return read()
 
-    robot.read = slow
+    def far():  # the watchdog does not count the way to the start
+        link.now = 0.0
+
+    robot.read, link.now = slow, -2.0
+    start = robot.start
+    robot.start = lambda seed: far() or start(seed)
     options = bridge.ServeOptions(watchdog=1.0)
     nobody = types.SimpleNamespace(settimeout=lambda _: None)
     session = serving._Session(robot, link, nobody, options, bridge.Log(None))

@@ -1,6 +1,7 @@
 """Friction of the device against the capstan, and checks of the lumen."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -66,6 +67,22 @@ def test_the_axis_of_the_s_bend_is_two_arcs_between_straight_ends():
         offset, tangent = line.nearest(points + aside * ways[:, ::-1] * (1, -1))
         np.testing.assert_allclose(offset, aside, atol=1e-12)
         np.testing.assert_allclose(tangent, ways, atol=1e-12)
+
+
+def test_the_reference_of_the_s_bend_pushes_a_rod_into_an_arc(monkeypatch):
+    """With EI/2R², the energy per length that a bend gains, and with its friction."""
+    monkeypatch.setattr(s_bend, "TUBE", 0.85e-3)
+    stiffness, length, device = 1e-4, 0.05, types.SimpleNamespace(outer_radius=0.8e-3)
+    sections = np.array([length]), np.array([stiffness]), None
+    rod = types.SimpleNamespace(sections=sections, device=device)
+    # The base is 20 mm before the bend, the end in its first arc.
+    rod.lengths, rod.qpos = np.array([0.0, length]), lambda joint: length - 0.02
+    line = s_bend._Line(0.0)
+    push, _ = s_bend._reference(rod, line, 0.0)
+    assert push == pytest.approx(stiffness / 2 / s_bend.BEND**2, rel=0.02)
+    more, wall = s_bend._reference(rod, line, 0.1)
+    normal = wall / np.hypot(1.0, 0.1)
+    assert more - push == pytest.approx(0.1 * normal, rel=0.01)
 
 
 def test_sliding_does_not_lift_a_device_off_the_wall():
