@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import types
 from pathlib import Path
 
 import h5py
@@ -15,6 +16,7 @@ from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.thickness import surface_thickness
 from cathsim_dmc.recording import coco, image_set, sequences
 from cathsim_dmc.recording.image_set import ImageSetOptions
+from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks.step import Step
 
 OPTIONS = ImageSetOptions(
@@ -178,6 +180,53 @@ def test_a_full_disk_is_told_before_hdf5_meets_it(
     with small_disk(size), pytest.raises(OSError, match=r"too large.*/one\.h5"):
         sequences.write(tmp_path / "one.h5", arch, states, OPTIONS, [2], name="one")
     assert not list(tmp_path.iterdir())
+
+
+def test_motions_start_along_the_route_and_are_a_mean_with_coloured_noise(
+    arch, monkeypatch
+):
+    class Free:
+        """Simulations in which nothing happens."""
+
+        def __init__(self, task, count, **_):
+            drawn = task.config.randomisation
+            assert task.config.start_along_route == (0.0, 0.9)
+            assert all([drawn.friction, drawn.stiffness, drawn.roll])
+            self.rollout = types.SimpleNamespace(shadows=[], moving=None)
+            self._none = np.zeros(count)
+
+        def reset(self):
+            pass
+
+        def step(self, actions):
+            acted.append(actions)
+            force = {"push_force": self._none, "push_torque": self._none}
+            line = {"centreline": self._none, "load_cell": self._none}
+            return types.SimpleNamespace(
+                physics_error=self._none > 0, wall_force=[self._none], vessel=None,
+                readings=types.SimpleNamespace(**force, **line),
+            )  # fmt: skip
+
+    acted = []
+    monkeypatch.setattr(batch, "BatchSimulation", Free)
+    options = dataclasses.replace(OPTIONS, sequences=100, frames=60)
+    sequences.simulate(arch, "bca", "steerable_5f", options, [1])
+    action = np.array(acted)  # (240, 100, 22): tip motors, push, turn
+    assert action.shape == (240, 100, 22) and np.abs(action).max() == 1.0
+    mean = action.mean(axis=0)
+    assert 0.85 < np.ptp(mean[:, :20]) / 2 < 1.0  # both ways
+    push = np.quantile(mean[:, 20], (0.01, 0.5, 0.99))
+    np.testing.assert_allclose(push, (-0.29, 0.35, 0.9), atol=0.07)
+    # Where nothing is clipped, the noise is seen as it is.
+    inner = np.abs(mean) < 0.1
+    noise = (action - mean)[20:, inner]
+    assert noise.std() == pytest.approx(0.3, rel=0.03)
+    after = (noise[1:] * noise[:-1]).mean() / noise.var()
+    assert after == pytest.approx(0.8, abs=0.02)
+    # Motors of one axis have one mean.
+    axis = np.arange(20) % 2
+    together = np.corrcoef(mean.T)[:20, :20] > 0.9
+    np.testing.assert_array_equal(together, axis[:, None] == axis)
 
 
 def test_a_device_whose_motions_all_fail_is_one_that_does_not_fit(arch, monkeypatch):
