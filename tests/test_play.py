@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from test_play_coaxial import Screen, held
 
 from cathsim_dmc.physics.forces import WallForce
-from cathsim_dmc.play import play, window
+from cathsim_dmc.play import play, session, window
 from cathsim_dmc.play.controls import BEND_RATE, HELD, ONCE, Controls
 from cathsim_dmc.recording.episode import Episode
 
@@ -93,6 +93,34 @@ def test_a_person_steers_in_the_fluoroscopy_window(monkeypatch, tmp_path):
     np.testing.assert_array_equal(first.action[:, 0:20:2], 0.0)
     assert first.termination == "truncated"
     assert not second.action[:, :20].any() and second.action[:, 20].min() == -1.0
+
+
+def test_play_keeps_the_pace_and_does_not_catch_up(monkeypatch, shared_environment):
+    """Twice as fast as the simulated time; the third picture takes half a second."""
+    clock, shown = [100.0], []
+
+    class Window:
+        closed = False
+
+        def __init__(self, task, controls):
+            self._controls = controls
+
+        def show(self, task, message="", until=0.0):
+            shown.append(until - 100.0)
+            clock[0] = max(clock[0], until) + 0.5 * (len(shown) == 3)
+            if len(shown) == 6:
+                self._controls.press("Escape")
+
+        def close(self):
+            self.closed = True
+
+    env = shared_environment("simple1_bca")
+    monkeypatch.setattr(session.suite, "load", lambda *_: env)
+    monkeypatch.setattr(session, "FluoroscopyWindow", Window)
+    monotonic = types.SimpleNamespace(monotonic=lambda: clock[0])
+    monkeypatch.setattr(session, "time", monotonic)
+    assert play("simple1_bca", speed=2.0) == []
+    np.testing.assert_allclose(shown, [0.02, 0.04, 0.06, 0.54, 0.56, 0.58])
 
 
 @pytest.mark.parametrize(
