@@ -386,6 +386,40 @@ def test_branches_that_are_alike_do_not_tell_the_heart(bend):
 
 
 @pytest.mark.parametrize(
+    ("wide", "bottom", "top", "radius", "branch", "seen"),
+    [
+        (10, 13, 18, 3.0, -25, True),
+        (60, 13, 18, 3.0, -25, False),  # along the aorta, as an aneurysm
+        (10, 13, 13.4, 3.0, -25, False),  # too low
+        (10, 13, 18, 1.1, -25, False),  # too thin
+        (10, -13, -18, 3.0, -25, False),  # under the arch
+        (10, 13, 18, 3.0, None, False),  # far from all branches
+    ],
+)
+def test_a_bump_of_the_arch_is_a_branch_that_was_cut_short(
+    bend, wide, bottom, top, radius, branch, seen
+):
+    """Its points lie so far from the axis of an aorta of 10 mm radius (mm)."""
+    x, y = np.arange(-wide / 2, wide / 2 + 1, 1.0), np.arange(-2, 3, 1.0)
+    away = np.arange(min(bottom, top), max(bottom, top) + 0.01, 0.3)
+    z = 1e3 * bend.line[:, 2].max() + away
+    grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).reshape(-1, 3)
+    if branch is None:
+        curve = line((-35, 0, -50), (-80, 0, -40))
+    else:
+        curve = line((branch, 0, 25), (branch, 0, 90))
+    ways = Tubes([curve, 1e-3 * grid], [4e-3, 1e-3 * radius])
+    ways.nodes = np.arange(len(curve), len(ways.points))
+    ways.links = cKDTree(ways.points).query_pairs(1.05e-3, output_type="ndarray")
+    found = offshoots(ways, bend, np.full(len(bend.line), 10e-3), [curve])
+    stubs = [one for one in found if not one.curves]
+    assert len(stubs) == seen and len(found) == (branch is not None) + seen
+    for one in stubs:
+        assert one.radius == pytest.approx(1e-3 * radius, abs=0.3e-3)
+        assert abs(one.s - 1e-3 * bend.apex) < 5e-3 and one.fork is None
+
+
+@pytest.mark.parametrize(
     ("end", "fork", "aside"),
     [
         ((70, 0, 0), None, True),
