@@ -1,17 +1,20 @@
 """Contacts and forces of MuJoCo Warp in small arrays, against MuJoCo."""
 
 import itertools
+import types
 
 import mujoco
 import numpy as np
 import pytest
 import warp_arrays
+from scipy.spatial.transform import Rotation
 
 from cathsim_dmc.laws import contact
 from cathsim_dmc.laws.device import Device as DeviceState
 from cathsim_dmc.simulation.warp import contact_kernels as kernels
-from cathsim_dmc.simulation.warp import passive
+from cathsim_dmc.simulation.warp import contacts, passive
 from cathsim_dmc.simulation.warp.contact_arrays import ROW
+from cathsim_dmc.validation.rig import bare, tube
 
 
 def placed(given):
@@ -210,6 +213,33 @@ def test_contacts_of_a_link_with_the_wall_of_its_world():
     given.motion.geom_xpos[0, geom] = np.nan
     kernels.find(0, scratch, given)
     assert given.found.number[0] == 0
+
+
+def test_a_world_that_enters_an_anatomy_leaves_the_others_where_they_are():
+    def model(radius, place, turn):
+        spec = bare(tube(0.04, radius).lumen)
+        wall = spec.worldbody.geoms[0]
+        wall.conaffinity, wall.quat, wall.pos = 0, turn, place
+        link = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": (1e-3, 1e-2, 0)}
+        spec.worldbody.add_body().add_geom(**link, contype=0)
+        return spec.compile()
+
+    known = model(4e-3, (0.0, 0.0, 0.02), (1.0, 0.0, 0.0, 0.0))
+    other = model(5e-3, (0.01, 0.02, 0.05), (0.8, 0.6, 0.0, 0.0))
+    device = types.SimpleNamespace(constant=lambda arrays: arrays)
+    walls = contacts.WallContacts(device, known, 3)
+    walls._walls = walls._made()
+    walls.enter([0, 1], known, mujoco.MjData(known))
+    assert walls.is_bound
+    walls.enter([1], other, mujoco.MjData(other))
+    assert not walls.is_bound  # its wall is not on the device yet
+    made, turn = walls._made(), Rotation.from_euler("x", 2 * np.arctan2(0.6, 0.8))
+    assert made.of_world[:, 0].tolist() == [0, 1, 0] and len(made.starts) == 2
+    wanted = np.tile([0.0, 0.0, 0.02], (3, 1))
+    wanted[1] = 0.01, 0.02, 0.05
+    np.testing.assert_allclose(made.places[:, 0], wanted)
+    np.testing.assert_allclose(made.turns[[0, 2], 0], [np.eye(3)] * 2)
+    np.testing.assert_allclose(made.turns[1, 0], turn.as_matrix())
 
 
 @pytest.mark.parametrize("shared", [True, False])
