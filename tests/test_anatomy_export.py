@@ -37,13 +37,20 @@ def test_pieces_surround_the_lumen(tube, pieces):
     assert min(ConvexHull(piece * 1e3).volume for piece in pieces) > 1e-3
 
 
-@pytest.mark.slow
-def test_a_missing_piece_and_a_plug_are_found(tube, pieces):
-    gap = [piece for piece in pieces if abs(piece[:, 2].mean() - 0.02) > 5e-3]
-    assert export.fidelity(tube, gap)["open_places"] > 5
-    plug = 2e-3 * np.stack(np.meshgrid(*[(-1, 1)] * 3), -1).reshape(-1, 3)
-    found = export.fidelity(tube, [*pieces, plug + (0, 0, 0.02)])
-    assert found["closed_to_5fr"] == ["tube"]
+@pytest.mark.parametrize(("near", "blocked"), [(0.8, []), (0.74, ["tube"])])
+def test_pieces_far_behind_the_wall_leave_it_open(tube, monkeypatch, near, blocked):
+    """Four plates around a tube of 4 mm, and an edge beside its axis (mm)."""
+    monkeypatch.setattr(export, "_PLACES", 500)
+    cube = np.stack(np.meshgrid(*[(-1, 1)] * 3), -1).reshape(-1, 3)
+    plate, turn = cube * [1, 6, 30] + [5, 0, 20], np.array([[0, 1, 0], [-1, 0, 0]])
+    turn = np.vstack([turn, [[0, 0, 1]]])
+    plates = [plate @ np.linalg.matrix_power(turn, k) for k in range(4)]
+    edge = cube + [1 + near, 0, 20]
+    found = export.fidelity(tube, [1e-3 * piece for piece in (*plates, edge)])
+    # On the diagonals the plates are 1.66 mm behind the wall.
+    assert 0 < found["open_places"] < 0.2 * found["places"]
+    assert 1.2 < found["recession_mm"]["max"] <= 1.5
+    assert found["closed_to_5fr"] == blocked
 
 
 @pytest.mark.slow
@@ -139,22 +146,43 @@ def test_the_walls_of_the_phantoms(name):
     assert found["intrusion_mm"]["mean"] <= 0.05 and found["intrusion_mm"]["max"] <= 0.3
 
 
+def parallel(apart, radius, first, low, high):
+    """A vessel of 2 mm radius along z and a branch beside it, from z = first on, mm."""
+
+    def line(wide, *points):
+        steps = np.linspace(0.0, 1.0, 30)[:, None]
+        parts = [(1 - steps) * a + steps * b for a, b in pairwise(np.array(points))]
+        joined = np.concatenate([parts[0], *(part[1:] for part in parts[1:])])
+        return Centreline(joined * 1e-3, np.full(len(joined), wide * 1e-3))
+
+    trunk = line(2.0, (0.0, 0, low), (0.0, 0, high))
+    bend = apart, 0, first + 3.0
+    arm = line(radius, (0.0, 0, first), bend, (apart, 0, high))
+    vessels = {"a": Vessel("a", trunk)}
+    vessels["b"] = Vessel("b", arm, "a", ostium=1.5e-3 * radius)
+    return Anatomy.from_tree(VesselTree(vessels), "two", goals={})
+
+
 @pytest.mark.slow
 def test_a_thin_wall_between_two_lumens_stays_out_of_both():
-    def line(*points):
-        steps = np.linspace(0.0, 1.0, 30)[:, None]
-        parts = [(1 - steps) * a + steps * b for a, b in pairwise(points)]
-        joined = np.concatenate([parts[0], *(part[1:] for part in parts[1:])])
-        return Centreline(joined * 1e-3, np.full(len(joined), 2e-3))
-
-    trunk = line(np.array([0, 0, -20.0]), np.array([0, 0, 20.0]))
-    arm = line(np.zeros(3), np.array([5.0, 0, 3]), np.array([5.0, 0, 20]))
-    tree = VesselTree(
-        {"a": Vessel("a", trunk), "b": Vessel("b", arm, "a", ostium=3e-3)}
-    )
-    anatomy = Anatomy.from_tree(tree, "two", goals={})
+    anatomy = parallel(5.0, 2.0, 0.0, -20.0, 20.0)
     found = export.fidelity(anatomy, export.wall_pieces(anatomy))
     assert not found["closed_to_5fr"] and found["intrusion_mm"]["p95"] < 0.4
+
+
+def test_a_wall_ends_before_a_lumen_beside_it():
+    """Also where it could go on behind, as behind one of 1.2 mm in its 4 mm."""
+    for gap, deepest in ((1.0, -0.15), (0.8, 0.5 * 1e3 * export.THINNEST)):
+        anatomy = parallel(2.6 + gap, 0.6, -8.0, -12.0, 16.0)
+        shell = export._shell(anatomy)
+        own = np.unique(shell.faces)
+        own = own[np.abs(shell.inner[own, 2] - 6e-3) < 6e-3]
+        assert len(own) > 100
+        inner, outer = shell.inner[own], shell.outer[own]
+        assert anatomy.lumen(inner).max() <= 1e-3 * deepest
+        if gap == 1.0:
+            way = np.linspace(inner, outer, 15).reshape(-1, 3)
+            assert anatomy.lumen(way).max() <= 1e-3 * deepest
 
 
 def test_a_model_holds_names_and_places_as_they_are(tube, tmp_path, monkeypatch):
