@@ -6,7 +6,7 @@ import trimesh
 from synthetic_scans import write_obj
 
 from cathsim_dmc.anatomy.parts import Surface
-from cathsim_dmc.anatomy.scan import topology
+from cathsim_dmc.anatomy.scan import repair, topology
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
 from cathsim_dmc.anatomy.scan.repair import mend
 from cathsim_dmc.anatomy.scan.topology import edge_counts
@@ -54,6 +54,21 @@ def test_a_hole_in_the_side_is_no_end(wide):
     gone = np.linalg.norm(middles - (RADIUS, 0.0, 70.0), axis=1) < 0.5 * wide
     with pytest.raises(ValueError, match="mm wide in the side of a vessel"):
         mended(vertices, faces[~gone])
+
+
+@pytest.mark.parametrize(
+    ("free", "end"), [([0, 1, 2, 3, 4], True), ([0, 1, 15, 16, 17], False)]
+)
+def test_a_branch_may_leave_right_behind_an_end(monkeypatch, free, end):
+    """Behind a hole in the side the vessel goes on both ways, of 32 directions."""
+    far = np.isin(np.arange(repair.DIRECTIONS), free)
+    monkeypatch.setattr(repair._Work, "_far_behind", lambda *_: far)
+    vertices, faces = revolved((RADIUS, 0.0), (RADIUS, LENGTH), (0.0, LENGTH))
+    if end:
+        assert "1 open vessel ends capped" in mended(vertices, faces)[1]
+    else:
+        with pytest.raises(ValueError, match="in the side of a vessel"):
+            mended(vertices, faces)
 
 
 @pytest.mark.parametrize("radii", [(6.0, 8.0), (8.0, 6.0)], ids="{0[0]:g}".format)

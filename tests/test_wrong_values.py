@@ -26,6 +26,26 @@ from cathsim_dmc.tasks.scene import Scene
 TASK = "simple1_bca"
 
 
+def test_checks_return_what_they_are_given_up_to_their_bounds():
+    most, long = bounds.MOST_SEED, "x" * 200
+    assert bounds.seeds("seed", 7, 3) == [7, 8, 9]
+    assert bounds.seeds("seed", most - 2, 3) == [most - 2, most - 1, most]
+    assert bounds.indices("indices", [2, 0, 2], 3).tolist() == [0, 2]
+    assert bounds.indices("indices", None, 3).tolist() == [0, 1, 2]
+    assert bounds.text("name", long) == long and bounds.pixels("size", (3, 4)) == (3, 4)
+    assert bounds.number("x", 2, 1.0, 2.0) == 2.0 == bounds.number("x", 2.0, 2.0)
+    assert bounds.actions([-3, 0.5, 2], (3,)).tolist() == [-1.0, 0.5, 1.0]
+    for name, check in {
+        "seed": lambda: bounds.seeds("seed", most - 1, 3),
+        "indices": lambda: bounds.indices("indices", [0, 3], 3),
+        "chosen": lambda: bounds.indices("chosen", [0, 0], 3, ascending=True),
+        "name": lambda: bounds.text("name", long + "x"),
+        "angle": lambda: bounds.array("angle", [True, False]),
+    }.items():
+        with pytest.raises(ValueError, match=f"^{name} is .*must be"):
+            check()
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
