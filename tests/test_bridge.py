@@ -156,31 +156,18 @@ def test_a_log_is_never_overwritten(tmp_path):
         bridge.Log(tmp_path / "a.jsonl")
 
 
+@pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("side", ["device", "driver"])
-def test_too_much_force_stops_the_device(side):
-    # The limit itself is allowed.
-    robot = Robot(steps=100, force=lambda count: 2.0 if count == 5 else -1.5)
-    served = Served(robot, force_limit=1.5 if side == "device" else None, lockstep=True)
-    own = bridge.DriveOptions(
-        watchdog=WAIT, warm_up=0, force_limit=None if side == "device" else 1.5
-    )
+def test_too_much_force_stops_the_device(side, sign):
+    """A pull as a push; the limit itself is allowed."""
+    robot = Robot(steps=100, force=lambda n: sign * 2.0 if n == 5 else -1.5)
+    limits = {"device": None, "driver": None, side: 1.5}
+    served = Served(robot, force_limit=limits["device"], lockstep=True)
+    own = dataclasses.replace(SLOW, force_limit=limits["driver"])
     found = bridge.drive(push, served.address, options=own)
     (done,) = served.joined()
     assert found.end == "force_limit" and len(robot.taken) == 5 and robot.stops
     assert done["end"] == ("force_limit" if side == "device" else "stopped")
-    assert done["force"] == 2.0 == found.force
-
-
-@pytest.mark.parametrize("side", ["device", "driver"])
-def test_a_pull_counts_as_a_push_does(side):
-    robot = Robot(steps=100, force=lambda count: -2.0 if count == 3 else 0.1)
-    served = Served(robot, force_limit=1.5 if side == "device" else None, lockstep=True)
-    own = bridge.DriveOptions(
-        watchdog=WAIT, warm_up=0, force_limit=None if side == "device" else 1.5
-    )
-    found = bridge.drive(push, served.address, options=own)
-    (done,) = served.joined()
-    assert found.end == "force_limit" and len(robot.taken) == 3
     assert done["force"] == 2.0 == found.force
 
 
@@ -646,6 +633,10 @@ def test_an_end_that_is_none_is_refused_on_both_sides():
          b'{}, "force": {}, "end": null}', "not_finite: time of state is 1000"),
         ('{"kind": "start", "seed": 1}'.encode("utf-16"), "no JSON in UTF-8"),
         ('{"kind": "start", "seed": 1}'.encode("utf-16-be"), "no JSON in UTF-8"),
+        ('{"kind": "stop", "reason": "x"}'.encode("utf-16-le"), "no JSON in UTF-8"),
+        (b"\xff\xfe", "not_json: a frame holds no JSON in UTF-8"),
+        (b'{"kind": "action", "step": true, "action": []}', "is true; .*whole number$"),
+        (b'{"kind": "action", "step": 0}', "action of action is missing; it must be a"),
     ],
 )  # fmt: skip
 def test_what_is_no_message_is_said_with_what_it_must_be(data, said):
@@ -664,6 +655,8 @@ def test_what_is_no_message_is_said_with_what_it_must_be(data, said):
         ([[0.0], 1.0], "wrong_shape: action is .*must be numbers of shape"),
         ([0.0], r"action has shape \[1\]; it must be \[2\]"),
         ([[0.5, True]], r"wrong_shape: action\[0\]\[1\] is true"),
+        ([[[0.0]]], r"action has shape \[1, 1, 1\]; it must be \[1, 2\]"),
+        ([0.0, 1.0, 0.0], r"action has shape \[3\]; it must be \[2\]"),
     ],
 )
 def test_the_entry_that_is_no_number_is_named(value, said):
@@ -749,29 +742,15 @@ def action(**changed):
 BAD = {
     "frame_too_long": struct.pack(">I", messages.MAX_FRAME + 1),
     "not_json": frame(b"{nothing"),
-    "not_json ": frame(b"\xff\xfe"),
-    "not_json  ": frame(b"[" * 200_000),
-    "bad_message": frame(b"[1, 2]"),
-    "bad_message ": frame(b'{"kind": "dance"}'),
-    "bad_message  ": frame(b'{"kind": "action", "step": true, "action": []}'),
-    "bad_message   ": frame(b'{"kind": "action", "step": 0}'),
+    "not_json ": frame(b"[" * 200_000),
+    "bad_message": frame(b'{"kind": "dance"}'),
     "not_finite": action(action=[float("nan"), 0.0]),
-    "not_finite ": frame(b'{"kind": "action", "step": 0, "action": [1e999, 0]}'),
     "wrong_shape": action(action=[0.0, 0.0, 0.0]),
-    "wrong_shape ": action(action=[[0.0, 0.0]]),
-    "wrong_shape  ": action(action=["1", "0"]),
-    "wrong_shape   ": action(action=[10**400, 0]),
-    "wrong_shape    ": action(action=[True, False]),
-    "out_of_order": action(step=7),
-    "out_of_order ": frame(b'{"kind": "start", "seed": 3}'),
-    "bad_message    ": action(step=-1),
-    "bad_message     ": action(step=0.0),
-    "bad_message      ": action(action=0.5),
-    "not_json   ": frame('{"kind": "stop", "reason": "x"}'.encode("utf-16-le")),
-    "wrong_shape     ": action(action=[True, 0.0]),
-    "wrong_shape      ": frame(
+    "wrong_shape ": frame(
         b'{"kind": "action", "step": 0, "action": ' + b"[" * 800 + b"]" * 800 + b"}"
     ),
+    "out_of_order": action(step=7),
+    "out_of_order ": frame(b'{"kind": "start", "seed": 3}'),
     "flood": action() * 200,  # all but the first are late
 }
 

@@ -51,12 +51,11 @@ def test_whatever_is_pressed_the_action_is_one(keys):
         np.testing.assert_array_equal(action, action.astype(np.float32))
 
 
-@pytest.mark.parametrize("kind", [{"tip_joints": 2, "rotation": True}, {"devices": 2}])
-def test_opposite_keys_do_the_opposite(kind):
+def test_opposite_keys_do_the_opposite():
     for one, other in (("w", "s"), ("a", "d"), ("Up", "Down"), ("Left", "Right")):
         found = []
         for key in (one, other):
-            hands = Controls(**kind)
+            hands = Controls(tip_joints=2, rotation=True)
             hands.press(key)
             found.append(hands.action(STEP))
         np.testing.assert_array_equal(found[0], -found[1])
@@ -109,7 +108,7 @@ def test_play_keeps_the_pace_and_does_not_catch_up(monkeypatch, shared_environme
             shown.append(until - 100.0)
             clock[0] = max(clock[0], until) + 0.5 * (len(shown) == 3)
             if len(shown) == 6:
-                self._controls.press("Escape")
+                self._controls.press("r")  # the next episode, if there is one
 
         def close(self):
             self.closed = True
@@ -119,8 +118,31 @@ def test_play_keeps_the_pace_and_does_not_catch_up(monkeypatch, shared_environme
     monkeypatch.setattr(session, "FluoroscopyWindow", Window)
     monotonic = types.SimpleNamespace(monotonic=lambda: clock[0])
     monkeypatch.setattr(session, "time", monotonic)
-    assert play("simple1_bca", speed=2.0) == []
+    assert play("simple1_bca", speed=2.0, episodes=1) == []
     np.testing.assert_allclose(shown, [0.02, 0.04, 0.06, 0.54, 0.56, 0.58])
+
+
+def test_a_held_key_that_the_screen_repeats_stays_held(monkeypatch, shared_environment):
+    clock, screen, controls = [0.0], Screen([]), Controls(10)
+    monkeypatch.setitem(sys.modules, "tkinter", screen)
+    monkeypatch.setattr(
+        window, "time", types.SimpleNamespace(monotonic=lambda: clock[0])
+    )
+    shown = window.FluoroscopyWindow(shared_environment("simple1_bca").task, controls)
+    event = types.SimpleNamespace(keysym="w")
+    press, release = (screen.bound[f"<Key{name}>"] for name in ("Press", "Release"))
+
+    def pushes(later):
+        clock[0] += later
+        shown.poll()
+        return controls.action(STEP)[-1] == 1.0
+
+    press(event)
+    release(event)  # X repeats a key as release and press
+    press(event)
+    assert pushes(0.1)
+    release(event)
+    assert pushes(0.05) and not pushes(0.02)
 
 
 @pytest.mark.parametrize(

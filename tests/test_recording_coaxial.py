@@ -1,11 +1,9 @@
-"""Coaxial devices in a record and in its Rerun file."""
+"""Coaxial devices in a record."""
 
 import numpy as np
 import pytest
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.parts import Surface
-from cathsim_dmc.recording import rerun_log
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.recording.records import CoaxialRecord
 
@@ -46,18 +44,6 @@ def test_the_record_has_both_devices(recorded):
         np.testing.assert_allclose(state, readings.points[:, -1], atol=1e-5)
 
 
-def test_links_look_like_the_outermost_device_there(recorded):
-    episode, _ = recorded
-    coaxial = CoaxialRecord.of(episode)
-    outermost = coaxial.outermost(episode.catheter)
-    # At first 30 mm of wire stand out of the catheter; in the end the wire lies in it.
-    lengths = np.linalg.norm(np.diff(episode.catheter[0], axis=0), axis=-1)
-    bare = lengths[outermost[0] == 0].sum()
-    assert bare == pytest.approx(0.03, abs=lengths.max())
-    assert (outermost[0][:10] == 1).all() and outermost[0][-1] == 0
-    assert coaxial.gaps[-1, 1] < coaxial.gaps[0, 1]
-
-
 def test_a_link_looks_like_what_is_outermost_in_its_middle():
     line, turns = np.zeros((2, 5, 3)), np.zeros((2, 2))
     line[..., 2] = np.arange(5) * 10e-3
@@ -75,17 +61,3 @@ def test_the_device_that_leads_has_no_gap_whichever_it_is():
     np.testing.assert_allclose(record.gaps, [[0, 0.01], [0, 0], [0.015, 0]])
     height = record.ends(line)[..., 2]
     np.testing.assert_allclose(height, 0.04 - record.gaps)
-
-
-def test_the_rerun_file_has_both(recorded, tmp_path):
-    from rerun.chunk import RrdReader
-
-    episode, _ = recorded
-    path = tmp_path / "pair.rrd"
-    box = Surface(np.eye(3), np.array([[0, 1, 2]]))
-    rerun_log.write_rrd(episode, box, path)
-    entities = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
-    wire = "world/catheter/{} series/insertion_mm/{} series/rotation_deg/{}"
-    for name in ("guidewire", "catheter"):
-        assert {f"/{one.format(name)}" for one in wire.split()} <= entities
-        assert f"/series/rotation_deg/{name}_end" in entities
