@@ -164,6 +164,11 @@ def test_force_is_vibration(virtual):
     assert hands.strength(-1.0) == 0.0 and hands.strength(0.0) == 0.0
     pad.close()
     assert virtual.felt[-1] == (0.0, 0.0)
+    asked = []
+    pad._pad = types.SimpleNamespace(attached=lambda: True)
+    pad._pad.rumble = lambda *how: asked.append(how)
+    pad.feel(1.5 / 4)
+    assert asked == [(0.5, 0.0, 100)]  # ms, longer than a control step
 
 
 def test_without_a_gamepad_the_message_says_what_to_do(monkeypatch, cathsim):
