@@ -6,12 +6,13 @@ import sys
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 from PIL import Image
 from recording_samples import make_episode, make_tube, same
 
 import cathsim_dmc
 from cathsim_dmc import agents, suite
-from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy import Anatomy, phantoms
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.physics.effects import Effect
@@ -60,7 +61,13 @@ def test_forces_are_those_of_the_task(pushed):
     assert (readout.penetration > 0.0).all() and readout.penetration.max() < 1e-3
     text = repr(readout)
     assert f"{1e3 * readout.wall_max:.2f} mN" in text
-    assert f"{1e3 * readout.wall_mean_sum:.2f}" in text
+    means = f"sum {1e3 * readout.wall_mean_sum:.2f} mN, largest "
+    assert f"mean over the step: {means}{1e3 * readout.wall_mean_max:.2f} mN" in text
+    cell = ", ".join(f"{1e3 * one:.1f}" for one in readout.load_cell)
+    assert f"load cell ({cell}) mN" in text
+    row = [*1e3 * readout.position[0], *1e3 * readout.force[0]]
+    found = [float(word) for word in text.splitlines()[4].split()]
+    np.testing.assert_allclose(found, row, atol=0.051)
     assert readout.wall_mean_sum == episode.meta["wall_force_mean_sum"][-1]
     assert len(text.splitlines()) == 5 + len(readout)
     assert PEAK_NOTE in text
@@ -117,9 +124,34 @@ def test_each_of_coaxial_devices_has_its_curve():
     np.testing.assert_allclose(found, 1e3 * ends.T)
 
 
+def test_coaxial_devices_have_their_colours_and_their_ends():
+    line = np.zeros((7, 5, 3))
+    line[..., 2] = 0.01 * np.arange(5)
+    ends = np.linspace([0.1, 0.1], [0.12, 0.105], 7)  # at last 15 mm of wire stand out
+    turns = {"rotation": [0.0] * 7, "tip_rotation": [0.0] * 7}
+    devices = [
+        {"name": name, "insertion": way.tolist(), "radius": radius, **turns}
+        for name, radius, way in zip(("a", "b"), (0.4e-3, 0.8e-3), ends.T, strict=True)
+    ]
+    goal = {"goal_position": [0.0, 0.0, 0.0], "goal_radius": 8e-3}
+    episode = make_episode(counts=np.zeros(6, int), catheter=line)
+    meta = {**episode.meta, **goal, "devices": devices}
+    episode = dataclasses.replace(episode, meta=meta)
+    moment = Moment.of_episode(episode, make_tube())
+    figure = scene_figure(moment, views=("front",), fluoroscopy=False, pixels=100)
+    axes = figure.axes[0]
+    dark = [each for each in axes.collections if hasattr(each, "get_segments")][1]
+    colours = [to_hex(colour) for colour in dark.get_colors()]
+    assert colours == 18 * ["#173a63"] + 6 * ["#0b6b5a"]
+    points = [one.get_xydata() for one in axes.lines if one.get_marker() == "o"]
+    np.testing.assert_allclose(np.concatenate(points)[:2], [[0, 40], [0, 25]])
+
+
 def test_phases_are_what_the_base_does(pushed):
     _, episode = pushed
-    way = np.cumsum([0.0, *[1e-3] * 10, *[0.0] * 10, 1e-3, *[0.0] * 9, *[-1e-3] * 8])
+    # 25 mm/s, 1.25 mm/s and -2.5 mm/s; the base rests below 2 mm/s.
+    steps = [1e-3] * 10, [5e-5] * 10, [1e-3], [0.0] * 9, [-1e-4] * 8
+    way = np.cumsum([0.0, *np.concatenate(steps)])
     states = len(way)
     made = dataclasses.replace(
         episode,
@@ -545,8 +577,9 @@ def test_a_figure_shows_forces_along_themselves_and_tells_them(pushed):
     moment = Moment.of(pushed[0])
     moment = dataclasses.replace(
         moment,
-        position=moment.device[[5, 9]] + [0.0, 0.01, 0.0],
-        force=np.array([[0.03, 0.01, 0.04], [-0.1, 0.0, 0.05]]), force_scale=0.2,
+        position=moment.device[[5, 9, 7]] + [0.0, 0.01, 0.0],
+        force=np.array([[0.03, 0.01, 0.04], [-0.1, 0.0, 0.05], [0.0, 0.0, 1e-3]]),
+        force_scale=0.2,
     )  # fmt: skip
     figure = scene_figure(moment, views=("front",), fluoroscopy=False, pixels=200)
     axes, bar = figure.axes
@@ -556,10 +589,13 @@ def test_a_figure_shows_forces_along_themselves_and_tells_them(pushed):
     way = 1e3 * (moment.position - moment.goal)[:, [0, 2]]
     np.testing.assert_allclose(arrows.XY - goal.center, way, atol=1e-6)
     wanted = moment.force[:, [0, 2]] * 22 / np.linalg.norm(moment.force[1])
+    wanted[2] = 0.0, 5.0  # the shortest
     np.testing.assert_allclose(np.column_stack([arrows.U, arrows.V]), wanted)
+    colours = force_colours(np.linalg.norm(moment.force, axis=1), 0.2) / 255
+    np.testing.assert_allclose(arrows.get_facecolors()[:, :3], colours)
     assert bar.get_ylim() == (0.0, 200.0) and "mN" in bar.get_ylabel()
     sizes = np.linalg.norm(moment.force, axis=1)
-    told = f"2 contacts, {force_text(sizes.sum())} in all, {force_text(sizes[1])} the"
+    told = f"3 contacts, {force_text(sizes.sum())} in all, {force_text(sizes[1])} the"
     assert told in figure.get_suptitle()
 
 
@@ -575,13 +611,20 @@ def test_the_ring_in_the_fluoroscopy_has_the_size_of_the_goal(pushed):
     assert 2 * ring.radius == pytest.approx(right[0] - left[0])
 
 
-@pytest.mark.parametrize(("view", "plane"), [("front", (0, 2)), ("left", (1, 2))])
-def test_the_arrow_at_the_inlet_points_into_the_lumen(view, plane):
+@pytest.mark.parametrize(
+    ("view", "plane", "up"),
+    [("front", (0, 2), 1), ("left", (1, 2), 1), ("below", (0, 1), -1)],
+)
+def test_the_arrow_at_the_inlet_points_into_the_lumen(view, plane, up, monkeypatch):
+    room = 5.0 if view == "below" else 9.0  # mm, of the goals
+    monkeypatch.setattr(Anatomy, "goal_room", lambda *_: 1e-3 * room)
     anatomy, axes = phantoms.load("type1", access="descending"), Picture().add_subplot()
     draw_anatomy(axes, anatomy, view)
     arrow = next(text for text in axes.texts if text.arrow_patch is not None)
     way = np.subtract(arrow.xy, arrow.xyann)
-    np.testing.assert_allclose(way, 30 * anatomy.inlet.direction[[*plane]], atol=1e-6)
+    wanted = 30 * anatomy.inlet.direction[[*plane]] * (1, up)
+    np.testing.assert_allclose(way, wanted, atol=1e-6)
+    assert {ring.radius for ring in axes.patches if not ring.fill} == {min(room, 8.0)}
     rings = {tuple(np.round(ring.center, 6)) for ring in axes.patches if not ring.fill}
     goals = {
         tuple(np.round(line.get_xydata()[0], 6))
