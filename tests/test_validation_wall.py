@@ -80,9 +80,9 @@ def test_the_reference_of_the_s_bend_pushes_a_rod_into_an_arc(monkeypatch):
     line = s_bend._Line(0.0)
     push, _ = s_bend._reference(rod, line, 0.0)
     assert push == pytest.approx(stiffness / 2 / s_bend.BEND**2, rel=0.02)
-    more, wall = s_bend._reference(rod, line, 0.1)
-    normal = wall / np.hypot(1.0, 0.1)
-    assert more - push == pytest.approx(0.1 * normal, rel=0.01)
+    more, wall = s_bend._reference(rod, line, 0.5)
+    normal = wall / np.hypot(1.0, 0.5)
+    assert more - push == pytest.approx(0.5 * normal, rel=0.01)
 
 
 def test_sliding_does_not_lift_a_device_off_the_wall():
