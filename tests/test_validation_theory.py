@@ -18,6 +18,8 @@ from cathsim_dmc.validation import (
     damping,
     force_sensors,
     friction,
+    helix,
+    modes,
     pair,
     rod,
     s_bend,
@@ -69,6 +71,47 @@ def test_elastica_of_a_uniform_rod_meets_the_elliptic_integrals(
     force, end = elastica_by_elliptic_integrals(length, stiffness, angle)
     np.testing.assert_allclose(shape.force, force, rtol=1e-6)
     np.testing.assert_allclose(shape.position[-1], end, rtol=1e-6)
+
+
+def test_a_helix_bears_the_derivative_of_its_energy():
+    """Of two helices of opposite hands after a straight part, the first."""
+    radius, angle, bending, step = 3e-3, 0.4, 1e-4, 0.2e-3
+
+    def rod(turns):
+        change = np.concatenate(
+            [np.full(20, 0.0), *(np.full(abs(n), n) for n in turns)]
+        )
+        phase = np.cumsum(np.sign(change)) * step * np.sin(angle) / radius
+        aside = radius * np.minimum(np.arange(len(phase)) / 20, 1.0)
+        places = np.cos(phase) * aside, np.sin(phase) * aside
+        return np.column_stack([*places, np.arange(len(phase)) * step * np.cos(angle)])
+
+    part = helix.one_hand(rod([350, -350]))
+    assert 200 < len(part) < 350 and part[-1, 2] < 370 * step * np.cos(angle)
+    force, found = helix.borne(part, bending)
+    assert found == pytest.approx(angle, rel=1e-3)
+    # A rod of unit length, a little less and more inclined.
+    near = angle + np.array([-1e-4, 1e-4])
+    energy, height = bending / 2 * (np.sin(near) ** 2 / radius) ** 2, np.cos(near)
+    assert force == pytest.approx(np.ptp(energy) / np.ptp(height), rel=2e-3)
+    with pytest.raises(RuntimeError, match="ends after"):
+        helix.one_hand(rod([200, -400]))
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+def test_a_uniform_beam_has_the_frequency_of_the_closed_form(parts):
+    length, bending, mass = 0.12, 2e-4, 2e-3
+    found = modes.beam_frequency(
+        np.full(parts, length / parts), [bending] * parts, mass
+    )
+    root = 1.875104069 / length
+    expected = root**2 * np.sqrt(bending / mass) / 2 / np.pi
+    assert found == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_first_mode_of_a_chain_is_that_of_its_beam_in_blood():
+    chain, beam = modes.frequencies("wire_014_micro")
+    assert chain == pytest.approx(beam, rel=modes.MODE_BOUND / 100)
 
 
 def test_checks_keep_their_bounds_and_nan_fails():

@@ -23,15 +23,12 @@ _MARGIN = 0.15  # of the helix, left out at both ends
 def helix(link: float, force: float = FORCE) -> tuple[float, float, float]:
     """Pushes a uniform device against the end of a frictionless tube.
 
-    A helix with the angle α to the axis bears F = 2 EI sin²α cos α / r², the derivative
-    of the bending energy by the shortening of a rod that is free to rotate.
-
     Args:
         link: Length of the links, m.
         force: Push force at which the base stops, N.
 
     Returns:
-        Push force of the simulation and F, N; α, rad.
+        Push force of the simulation and of `borne`, N; angle of the helix, rad.
 
     Raises:
         RuntimeError: if the push force is not reached.
@@ -55,11 +52,19 @@ def helix(link: float, force: float = FORCE) -> tuple[float, float, float]:
         environment.step(0.0 * action)
     push, line = float(task.readings.push_force), task.readings.centreline
     environment.close()
-    part = one_hand(line)
-    cosine = np.ptp(part[:, 2]) / np.linalg.norm(np.diff(part, axis=0), axis=-1).sum()
-    radius = np.linalg.norm(part[:, :2], axis=1).mean()  # of the joints, on the rod
-    theory = 2 * shaft.bending_stiffness * (1 - cosine**2) * cosine / radius**2
-    return push, float(theory), float(np.arccos(cosine))
+    return push, *borne(one_hand(line), shaft.bending_stiffness)
+
+
+def borne(line: np.ndarray, bending: float) -> tuple[float, float]:
+    """Axial force (N) and angle α to the axis (rad) of a helix (L, 3), m, around z.
+
+    The force is F = 2 EI sin²α cos α / r², the derivative of the bending energy by the
+    shortening of a rod with the stiffness EI, N·m², that is free to rotate.
+    """
+    cosine = np.ptp(line[:, 2]) / np.linalg.norm(np.diff(line, axis=0), axis=-1).sum()
+    radius = np.linalg.norm(line[:, :2], axis=1).mean()  # of the joints, on the rod
+    force = 2 * bending * (1 - cosine**2) * cosine / radius**2
+    return float(force), float(np.arccos(cosine))
 
 
 def one_hand(line: np.ndarray) -> np.ndarray:
