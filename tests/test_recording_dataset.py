@@ -1,12 +1,14 @@
 """Recorded episodes as Minari datasets, read back by Minari."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
 
 minari = pytest.importorskip("minari")
 
+from cathsim_dmc.recording import dataset  # noqa: E402
 from cathsim_dmc.recording.dataset import export  # noqa: E402
 from cathsim_dmc.recording.recorder import EpisodeRecorder  # noqa: E402
 
@@ -30,9 +32,9 @@ def test_a_dataset_holds_what_happened(episodes, tmp_path):
     size = {"size": 32, "noise": True}
     names = ["tracking", "image"]
     export(episodes, folder, observation=names, task_kwargs={"fluoroscopy": size})
-    dataset = minari.MinariDataset(folder / "data")
-    assert dataset.total_steps == 6 + 5
-    for episode, data in zip(episodes, dataset.iterate_episodes(), strict=True):
+    found = minari.MinariDataset(folder / "data")
+    assert found.total_steps == 6 + 5
+    for episode, data in zip(episodes, found.iterate_episodes(), strict=True):
         np.testing.assert_array_equal(data.actions, episode.action)
         np.testing.assert_allclose(data.rewards, episode.reward, atol=1e-9)
         forces = data.infos["wall_force_max"][1:]
@@ -42,8 +44,8 @@ def test_a_dataset_holds_what_happened(episodes, tmp_path):
         assert data.observations["image"].shape == (episode.steps + 1, 32, 32, 1)
         assert data.truncations.tolist() == [False] * (episode.steps - 1) + [True]
         assert not data.terminations.any() and data.actions.dtype == np.float32
-    again = dataset.recover_environment()
-    first = next(dataset.iterate_episodes()).observations["tracking_points"][0]
+    again = found.recover_environment()
+    first = next(found.iterate_episodes()).observations["tracking_points"][0]
     shown = again.reset(seed=3)[0]["tracking_points"]
     np.testing.assert_array_equal(shown, first)
 
@@ -55,12 +57,24 @@ def test_a_time_limit_truncates_and_actions_keep_their_precision(
     recorder = EpisodeRecorder(env, TASK, SHORT)
     episode = recorder.record_episode(lambda _: draw.uniform(-1, 1, 21), 6)
     export([episode], tmp_path / "own", observation="tracking")
-    dataset = minari.MinariDataset(tmp_path / "own" / "data")
-    (data,) = dataset.iterate_episodes()
+    found = minari.MinariDataset(tmp_path / "own" / "data")
+    (data,) = found.iterate_episodes()
     assert data.truncations.tolist() == [False] * 8 + [True]
     assert not data.terminations.any()
     np.testing.assert_array_equal(data.actions, episode.action)
-    assert dataset.id == "own-v0"  # an id of Minari ends in a version
+    assert found.id == "own-v0"  # an id of Minari ends in a version
+
+
+def test_room_for_the_arrays_of_all_episodes_is_asked_for(tmp_path, monkeypatch):
+    """Compressed they take less, but noise does not."""
+    asked = []
+    monkeypatch.setattr(dataset, "fill", lambda path, size: asked.append(size))
+    (tmp_path / "space").touch()
+    images, force = np.zeros((20, 512, 512), np.uint8), {"force": np.zeros(20)}
+    one = types.SimpleNamespace(observations={"image": images}, infos=force)
+    one.actions = np.zeros((19, 3))
+    dataset._check_space(tmp_path / "space", [one, one])
+    assert 2.1 * images.nbytes < asked[0] < 3 * images.nbytes
 
 
 def test_what_cannot_be_repeated_is_refused(episodes, tmp_path):
