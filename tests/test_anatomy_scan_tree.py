@@ -2,6 +2,8 @@
 
 import re
 from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +19,7 @@ from cathsim_dmc.anatomy.arch.tree import arch_tree as random_arch
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Goal, Surface
 from cathsim_dmc.anatomy.reach import unreachable
+from cathsim_dmc.anatomy.scan import check
 from cathsim_dmc.anatomy.scan.aorta import unproven
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.ends import free_ends
@@ -408,7 +411,8 @@ def test_the_proof_finds_each_fault(computed):
     # A jump from one vessel into the next, through both walls.
     points = np.concatenate([line.points[: len(line.points) // 2], lsa_points[-20:]])
     jump = replace(lcca, centreline=Centreline(points, np.full(len(points), 3e-3)))
-    assert "lcca leaves the lumen" in found("centrelines in the lumen", lcca=jump)
+    left = found("centrelines in the lumen", lcca=jump)
+    assert re.search(r"lcca leaves the lumen .*, by \d+\.\d mm", left)
     # A branch that runs in the aorta.
     beside = good.tree.root.centreline.slice(0.05, 0.2)
     twin = replace(lcca, centreline=beside, ostium=5e-3)
@@ -458,6 +462,33 @@ def test_the_proof_finds_each_fault(computed):
     for other, words in (("lsa", "to the right"), ("lcca", "in this order")):
         vessels = renamed(good.tree.vessels, "bca", other)
         assert words in found(sides)
+
+
+def test_branches_are_checked_against_radius_and_ostium():
+    """A start outside of the parent; 22 mm in the lumen of another branch."""
+
+    def line(radius, *corners):
+        parts = [np.linspace(a, b, 40) for a, b in pairwise(np.array(corners))]
+        points = np.concatenate(parts) * 1e-3
+        keep = np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 0)
+        return Centreline(points[keep], np.full(keep.sum(), radius * 1e-3))
+
+    root = Vessel("aorta", line(5.0, (0.0, 0, 0), (0, 0, 100)))
+
+    def found(look, *branches):
+        tree = VesselTree({one.name: one for one in (root, *branches)})
+        return list(look(SimpleNamespace(tree=tree), None))
+
+    for off in (4.9, 5.1):
+        one = Vessel("b", line(2.0, (off, 0, 50), (off + 40, 0, 50)), "aorta", 1e-3)
+        said = found(check._parents, one)
+        assert bool(said) == (off > 5.0)
+    assert said[0].startswith("b starts 5.1 mm from the centreline of aorta")
+    path = line(2.0, (0.0, 0, 50), (60, 0, 50))
+    both = Vessel("c", line(2.0, (0.0, 0, 50), (22, 0, 50), (40, 0, 90)), "aorta", 0.0)
+    for ostium in (25e-3, 1e-3):
+        said = found(check._own_lumen, Vessel("b", path, "aorta", ostium), both)
+        assert any(each.startswith("c runs") for each in said) == (ostium < 22e-3)
 
 
 @pytest.mark.slow
