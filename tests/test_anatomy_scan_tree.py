@@ -491,6 +491,18 @@ def test_branches_are_checked_against_radius_and_ostium():
         assert any(each.startswith("c runs") for each in said) == (ostium < 22e-3)
 
 
+@pytest.mark.parametrize(("apart", "tells"), [(50, False), (70, True)])
+def test_arms_that_end_near_each_other_tell_no_sides(apart, tells):
+    """The left one to the right of the other."""
+    vessels = {}
+    for name, x in (("rsa", apart), ("lsa", 0)):
+        points = 1e-3 * np.array([[0.0, 0, 0], [x, 0, 50]])
+        vessels[name] = SimpleNamespace(centreline=SimpleNamespace(points=points))
+    tree = SimpleNamespace(vessels=vessels)
+    said = list(check._arms(SimpleNamespace(tree=tree)))
+    assert bool(said) == tells
+
+
 @pytest.mark.slow
 def test_the_surface_of_a_phantom_is_a_scan(tmp_path):
     """Narrow ends; and at the heart, `type2` is narrower than at its other end."""
