@@ -65,7 +65,9 @@ def flag(mask, bit, pixels):
     return np.array(found)
 
 
-def test_keypoints_are_where_the_camera_matrix_puts_them_and_on_their_masks(rows):
+def test_keypoints_are_where_the_camera_matrix_puts_them_and_on_their_masks(
+    rows, states
+):
     pixels = projected(rows["camera_matrix"], rows["keypoints_3d"])
     seen = rows["keypoints"][..., 2] > 0
     error = (pixels - rows["keypoints"][..., :2])[seen]
@@ -75,6 +77,11 @@ def test_keypoints_are_where_the_camera_matrix_puts_them_and_on_their_masks(rows
         inside = seen[:, number]
         assert flag(rows["mask"][inside], bit, pixels[inside, number]).all(), name
     assert seen[:, :4].any(axis=0).all() and seen[:, 4:].any(), "all are tested"
+    for number, shadow in enumerate(states.shadows):  # tip and marker of each
+        marked = np.diff(rows["keypoints_3d"][:, 2 * number : 2 * number + 2], axis=1)
+        length = np.linalg.norm(marked, axis=-1)
+        assert 1e-3 < 0.9 * shadow.marker_length < length.min()
+        assert length.max() < shadow.marker_length + 1e-6
     # The head of the chain is the tip of the device that leads.
     heads = rows["centreline"][:, -1]
     tips = np.linalg.norm(rows["keypoints_3d"][:, [0, 2]] - heads[:, None], axis=-1)
