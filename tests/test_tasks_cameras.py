@@ -12,6 +12,7 @@ from conftest import twin
 from cathsim_dmc import suite
 from cathsim_dmc.tasks.cameras import FARTHEST, CameraOptions
 
+BACK_ENDS = ("egl", "osmesa")  # that need no display
 PROBE = "import mujoco as m; m.Renderer(m.MjModel.from_xml_string('<mujoco/>'), 8, 8)"
 SEEING = """
 import sys
@@ -57,19 +58,93 @@ print("seen")
 """
 
 
-def python(*arguments):
-    environment = {**os.environ, "MUJOCO_GL": "osmesa", "OMP_NUM_THREADS": "1"}
+SHARING = """
+import gc, os, signal, threading
+import numpy as np
+from cathsim_dmc import suite
+
+def load(**options):
+    return suite.load("cathsim", "simple1_bca", {"random": 3, **options})
+
+def forked(act, expected=None):
+    child = os.fork()
+    if not child:
+        signal.alarm(60)  # a fork that hangs
+        status = 1
+        try:
+            act()
+            status = 0 if expected is None else 2
+        except RuntimeError as error:
+            status = 0 if expected and expected in str(error) else 3
+        finally:
+            os._exit(status)
+    assert os.waitpid(child, 0)[1] == 0
+
+cameras = {"names": ["top", "tip"], "size": 48}
+seeing = {"observation": ["rgb", "depth"], "cameras": cameras}
+made = load(**seeing)
+forked(made.reset)
+forked(lambda: load(**seeing).reset())
+
+action = np.zeros(made.action_spec().shape)
+alone, others = made, load(**seeing)
+episode = [alone.reset(), *(alone.step(action) for _ in range(4))]
+forked(lambda: made.step(action), "spawn")
+forked(lambda: load(**seeing).reset(), "spawn")
+
+def film(env):
+    return [env.physics.render(60, 90, camera_id=name) for name in ("top", "side")]
+
+third = load()
+third.reset()
+still, step = film(third), others.reset()
+for number, expected in enumerate(episode):
+    for key, value in expected.observation.items():
+        np.testing.assert_array_equal(step.observation[key], value, err_msg=key)
+    np.testing.assert_array_equal(film(third), still)
+    film(others)
+    if number == 1:  # of which a context is freed
+        fourth = load(**seeing)
+        fourth.reset(), film(fourth)
+    elif number == 2:
+        del fourth
+        gc.collect()
+    went = []
+    each = threading.Thread(target=lambda: went.append(others.step(action)))
+    each.start(), each.join()
+    (step,) = went
+print("shared")
+"""
+
+
+@pytest.fixture(scope="module")
+def back_end():
+    """Name of a back end of OpenGL that works here."""
+    found = (name for name in BACK_ENDS if not python(name, PROBE).returncode)
+    return next(found, None) or pytest.skip("neither EGL nor OSMesa works here")
+
+
+def python(back_end, *arguments):
+    environment = {**os.environ, "MUJOCO_GL": back_end, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", *arguments]
     return subprocess.run(command, env=environment, capture_output=True, text=True)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["type1_bca", "type1_bca_pair"])
-def test_cameras_see_what_they_should(task):
-    if python(PROBE).returncode:
-        pytest.skip("no software OpenGL (OSMesa) here")
-    done = python(SEEING, task)
+def test_cameras_see_what_they_should(task, back_end):
+    done = python(back_end, SEEING, task)
     assert "seen" in done.stdout, done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
+def test_contexts_of_others_threads_forks_and_the_exit(back_end):
+    """Each environment of a process sees what it sees alone, whoever else renders."""
+    done = python(back_end, SHARING)
+    assert "shared" in done.stdout, done.stderr
+    assert done.returncode == 0
+    # Contexts that are freed after the end of EGL say so.
+    assert "Error" not in done.stderr, done.stderr
 
 
 def test_without_opengl_the_message_says_what_to_do(shared_environment, monkeypatch):

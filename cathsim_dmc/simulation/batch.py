@@ -79,8 +79,8 @@ class BatchSimulation(NotCopied):
             seeds: Seeds of the simulations, or of the first; the others count up.
 
         Raises:
-            ValueError: if the task overrides a hook of composer, or a number is not
-                allowed.
+            ValueError: if the task overrides a hook of composer, a number is not
+                allowed, or a camera needs OpenGL, which does not start.
         """
         num_simulations = bounds.whole(
             "num_simulations", num_simulations, 1, bounds.MOST_SIMULATIONS
@@ -95,6 +95,7 @@ class BatchSimulation(NotCopied):
         self.stepper = self._made_stepper(num_simulations, num_threads)
         self.num_simulations, self.num_actions = num_simulations, task.num_actions
         self.rollout: Rollout = task.make_rollout(self._model, self.stepper)
+        self.rollout.views.open()  # a batch cannot be forked anyway
         self.seed(seeds)
         self.error_files: Any = None
         self._begun = np.zeros(num_simulations, dtype=bool)

@@ -1,8 +1,9 @@
 """Pictures of MuJoCo's cameras, which need OpenGL, unlike fluoroscopy."""
 
 import copy
+import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.imaging.options import VIEW_ANGLE
 from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.stepper import Stepper
+from cathsim_dmc.tasks.render_thread import render_thread
 
 # Two cameras of `scene.Scene`, and one in the head of the device, see `Cameras`.
 NAMES = ("top", "side", "tip")
@@ -20,6 +22,8 @@ KINDS = ("rgb", "depth")  # names of observations
 # Near and far clipping plane, m: a wall that the head touches is a radius of the device
 # away, and the top view 0.7 m.
 NEAREST, FARTHEST = 0.3e-3, 10.0
+# Values of MUJOCO_GL with which MuJoCo loads no OpenGL.
+_DISABLED = ("disable", "disabled", "off", "false", "0")
 _OUT_OF_SIGHT = 1e3  # m; a transparent geom would still be in the depth image
 
 
@@ -54,6 +58,7 @@ class Cameras:
     """
 
     _renderer: Any = None
+    _close: Callable[[], None] | None = None  # frees the context
 
     def __init__(
         self,
@@ -63,7 +68,7 @@ class Cameras:
         links: np.ndarray,
         resized: bool,
     ):
-        """Opens the context.
+        """Prepares the model; the first image opens the context, or `open`.
 
         Args:
             kinds: Kinds of images, of `KINDS`.
@@ -71,9 +76,11 @@ class Cameras:
             resized: Whether the sizes of these geoms differ between simulations.
 
         Raises:
-            ValueError: if OpenGL does not start.
+            ValueError: if OpenGL is disabled.
         """
-        rows, columns = options.size
+        if os.environ.get("MUJOCO_GL", "").lower().strip() in _DISABLED:
+            raise ValueError(_no_opengl("it is disabled"))
+        self._size = rows, columns = options.size
         self._names, self._resized = options.names, resized
         self._kinds = tuple(kinds)
         self._links = set(links.tolist())
@@ -83,24 +90,27 @@ class Cameras:
         model.vis.map.znear, model.vis.map.zfar = NEAREST, FARTHEST
         self._data, self._options = mujoco.MjData(model), mujoco.MjvOption()
         self._options.sitegroup[:] = 0
+
+    def open(self) -> None:
+        """Opens the context, if it is not open; a process is not to be forked then.
+
+        Raises:
+            ValueError: if OpenGL does not start.
+            RuntimeError: if the process was forked from one that has rendered.
+        """
+        thread = render_thread()
+        if self._renderer is not None:
+            return
         try:
-            self._renderer = mujoco.Renderer(model, rows, columns)
+            self._renderer = thread.run(lambda: thread.open(self._model, *self._size))
         except Exception as error:  # each back end fails in its own way
-            chosen = os.environ.get("MUJOCO_GL", "not set")
-            raise ValueError(
-                f"the observations rgb and depth need OpenGL, which does not start "
-                f"here (MUJOCO_GL is {chosen}: {type(error).__name__}: {error}). Set "
-                "MUJOCO_GL to egl (with a GPU), osmesa (software) or glfw (with a "
-                "display) before Python starts, or observe image or segmentation, "
-                "which need no OpenGL"
-            ) from error
+            message = _no_opengl(f"{type(error).__name__}: {error}")
+            raise ValueError(message) from error
+        self._close = functools.partial(thread.close, self._renderer)
 
     def __del__(self):
-        # MuJoCo frees objects of the current context, which may be another one.
-        context = getattr(self._renderer, "_gl_context", None)
-        if context is not None:
-            context.make_current()
-            self._renderer.close()
+        if self._close is not None:
+            self._close()
 
     def see(
         self, indices: np.ndarray, stepper: Stepper, readings: Readings
@@ -110,9 +120,24 @@ class Cameras:
         Returns:
             "rgb": (K, rows, columns, 3 C) uint8 of C cameras; "depth": (K, rows,
             columns, C) float32, m.
+
+        Raises:
+            ValueError, RuntimeError: as of `open`.
         """
-        seen = [self._see(index, stepper, readings) for index in indices]
+        self.open()
+        seen = render_thread().run(
+            lambda: [self._see(index, stepper, readings) for index in indices]
+        )
         return {kind: np.stack([one[kind] for one in seen]) for kind in self._kinds}
+
+    def blank(self, count: int) -> dict[str, np.ndarray]:
+        """Pictures of zeros of K = `count` simulations; see `see`."""
+        size, cameras = (count, *self._size), len(self._names)
+        kinds = {
+            "rgb": np.zeros((*size, 3 * cameras), np.uint8),
+            "depth": np.zeros((*size, cameras), np.float32),
+        }
+        return {kind: kinds[kind] for kind in self._kinds}
 
     def _see(
         self, index: int, stepper: Stepper, readings: Readings
@@ -154,3 +179,14 @@ class Cameras:
             geom.rgba[3] = 1.0
             if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid in self._links:
                 geom.pos[:] = _OUT_OF_SIGHT
+
+
+def _no_opengl(reason: str) -> str:
+    """What to do without OpenGL, as the message of an error."""
+    chosen = os.environ.get("MUJOCO_GL") or "not set"
+    return (
+        f"the observations rgb and depth need OpenGL, which does not start here "
+        f"(MUJOCO_GL is {chosen}: {reason}). Set MUJOCO_GL to egl (a GPU, or Mesa's "
+        "software), osmesa (software) or glfw (with a display) before Python starts, "
+        "or observe image or segmentation, which need no OpenGL"
+    )

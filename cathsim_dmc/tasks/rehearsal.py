@@ -31,6 +31,8 @@ def rehearse(rollout: Rollout, stepper: Any, num_actions: int) -> None:
         stepper: Does their physics steps.
         num_actions: Entries of an action.
     """
+    # With OpenGL started, the process could not be forked. Cameras compile nothing.
+    rollout.views.leave_out_cameras()
     everyone = np.arange(stepper.num_simulations)
     rollout.begin(everyone, [RandomState(0) for _ in everyone])
     stepper.forward_unactuated(everyone)

@@ -116,7 +116,7 @@ class Rollout(Restorable):
         self.progress = Progress(self._names, cases, count, config.give_up)
         self._chain = CommonChain(scene.catheter, config.shaft_link)
         self._sensors = ImageSensors(self._names, self._cases, count, self._chain)
-        self._views = Views(self._names, config, model, scene, self.index.geoms)
+        self.views = Views(self._names, config, model, scene, self.index.geoms)
         self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
@@ -336,10 +336,10 @@ class Rollout(Restorable):
             sensors.capture(
                 rows, begins, points, self.shadows, handles, random, self.around, last
             )
-        if self._views.wanted and len(rows):
+        if self.views.wanted and len(rows):
             scenes = [self.case(index).scene for index in rows]
-            found = self._views.see(
-                rows, scenes, self._stepper, self.readings, self.moving
+            found = self.views.see(
+                rows, scenes, self._stepper, self.readings, self.moving, self.begun
             )
             for name, view in found.items():
                 sensors.hold(name, view, rows)

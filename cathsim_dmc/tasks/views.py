@@ -35,7 +35,7 @@ class Views:
             links: Numbers of the geoms of the device.
 
         Raises:
-            ValueError: if a camera needs OpenGL, which does not start.
+            ValueError: if a camera needs OpenGL, which is disabled.
         """
         self._size = config.endoluminal_size
         self._inside = any(name.startswith("endoluminal") for name in names)
@@ -44,6 +44,20 @@ class Views:
             resized = scene.catheter.coaxial
             self._cameras = Cameras(model, config.cameras, kinds, links, resized)
         self.wanted = self._inside or self._cameras is not None
+        self._left_out = False
+
+    def open(self) -> None:
+        """Starts OpenGL if a camera needs it; the first image does so otherwise.
+
+        Raises:
+            ValueError, RuntimeError: as of `Cameras.open`.
+        """
+        if self._cameras is not None:
+            self._cameras.open()
+
+    def leave_out_cameras(self) -> None:
+        """Cameras give images of zeros from now on, and do not start OpenGL."""
+        self._left_out = True
 
     def see(
         self,
@@ -52,6 +66,7 @@ class Views:
         stepper: Stepper,
         readings: Readings,
         moving: Moving | None,
+        begun: bool = True,
     ) -> dict[str, np.ndarray]:
         """Renders the views of some simulations.
 
@@ -61,12 +76,17 @@ class Views:
             stepper: Stepper of all N simulations.
             readings: State of the devices of all N simulations.
             moving: Effect that moves the vessels; None if they rest.
+            begun: Whether an episode has begun. Composer observes at construction too,
+                and an environment that has only been made may be forked: its cameras
+                give zeros and do not start OpenGL.
 
         Returns:
             Images (K, ...) by name, see `Cameras.see` and `endoluminal.views`.
         """
         seen: dict[str, np.ndarray] = {}
-        if self._cameras is not None:
+        if self._cameras is not None and (self._left_out or not begun):
+            seen = self._cameras.blank(len(rows))
+        elif self._cameras is not None:
             seen = self._cameras.see(rows, stepper, readings)
         if not self._inside:
             return seen

@@ -134,16 +134,21 @@ shown, and open ends of the lumen appear closed.
 CAMERAS = """
 ## Cameras
 
-`rgb` and `depth` show MuJoCo's cameras and need OpenGL: set `MUJOCO_GL` to `egl` (with
-a GPU), `osmesa` (software) or `glfw` (with a display) before Python starts.
+`rgb` and `depth` show MuJoCo's cameras and need OpenGL: set `MUJOCO_GL` to `egl` (a GPU,
+or Mesa's software), `osmesa` (software) or `glfw` (with a display) before Python starts.
 `task_kwargs={"cameras": {...}}` configures them:
 
 {table}
 
 The channels of the cameras follow each other. "tip" looks from the head along its axis
 with a field of view of a right angle, as in endoluminal views, and does not show the
-device. A batch renders its simulations one after the other. Tasks with several
-anatomies or a moving vessel are refused.
+device. "top" and "side" show the vessel as translucent, but `depth` as solid: in it the
+wall hides the device. A batch renders its simulations one after the other. Tasks with
+several anatomies or a moving vessel are refused.
+
+All cameras of a process render in one thread of their own, so `physics.render` and other
+uses of OpenGL do not disturb them. Such a process cannot be
+[forked](reliability.md#processes) after its first image.
 """
 
 RANDOMISATION = """
