@@ -115,6 +115,33 @@ for number, expected in enumerate(episode):
     (step,) = went
 print("shared")
 """
+DRAWN = """
+import mujoco
+import numpy as np
+from cathsim_dmc import suite
+from dm_control.mujoco.wrapper import MjvOption
+
+options = MjvOption()
+options.sitegroup[:] = 0
+for task, randomised in (("simple1_bca", True), ("simple1_bca_pair", False)):
+    env = suite.load("cathsim", task, {
+        "random": 3, "observation": "rgb", "randomisation": randomised,
+        "cameras": {"names": ["top", "side"], "size": 96},
+    })
+    env.reset()
+    action = np.zeros(env.action_spec().shape)
+    action[[0, -1]] = 1.0
+    for _ in range(8):
+        seen = env.step(action).observation["rgb"]
+    mujoco.mj_kinematics(env.physics.model.ptr, env.physics.data.ptr)
+    mujoco.mj_camlight(env.physics.model.ptr, env.physics.data.ptr)
+    for number, name in enumerate(("top", "side")):
+        drawn = env.physics.render(96, 96, camera_id=name, scene_option=options)
+        mine = seen[..., 3 * number : 3 * number + 3]
+        difference = np.abs(mine.astype(int) - drawn).max()
+        assert difference < 30, (task, name, difference)
+print("drawn")
+"""
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +172,12 @@ def test_contexts_of_others_threads_forks_and_the_exit(back_end):
     assert done.returncode == 0
     # Contexts that are freed after the end of EGL say so.
     assert "Error" not in done.stderr, done.stderr
+
+
+def test_the_device_is_drawn_where_it_is(back_end):
+    """Randomisation rolls the base of the device, coaxial devices have other radii."""
+    done = python(back_end, DRAWN)
+    assert "drawn" in done.stdout, done.stderr
 
 
 def test_without_opengl_the_message_says_what_to_do(shared_environment, monkeypatch):

@@ -3,7 +3,7 @@
 import copy
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from cathsim_dmc import bounds
 from cathsim_dmc.imaging.options import VIEW_ANGLE
+from cathsim_dmc.physics.effects import World
 from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks.render_thread import render_thread
@@ -24,6 +25,11 @@ KINDS = ("rgb", "depth")  # names of observations
 NEAREST, FARTHEST = 0.3e-3, 10.0
 # Values of MUJOCO_GL with which MuJoCo loads no OpenGL.
 _DISABLED = ("disable", "disabled", "off", "false", "0")
+# Fields of the model that, with `qpos`, decide how a device is drawn.
+_DRAWN = frozenset(
+    {"body_pos", "body_quat", "jnt_pos", "jnt_axis"}
+    | {"geom_pos", "geom_quat", "geom_size", "geom_rgba"}
+)
 _OUT_OF_SIGHT = 1e3  # m; a transparent geom would still be in the depth image
 
 
@@ -62,18 +68,16 @@ class Cameras:
 
     def __init__(
         self,
-        model: mujoco.MjModel,
+        world: World,
         options: CameraOptions,
         kinds: Sequence[str],
-        links: np.ndarray,
-        resized: bool,
+        written: Collection[str],
     ):
         """Prepares the model; the first image opens the context, or `open`.
 
         Args:
             kinds: Kinds of images, of `KINDS`.
-            links: Numbers of the geoms of the device.
-            resized: Whether the sizes of these geoms differ between simulations.
+            written: Fields of the model that differ between simulations.
 
         Raises:
             ValueError: if OpenGL is disabled.
@@ -81,10 +85,10 @@ class Cameras:
         if os.environ.get("MUJOCO_GL", "").lower().strip() in _DISABLED:
             raise ValueError(_no_opengl("it is disabled"))
         self._size = rows, columns = options.size
-        self._names, self._resized = options.names, resized
+        self._names, self._written = options.names, _DRAWN.intersection(written)
         self._kinds = tuple(kinds)
-        self._links = set(links.tolist())
-        self._model = model = copy.copy(model)
+        self._links = set(world.index.geoms.tolist())
+        self._model = model = copy.copy(world.model)
         model.vis.global_.offheight, model.vis.global_.offwidth = rows, columns
         model.stat.extent = 1.0  # unit of `znear` and `zfar`
         model.vis.map.znear, model.vis.map.zfar = NEAREST, FARTHEST
@@ -143,8 +147,8 @@ class Cameras:
         self, index: int, stepper: Stepper, readings: Readings
     ) -> dict[str, np.ndarray]:
         """Pictures of one simulation."""
-        if self._resized:
-            self._model.geom_size[:] = stepper.field(index, "geom_size")
+        for name in self._written:
+            getattr(self._model, name)[:] = stepper.field(index, name)
         self._data.qpos[:] = stepper.arrays.qpos[index]
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)

@@ -116,7 +116,7 @@ class Rollout(Restorable):
         self.progress = Progress(self._names, cases, count, config.give_up)
         self._chain = CommonChain(scene.catheter, config.shaft_link)
         self._sensors = ImageSensors(self._names, self._cases, count, self._chain)
-        self.views = Views(self._names, config, model, scene, self.index.geoms)
+        self.views = Views(self._names, config, world, self.effects)
         self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
         self._random_states: list[RandomState] | None = None

@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-import mujoco
 import numpy as np
 
 from cathsim_dmc.imaging import endoluminal
+from cathsim_dmc.physics.effects import Effect, World
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.stepper import Stepper
@@ -25,14 +25,13 @@ class Views:
         self,
         names: Sequence[str],
         config: NavigationConfig,
-        model: mujoco.MjModel,
-        scene: Scene,
-        links: np.ndarray,
+        world: World,
+        effects: Sequence[Effect],
     ):
         """Prepares the views for observations of these names.
 
         Args:
-            links: Numbers of the geoms of the device.
+            effects: All effects, which may change the model of a simulation.
 
         Raises:
             ValueError: if a camera needs OpenGL, which is disabled.
@@ -41,8 +40,8 @@ class Views:
         self._inside = any(name.startswith("endoluminal") for name in names)
         self._cameras: Cameras | None = None
         if kinds := [kind for kind in KINDS if kind in names]:
-            resized = scene.catheter.coaxial
-            self._cameras = Cameras(model, config.cameras, kinds, links, resized)
+            written = {name for effect in effects for name in effect.model_fields}
+            self._cameras = Cameras(world, config.cameras, kinds, written)
         self.wanted = self._inside or self._cameras is not None
         self._left_out = False
 
