@@ -7,7 +7,7 @@ WORKERS ?= 2
 PIP := PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --constraint constraints.txt
 # dm-control asks for labmaze, which has no wheel for these Pythons and is not used here.
 LABMAZE := './tools/labmaze ; python_version >= "3.13"'
-# MuJoCo looks for OpenGL at import; nothing here draws with it.
+# MuJoCo looks for OpenGL at import; tests that draw with it choose a back end themselves.
 export MUJOCO_GL ?= disable
 
 .PHONY: demo test test-slow nightly lint lock audit compatibility dist docs site clean

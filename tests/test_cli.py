@@ -244,6 +244,15 @@ def test_the_doctor_names_what_is_missing_and_what_to_do(cathsim, monkeypatch):
     assert "trimesh: not installed" in failed[1]
 
 
+def test_the_doctor_renders_to_see_whether_opengl_works(monkeypatch):
+    """Without a display, GLFW gives contexts that cannot render."""
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    found = checks._opengl()
+    assert "none (MUJOCO_GL glfw)" in found.value and "egl or osmesa" in found.note
+
+
 def test_an_evaluation_reports_each_episode(cathsim):
     code, out, err = cathsim(
         *("eval", "push", "--task", "simple1_bca", "--episodes", 2, "--threads", 1),

@@ -23,7 +23,11 @@ from cathsim_dmc.cli.options import (
 )
 from cathsim_dmc.laws.capsule import nearest_places
 
-_OPENGL = "import mujoco; mujoco.GLContext(8, 8).make_current()"
+# A context alone does not fail where there is no display.
+_OPENGL = (
+    "import mujoco as m; "
+    "m.Renderer(m.MjModel.from_xml_string('<mujoco/>'), 8, 8).render()"
+)
 
 
 class Finding(NamedTuple):
@@ -88,7 +92,11 @@ def _kernels() -> Finding:
 def _opengl() -> Finding:
     command = [sys.executable, "-c", _OPENGL]
     works = not subprocess.run(command, capture_output=True, check=False).returncode
-    advice = "" if works else "rgb, depth and viewers need it: try MUJOCO_GL=egl"
+    advice = (
+        ""
+        if works
+        else "rgb, depth and viewers need it: set MUJOCO_GL to egl or osmesa"
+    )
     setting = os.environ.get("MUJOCO_GL", "not set")
     found = f"{'works' if works else 'none'} (MUJOCO_GL {setting})"
     return Finding("OpenGL", found, note=advice)

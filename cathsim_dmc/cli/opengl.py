@@ -15,8 +15,9 @@ _LOADERS = ("OpenGL.", "dm_control._render.", "glfw.", "mujoco.")
 def import_command(module: str, arguments: list[str]) -> ModuleType:
     """Imports the module of a command; restarts the process if OpenGL fails to load.
 
-    MuJoCo loads OpenGL at import, but no command draws with it. Modules that have been
-    imported in part cannot be imported again, so the process starts anew without it.
+    MuJoCo loads OpenGL at import, but commands draw with it only if a task observes
+    `rgb` or `depth`, which is refused then. Modules that have been imported in part
+    cannot be imported again, so the process starts anew without it.
     """
     try:
         return importlib.import_module(module)
