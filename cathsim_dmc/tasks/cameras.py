@@ -183,6 +183,11 @@ class Cameras:
             geom.rgba[3] = 1.0
             if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid in self._links:
                 geom.pos[:] = _OUT_OF_SIGHT
+        for light in scene.lights[: scene.nlight] if inside else ():
+            if light.headlight:  # OpenGL lights the outside of the wall
+                light.dir[:] *= -1.0
+            else:  # the ceiling of the room
+                light.diffuse[:] = 0.0
 
 
 def _no_opengl(reason: str) -> str:

@@ -141,10 +141,10 @@ or Mesa's software), `osmesa` (software) or `glfw` (with a display) before Pytho
 {table}
 
 The channels of the cameras follow each other. "tip" looks from the head along its axis
-with a field of view of a right angle, as in endoluminal views, and does not show the
-device. "top" and "side" show the vessel as translucent, but `depth` as solid: in it the
-wall hides the device. A batch renders its simulations one after the other. Tasks with
-several anatomies or a moving vessel are refused.
+with a field of view of a right angle, as in endoluminal views, by its own lamp alone,
+and does not show the device. "top" and "side" show the vessel as translucent in `rgb`,
+but as solid in `depth`, where the wall hides the device. A batch renders its simulations
+one after the other. Tasks with several anatomies or a moving vessel are refused.
 
 All cameras of a process render in one thread of their own, so `physics.render` and other
 uses of OpenGL do not disturb them. Such a process cannot be
