@@ -10,6 +10,7 @@ import pytest
 from conftest import twin
 
 from cathsim_dmc import suite
+from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.cameras import FARTHEST, CameraOptions
 
 BACK_ENDS = ("egl", "osmesa")  # that need no display
@@ -188,8 +189,15 @@ def test_without_opengl_the_message_says_what_to_do(shared_environment, monkeypa
 
     monkeypatch.setattr(mujoco, "Renderer", fail)
     task = twin(shared_environment("simple1_bca").task, observation="rgb")
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    with pytest.raises(ValueError, match="it is disabled.*osmesa.*segmentation"):
+        suite.environment(task)
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
     with pytest.raises(ValueError, match="MUJOCO_GL.*no display.*osmesa.*segmentation"):
         suite.environment(task).reset()
+    task = twin(shared_environment("simple1_bca").task, observation="rgb")
+    with pytest.raises(ValueError, match="MUJOCO_GL.*no display"):
+        BatchSimulation(task, 2)  # before any work
 
 
 def test_what_cameras_cannot_show_is_refused(shared_environment):
