@@ -17,6 +17,7 @@ from typing import TypeVar
 
 import mujoco
 
+# Annotations name `mujoco.Renderer` in quotes: without OpenGL modules there is none.
 _T = TypeVar("_T")
 _TIME_TO_CLOSE = 5.0  # s at the exit of the process
 
@@ -31,7 +32,7 @@ class RenderThread:
     def __init__(self):
         """Starts the thread."""
         self.process = os.getpid()
-        self._renderers: set[mujoco.Renderer] = set()
+        self._renderers: set["mujoco.Renderer"] = set()
         self._closes_at_exit = False
         # Its `put` may be called by a destructor in the middle of another `put`.
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -55,7 +56,7 @@ class RenderThread:
         self._jobs.put(job)
         return future.result()
 
-    def open(self, model: mujoco.MjModel, rows: int, columns: int) -> mujoco.Renderer:
+    def open(self, model: mujoco.MjModel, rows: int, columns: int) -> "mujoco.Renderer":
         """Opens a renderer; to be called in this thread."""
         renderer = mujoco.Renderer(model, rows, columns)
         self._renderers.add(renderer)
@@ -65,11 +66,11 @@ class RenderThread:
             self._closes_at_exit = True
         return renderer
 
-    def close(self, renderer: mujoco.Renderer) -> None:
+    def close(self, renderer: "mujoco.Renderer") -> None:
         """Closes a renderer, at once or after the present job; does not wait."""
         self._jobs.put(lambda: self._close(renderer))
 
-    def _close(self, renderer: mujoco.Renderer) -> None:
+    def _close(self, renderer: "mujoco.Renderer") -> None:
         if renderer in self._renderers:
             self._renderers.remove(renderer)
             # MuJoCo frees objects of the current context, which may be another one.
