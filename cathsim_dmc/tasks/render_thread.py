@@ -32,7 +32,7 @@ class RenderThread:
     def __init__(self):
         """Starts the thread."""
         self.process = os.getpid()
-        self._renderers: set["mujoco.Renderer"] = set()
+        self._renderers: set[mujoco.Renderer] = set()
         self._closes_at_exit = False
         # Its `put` may be called by a destructor in the middle of another `put`.
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
