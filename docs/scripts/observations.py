@@ -148,7 +148,8 @@ one after the other. Tasks with several anatomies or a moving vessel are refused
 
 All cameras of a process render in one thread of their own, so `physics.render` and other
 uses of OpenGL do not disturb them. Such a process cannot be
-[forked](reliability.md#processes) after its first image.
+[forked](reliability.md#processes) after its first image. `physics.render` and viewers
+draw no vessel in tasks with several anatomies, and a moving vessel at rest.
 """
 
 RANDOMISATION = """
