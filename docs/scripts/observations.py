@@ -134,8 +134,9 @@ shown, and open ends of the lumen appear closed.
 CAMERAS = """
 ## Cameras
 
-`rgb` and `depth` show MuJoCo's cameras and need OpenGL: set `MUJOCO_GL` to `egl` (a GPU,
-or Mesa's software), `osmesa` (software) or `glfw` (with a display) before Python starts.
+`rgb` and `depth` show MuJoCo's cameras and need OpenGL: set `MUJOCO_GL` to `egl` (a
+GPU, or Mesa's software), `osmesa` (software) or `glfw` (with a display) before Python
+starts.
 `task_kwargs={"cameras": {...}}` configures them:
 
 {table}
@@ -143,11 +144,12 @@ or Mesa's software), `osmesa` (software) or `glfw` (with a display) before Pytho
 The channels of the cameras follow each other. "tip" looks from the head along its axis
 with a field of view of a right angle, as in endoluminal views, by its own lamp alone,
 and does not show the device. "top" and "side" show the vessel as translucent in `rgb`,
-but as solid in `depth`, where the wall hides the device. A batch renders its simulations
-one after the other. Tasks with several anatomies or a moving vessel are refused.
+but as solid in `depth`, where the wall hides the device. A batch renders its
+simulations one after the other. Tasks with several anatomies or a moving vessel are
+refused.
 
-All cameras of a process render in one thread of their own, so `physics.render` and other
-uses of OpenGL do not disturb them. Such a process cannot be
+All cameras of a process render in one thread of their own, so `physics.render` and
+other uses of OpenGL do not disturb them. Such a process cannot be
 [forked](reliability.md#processes) after its first image. `physics.render` and viewers
 draw no vessel in tasks with several anatomies, and a moving vessel at rest.
 """
