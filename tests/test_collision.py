@@ -437,6 +437,23 @@ def test_a_bore_without_width_is_refused():
         fields.Bore(np.array([(0, 0, 0), (0, 0, 1)]), 0.0)
 
 
+@pytest.mark.parametrize(
+    ("points", "radii", "words"),
+    [
+        ([], 1e-3, "points of a bore"),
+        ([(0, 0, 0)], 1e-3, "points of a bore is .* two or more"),
+        ([(0, 0), (0, 1)], 1e-3, "points of a bore .* shape"),
+        ([(0, 0, 0), (0, 0, np.nan)], 1e-3, "points of a bore"),
+        ([(0, 0, 0), (0, 0, 1)], [1e-3] * 3, "radii of a bore .* a number, or 2"),
+        ([(0, 0, 0), (0, 0, 1)], "x", "radii of a bore"),
+        ([(0, 0, 0), (0, 0, 1)], np.inf, "radii of a bore"),
+    ],
+)
+def test_so_is_what_makes_no_bore(points, radii, words):
+    with pytest.raises(ValueError, match=words):
+        fields.Bore(points, radii)
+
+
 _TOGETHER = """
 import threading
 import numpy as np

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.field import Field
 
 _MESSAGE = (
@@ -52,12 +53,19 @@ class Bore:
             radii: (n,) or scalar, m.
 
         Raises:
-            ValueError: if consecutive points coincide, or a radius is not positive.
+            ValueError: if there are fewer than two points, consecutive ones coincide,
+                or a radius is not positive.
         """
-        points = np.asarray(points, dtype=np.float64)
-        radii = np.broadcast_to(np.asarray(radii, dtype=np.float64), len(points))
+        points = bounds.array("points of a bore", points, shape=(-1, 3))
+        if len(points) < 2:
+            bounds.refuse("points of a bore", points, "two or more, of shape (n, 3)")
+        radii = bounds.array("radii of a bore", radii)
+        if radii.shape not in ((), (len(points),)):
+            bounds.refuse("radii of a bore", radii, f"a number, or {len(points)}")
+        radii = np.broadcast_to(radii.astype(np.float64), len(points))
+        points = points.astype(np.float64)
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        if not (steps.min() > 0 and radii.min() > 0 and np.isfinite(points).all()):
+        if not (steps.min() > 0 and radii.min() > 0):
             raise ValueError(
                 f"the bore's points are {steps.min():g} m apart and its radii "
                 f"{radii.min():g} m at the least; both must be above 0"
