@@ -10,8 +10,9 @@ import pytest
 from conftest import twin
 
 from cathsim_dmc import suite
-from cathsim_dmc.physics.effects import Effect
+from cathsim_dmc.physics.effects import Effect, of_kind
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.config import NavigationConfig
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 from side_wind import SideWind
@@ -361,6 +362,28 @@ def test_a_law_that_numba_refuses_is_named_in_one_line():
         suite.load("cathsim", "simple1_bca", {"effects": [Uncompiled((0, 0, 1))]})
     text = str(found.value)
     assert text.startswith("numba cannot compile") and "\n" not in text
+
+
+class Counting(Effect):
+    """Counts control steps in an array that it is given."""
+
+    def __init__(self):
+        self.count, self.limits = np.zeros(1), np.ones(1)
+        self.limits.flags.writeable = False
+
+    def act(self, action, state):
+        self.count += 1
+        return action
+
+
+def test_environments_do_not_share_the_arrays_of_an_effect():
+    given = Counting()
+    config = NavigationConfig(effects=[given])
+    chain = suite.make_task("simple1_bca").scene.catheter
+    one, other = (of_kind(config.effects_on(chain), Counting) for _ in range(2))
+    one.act(None, None)
+    assert (one.count, other.count, given.count) == (1, 0, 0)
+    assert one.limits is given.limits
 
 
 class Gain(Effect):

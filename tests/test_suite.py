@@ -254,7 +254,7 @@ def test_a_task_has_one_environment_with_known_settings(shared_environment):
         suite.environment(task)
     with pytest.raises(ValueError, match="environment_kwargs.*time_limit"):
         suite.environment(twin(task), flat_observation=True)
-    with pytest.raises(ValueError, match="lead is 0.2, which only coaxial devices"):
+    with pytest.raises(ValueError, match="lead is 0.2, which only several"):
         suite.make_task("type1_lcca", lead=0.2)
     with pytest.raises(ValueError, match="task is 'type1_bca'"):
         BatchSimulation("type1_bca", 2)

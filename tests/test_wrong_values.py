@@ -90,6 +90,14 @@ def test_arrays_and_durations_are_no_numbers(name, value):
         suite.make_task(TASK, **{name: value})
 
 
+@pytest.mark.parametrize("name", ["lead", "lumen_friction"])
+def test_options_between_devices_are_refused_for_one(name):
+    with pytest.raises(ValueError, match=f"{name} is 0.2.*several.*give devices"):
+        NavigationConfig(**{name: 0.2})
+    with pytest.raises(ValueError, match=f"{name} is 0.2.*give another device"):
+        NavigationConfig(devices=["wire_035_glide"], **{name: 0.2})
+
+
 def test_so_are_numbers_in_a_row():
     with pytest.raises(ValueError, match=r"place is \[0, 1e\+300\]"):
         bounds.vector("place", [0, 1e300], 2)

@@ -7,6 +7,7 @@ through `dispatcher`. The parameters of all effects of a simulation lie one afte
 other in MuJoCo's `userdata`; the last number of `userdata` is the label of the layout.
 """
 
+import copy
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -100,6 +101,8 @@ class NoParameters(NamedTuple):
 class Effect:
     """Base class of effects, which changes nothing; subclasses override its methods.
 
+    Each environment acts by a copy of the effect with arrays of its own.
+
     Attributes:
         data_fields: Fields of `mujoco.MjData` that it reads, beside
             `ModelIndex.FIELDS`.
@@ -161,6 +164,18 @@ class Effect:
             (N, A), action for the next effect; the drives get it clipped to [-1, 1].
         """
         return action
+
+
+def copied(effect: Effect) -> Effect:
+    """Returns a copy for one rollout, with its own arrays.
+
+    Arrays that cannot be written and other attributes stay shared.
+    """
+    one = copy.copy(effect)
+    for name, value in vars(one).items():
+        if isinstance(value, np.ndarray) and value.flags.writeable:
+            vars(one)[name] = value.copy()
+    return one
 
 
 def check_action(effect: Effect, action: Any, shape: tuple[int, ...]) -> None:

@@ -1,6 +1,5 @@
 """Options of a navigation task."""
 
-import copy
 import dataclasses
 import warnings
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ from cathsim_dmc.entities.contact import FRICTION, MOST_FRICTION
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import LEAD, LUMEN_FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.physics.effects import Effect
+from cathsim_dmc.physics.effects import Effect, copied
 from cathsim_dmc.physics.held import Released
 from cathsim_dmc.physics.randomisation import (
     ActionDelay,
@@ -154,7 +153,7 @@ class NavigationConfig:
 
     def effects_on(self, chain: Chain) -> list[Effect]:
         """Returns new effects for one rollout, in the order in which they act."""
-        own = [copy.copy(effect) for effect in self.effects]
+        own = [copied(effect) for effect in self.effects]
         delay = ActionDelay(self.randomisation.longest_delay)
         model = RandomisedModel(self.randomisation)
         blood, walls = self.vessel.effects()
@@ -167,12 +166,7 @@ class NavigationConfig:
 
     def _check_devices(self):
         if self.devices is None:
-            for name in ("lead", "lumen_friction"):
-                if getattr(self, name) != getattr(type(self), name):
-                    raise ValueError(
-                        f"{name} is {getattr(self, name)!r}, which only coaxial "
-                        "devices have; give devices, or leave it out"
-                    )
+            self._check_alone("devices")
             return
         named = isinstance(self.devices, Sequence) and not isinstance(self.devices, str)
         if not named or not self.devices:
@@ -183,9 +177,20 @@ class NavigationConfig:
                 "['wire_035_glide', 'berenstein_5f']",
             )
         object.__setattr__(self, "devices", tuple(self.devices))
+        if len(self.devices) == 1:
+            self._check_alone("another device in devices")
         given = {name: getattr(self, name) for name in _REPLACED}
         changed = {n: v for n, v in given.items() if v != getattr(type(self), n)}
         refuse_replaced(changed, self.devices)
+
+    def _check_alone(self, missing: str):
+        """Raise ValueError if an option between coaxial devices is given for one."""
+        for name in ("lead", "lumen_friction"):
+            if getattr(self, name) != getattr(type(self), name):
+                raise ValueError(
+                    f"{name} is {getattr(self, name)!r}, which only several coaxial "
+                    f"devices have; give {missing}, or leave it out"
+                )
 
     def _check_numbers(self):
         required = {
