@@ -95,6 +95,30 @@ def fields(
     }
 
 
+def settings(owner: Any, limits: Mapping[str, tuple[float, float]]) -> None:
+    """Checks the fields of a dataclass that differ from their defaults.
+
+    Integers and numbers are at least 0; other values are of the default's class.
+
+    Args:
+        limits: Other (low, high) by name.
+    """
+    for field in dataclasses.fields(owner):
+        name, usual = field.name, field.default
+        value, ends = getattr(owner, name), limits.get(name, (0, math.inf))
+        if isinstance(usual, int):
+            low, high = (None if math.isinf(end) else int(end) for end in ends)
+            whole(name, value, low, high)
+        elif isinstance(usual, float):
+            if value is not usual and value != usual:
+                number(name, value, *ends)
+        elif isinstance(usual, tuple):
+            for one in _row(value) or refuse(name, value, "one number or more"):
+                number(f"an entry of {name}", one, *ends)
+        else:
+            instance(name, value, type(usual))
+
+
 def whole(
     name: str, value: Any, low: int | None = None, high: int | None = None
 ) -> int:

@@ -20,7 +20,10 @@ from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.play.session import play
 from cathsim_dmc.policies import POLICIES, make_policy
+from cathsim_dmc.policies.coaxial_pursuit import CoaxialSettings
+from cathsim_dmc.policies.pursuit import Settings
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.retry import Pattern, RetrySettings
 from cathsim_dmc.tasks.scene import Scene
 
 TASK = "simple1_bca"
@@ -96,6 +99,36 @@ def test_options_between_devices_are_refused_for_one(name):
         NavigationConfig(**{name: 0.2})
     with pytest.raises(ValueError, match=f"{name} is 0.2.*give another device"):
         NavigationConfig(devices=["wire_035_glide"], **{name: 0.2})
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "words"),
+    [
+        (Settings, {"speed": 2.0}, "speed is 2.0; .*from 0 to 1"),
+        (Settings, {"gain": "x"}, "gain is 'x'"),
+        (Settings, {"stuck": (30, 30)}, r"stuck\[0\] is 30; .*below stuck\[1\], 30"),
+        (Settings, {"stuck": 3}, "stuck is 3"),
+        (Settings, {"soft_push": 0.2}, "soft_push is 0.2; .*below hard_push, 0.1"),
+        (Settings, {"retry": None}, "retry is None; .*a RetrySettings"),
+        (CoaxialSettings, {"lead_gain": math.nan}, "lead_gain is nan"),
+        (CoaxialSettings, {"straightening": 0.5}, "straightening is 0.5.*an integer"),
+        (RetrySettings, {"thorough": 0}, "thorough is 0; .*at least 1"),
+        (RetrySettings, {"slack": -1.0}, "slack is -1.0"),
+        (RetrySettings, {"pattern": (1.0,)}, "pattern is .*a Pattern"),
+        (Pattern, {"leads": ()}, r"leads is \(\); .*one number or more"),
+        (Pattern, {"leads": 0.1}, "leads is 0.1; .*one number or more"),
+        (
+            Pattern,
+            {"lookahead_factors": (1.0, -1.0)},
+            "entry of lookahead_factors is -1.0",
+        ),
+        (Pattern, {"offsets": (math.nan,)}, "entry of offsets is nan"),
+    ],
+)
+def test_settings_of_the_expert_are_checked(kind, given, words):
+    with pytest.raises(ValueError, match=words):
+        kind(**given)
+    assert kind() == dataclasses.replace(kind())
 
 
 def test_so_are_numbers_in_a_row():

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.tasks import retry
 from cathsim_dmc.tasks.retry import Memory, RetrySettings
 from cathsim_dmc.tasks.route import Place, Route, locate
@@ -52,6 +53,22 @@ class AttemptSettings:
     straightening: int = 8
     withdrawal: float = 0.25
     relaxing: float = 0.7
+
+    def __post_init__(self):
+        limits: dict[str, tuple[float, float]] = {}
+        shares = "speed", "creep", "press", "withdrawal", "relaxing"
+        limits |= dict.fromkeys(shares, (0, 1))
+        limits |= dict.fromkeys(("aligned", "misaligned"), (-1, 1))
+        bounds.settings(self, limits)
+        bounds.interval("stuck", self.stuck, 0, integers=True)
+        for low, high, ends in (
+            ("misaligned", "aligned", (self.misaligned, self.aligned)),
+            ("soft_force", "hard_force", (self.soft_force, self.hard_force)),
+            ("soft_push", "hard_push", (self.soft_push, self.hard_push)),
+            ("stuck[0]", "stuck[1]", self.stuck),
+        ):
+            if ends[0] >= ends[1]:  # the ramp between them would divide by 0
+                bounds.refuse(low, ends[0], f"below {high}, {ends[1]}")
 
 
 class State(NamedTuple):

@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.tasks.route import Place, Route
 from cathsim_dmc.tasks.take_offs import bend
 
@@ -56,6 +57,9 @@ class Pattern:
     lookahead_factors: tuple[float, ...] = (1.0, 0.75, 1.3)
     leads: tuple[float, ...] = (0.0,)
     offsets: tuple[float, ...] = (0.0,)
+
+    def __post_init__(self):
+        bounds.settings(self, dict.fromkeys(("leads", "offsets"), (-np.inf, np.inf)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,6 +126,12 @@ class RetrySettings:
     close: Pattern = Pattern()
     sharp: float = 0.0
     planar: float = -1.0
+
+    def __post_init__(self):
+        limits: dict[str, tuple[float, float]] = {}
+        limits |= dict.fromkeys(("patience", "lost_patience", "thorough"), (1, np.inf))
+        limits |= dict.fromkeys(("tolerance", "middle", "planar"), (-1, np.inf))
+        bounds.settings(self, limits)
 
 
 SINGLE = RetrySettings()
