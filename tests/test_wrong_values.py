@@ -16,14 +16,18 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.entities.sheath import Sheath, straight
-from cathsim_dmc.physics.effects import Effect
+from cathsim_dmc.physics.effects import Draw, Effect
+from cathsim_dmc.physics.forces import Contacts
 from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.play.session import play
 from cathsim_dmc.policies import POLICIES, make_policy
-from cathsim_dmc.policies.coaxial_pursuit import CoaxialSettings
-from cathsim_dmc.policies.pursuit import Settings
+from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
+from cathsim_dmc.policies.pursuit import Plan, Settings
+from cathsim_dmc.tasks.coaxial_ends import CoaxialEnds
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.objectives import Cannulation
 from cathsim_dmc.tasks.retry import Pattern, RetrySettings
+from cathsim_dmc.tasks.route import Route
 from cathsim_dmc.tasks.scene import Scene
 
 TASK = "simple1_bca"
@@ -281,3 +285,11 @@ def test_a_task_without_an_environment_says_so():
     for show in (lambda: task.readings, task.info, task.snapshot):
         with pytest.raises(RuntimeError, match=r"no environment.*suite.environment"):
             show()
+
+
+def test_objects_with_arrays_are_compared_by_identity():
+    one, other = (suite.make_task(TASK).scene for _ in range(2))
+    assert one.placement != other.placement and one != other
+    assert one in {one} and other not in {one}
+    for kind in (Cannulation, Route, Plan, CoaxialPlan, CoaxialEnds, Draw, Contacts):
+        assert kind.__eq__ is object.__eq__ and kind.__hash__ is object.__hash__

@@ -24,7 +24,7 @@ from cathsim_dmc.laws import parameters as declared
 from cathsim_dmc.physics.readings import ModelIndex, Readings
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Draw:
     """Values drawn for an episode; None keeps the model's own value.
 
@@ -57,7 +57,7 @@ class Draw:
     insertion: float | None = None
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class World:
     """N simulations that an effect acts on.
 

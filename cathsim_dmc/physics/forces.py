@@ -23,7 +23,7 @@ DEEPEST = 0.3e-3
 REFINEMENT = 8
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Contacts:
     """Contacts of the device with the wall; K rows, of which some are empty.
 

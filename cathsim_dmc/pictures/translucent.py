@@ -24,7 +24,7 @@ _SAMPLES = 2  # samples along each side of a pixel
 _LAYERS = 16  # largest number of walls that are drawn in a pixel, the nearest
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ParallelProjection:
     """A parallel projection of the world onto a picture."""
 

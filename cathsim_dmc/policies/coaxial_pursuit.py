@@ -80,7 +80,7 @@ class CoaxialSettings(AttemptSettings):
 CLOSE = CoaxialSettings(aligned=0.9, misaligned=0.3)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class CoaxialPlan(Route):
     """Route and devices of a task with coaxial devices; world frame, SI units.
 

@@ -53,7 +53,7 @@ class Settings(AttemptSettings):
     max_bend_rate: float = 0.08
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Plan(Route):
     """Route and device of a task; world frame, SI units.
 

@@ -15,7 +15,7 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics.readings import Readings
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class CoaxialEnds:
     """Where the shaped ends of K devices begin on their common chain of L links.
 

@@ -205,7 +205,7 @@ class Routed:
     route: Centreline
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Cannulation(Shiftable, Routed):
     """Bring the head of the device into a branch.
 

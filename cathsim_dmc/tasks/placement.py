@@ -42,7 +42,7 @@ _TILT_STEP, _LARGEST_TILT = np.radians(2.5), np.radians(30.0)
 _AZIMUTH_STEP = np.radians(15.0)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Placement:
     """Poses of the device at the start; world frame, SI units.
 

@@ -19,7 +19,7 @@ SIDE_AHEAD = 25e-3  # m along the route to the point that a shaped end is turned
 _NEARBY = 10e-3  # m of the route that a head can pass between two control steps
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Route:
     """A route in steps of `ROUTE_SPACING`.
 

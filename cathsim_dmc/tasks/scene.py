@@ -31,7 +31,7 @@ _TORSION_JOINTS = 4
 _DENSE_LINKS = 50
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
     """Entities of a task, attached to the arena.
 

@@ -36,7 +36,7 @@ NEVER = 1e-6  # m, goal radius that no policy reaches
 _WARM_STEPS = 1000  # of the humanoid, 5 s, after which it lies on the floor
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Pace:
     """Speed of one episode.
 

@@ -43,7 +43,7 @@ CONVERGED = 3.0  # %, deviation of the mean force from that of the reference
 LEAST_FORCE = 1e-3
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Rest:
     """Motion and force of a device at rest in N states.
 

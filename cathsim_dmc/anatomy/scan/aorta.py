@@ -87,7 +87,7 @@ def find_aorta(
     return pair, ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Bend:
     """The bend of an aorta; directions are unit vectors (3,)."""
 

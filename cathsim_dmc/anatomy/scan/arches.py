@@ -24,7 +24,7 @@ from cathsim_dmc.anatomy.scan.ways import Ways
 LIKE_NONE = 0.85  # probability of no known pattern, above which a bend is no arch
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Arch:
     """An aortic arch, with its paths from the end that is not at the heart."""
 

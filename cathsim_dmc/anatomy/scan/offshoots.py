@@ -71,7 +71,7 @@ MIXED, MIXES = {"lsa": "lcca", "rsa": "rcca", "lcca": "lsa"}, 0.02
 TWINS = 85e-3  # m, common length without others from which two curves are one vessel
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Offshoot:
     """A branch of the arch with the curves that it leads to; lengths in m."""
 
