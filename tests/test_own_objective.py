@@ -213,7 +213,15 @@ def test_a_goal_that_is_no_place_is_refused(goal):
 
 @pytest.mark.parametrize(
     "distance",
-    [None, 0.1, [0.1, 0.1], np.zeros(3), np.zeros((2, 1)), np.full(2, np.nan)],
+    [
+        None,
+        0.1,
+        [0.1, 0.1],
+        np.zeros(3),
+        np.zeros((2, 1)),
+        np.full(2, np.nan),
+        -np.ones(2),
+    ],
 )
 def test_a_distance_along_the_route_that_is_none_is_refused(distance):
     task = advancing()
@@ -221,6 +229,16 @@ def test_a_distance_along_the_route_that_is_none_is_refused(distance):
     words = r"path_distance\(\) of Advance returns .*finite.*\(2,\)"
     with pytest.raises(ValueError, match=words):
         BatchSimulation(task, 2, num_threads=1).reset()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_path_ratio_is_finite_where_the_route_has_no_length():
+    task = advancing()
+    task.objective.path_distance = lambda head: np.zeros(2)
+    batch = BatchSimulation(task, 2, num_threads=1)
+    assert batch.reset().path_ratio.tolist() == [0.0, 0.0]
+    step = batch.step(np.ones((2, batch.num_actions)))
+    assert np.isfinite(step.path_ratio).all() and (step.path_ratio > 0).all()
 
 
 @pytest.mark.parametrize("hook", ["task_observables", "action_spec"])

@@ -169,13 +169,13 @@ def path_distances(groups: Groups, head: np.ndarray, begun: np.ndarray) -> np.nd
         own = objective.path_distance(head[rows])
         shape, given = head[rows].shape[:1], getattr(own, "shape", None)
         fits = type(own) is np.ndarray and own.dtype.kind in "fiu" and given == shape
-        if not fits or not np.isfinite(own[starts[rows]]).all():
+        if not fits or not ((own >= 0) & np.isfinite(own))[starts[rows]].all():
             raise ValueError(
                 f"path_distance() of {type(objective).__name__} returns "
-                f"{bounds.shown(own)}; it must return an array of finite numbers of "
-                f"shape {shape}, m"
+                f"{bounds.shown(own)}; it must return an array of finite numbers, at "
+                f"least 0, of shape {shape}, m"
             )
-        found[rows] = own
+        found[rows] = np.maximum(own, 1e-6)  # ratios to 0 are undefined
     return found
 
 
