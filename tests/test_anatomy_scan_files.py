@@ -11,7 +11,7 @@ from synthetic_scans import marched, y_tree
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.curves import read_curves
 from cathsim_dmc.anatomy.scan.labels import label_surface
-from cathsim_dmc.anatomy.scan.mesh import read_triangles
+from cathsim_dmc.anatomy.scan.mesh import read_triangles, stated_frame
 
 
 def poly_data(points, faces=(), lines=(), **cells):
@@ -390,6 +390,33 @@ def test_polygons_of_a_binary_ply_differ_in_their_corners(tmp_path, order):
     path.write_bytes(whole[:-20])
     with pytest.raises(ValueError, match="it ends early, 2 of 27 rows are missing"):
         read_triangles(path)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("form", ["ascii", "binary"])
+def test_headers_of_ply_end_where_a_line_says_so(tmp_path, end, form):
+    points, faces = marched(y_tree(), 3e-3)
+    path = polygons(tmp_path / "lumen.ply", points, faces)
+    head, mark, body = path.read_bytes().partition(b"end_header\n")
+    if form == "ascii":
+        head = head.replace(b"binary_little_endian", b"ascii")
+        head = head.replace(b"property uchar red\n", b"")
+        rows = [" ".join(map(repr, point)) for point in points.tolist()]
+        rows += [" ".join(map(str, (3, *face))) for face in faces.tolist()]
+        body = end.join([*rows, ""]).encode()
+    note = b"comment 3 mm behind end_header\ncomment SPACE=RAS\nelement"
+    head = head.replace(b"element", note, 1)
+    path.write_bytes((head + mark).replace(b"\n", end.encode()) + body)
+    vertices, triangles = read_triangles(path)
+    np.testing.assert_allclose(vertices[triangles], points[faces])
+    assert stated_frame(path) == "RAS"
+    path.write_bytes(head + b"end header\n" + body)
+    with pytest.raises(ValueError, match="has no line 'end_header'"):
+        read_triangles(path)
+    if form == "ascii":
+        path.write_bytes((head + mark).replace(b"\n", end.encode()) + body[:-400])
+        with pytest.raises(ValueError, match="it ends early"):
+            read_triangles(path)
 
 
 def lines_of_obj():

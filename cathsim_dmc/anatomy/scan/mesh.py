@@ -117,7 +117,7 @@ def stated_frame(path: str | Path) -> str | None:
         named = b'"SPACE"' in head
         said = parsed(path, kind, vtk_files.space, "vtp") if named else ""
     else:
-        said = head[:80] if kind == "stl" else head.partition(b"end_header")[0]
+        said = head[:80] if kind == "stl" else re.split(rb"[\r\n]end_header", head)[0]
         lines = said.decode("latin-1").splitlines()
         # A comment of OBJ or PLY, the title of VTK's old files.
         starts = {"obj": "#", "ply": "comment", "vtk": "", "stl": ""}[kind]
@@ -134,7 +134,7 @@ def _require_end(path: Path) -> None:
         head = stream.read(_COMMENTS)
     if kind == "obj":
         _require_obj_end(path)
-    elif kind == "ply" and re.search(rb"(?m)^format ascii", head):
+    elif kind == "ply" and re.search(rb"[\r\n]format ascii", head):
         _require_ply_end(path.read_bytes())
 
 
@@ -163,7 +163,8 @@ def _require_obj_end(path: Path) -> None:
 
 
 def _require_ply_end(data: bytes) -> None:
-    header, _, body = data.partition(b"end_header")
+    header, start = ply_files.header(data)
+    body = data[start:]
     counts = re.findall(rb"(?m)^element (\w+) (\d+)", header)
     whole = sum(int(count) for _, count in counts)
     rows = [row.split() for row in body.splitlines() if row.strip()]
@@ -230,8 +231,11 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     elif kind == "stl":  # a text file is kept whole
         data = data[: 84 + 50 * int.from_bytes(data[80:84], "little")]
         data = data if b"\0" in data[:84] else _with_line_feeds(data)
-    elif re.search(rb"(?m)^format binary", data[:_COMMENTS]):
-        return ply_files.triangles(data)
+    else:
+        header, start = ply_files.header(data)
+        if b"\nformat binary" in header:
+            return ply_files.triangles(data)
+        data = header + _with_line_feeds(data[start:])
     stream = io.BytesIO(data)
     try:
         mesh = trimesh.load_mesh(stream, file_type=kind, process=False, **options)

@@ -1,5 +1,9 @@
-"""Triangles of binary PLY files, whose polygons may have any number of corners."""
+"""Headers of PLY files, and triangles of binary ones, whose polygons may have any size.
 
+A header ends with a line `end_header`; its lines end in LF, CR LF or CR.
+"""
+
+import re
 from typing import Any
 
 import numpy as np
@@ -20,13 +24,29 @@ _TYPES = {
 }
 
 
+def header(data: bytes) -> tuple[bytes, int]:
+    """Header without comments, its lines ending in LF, and the offset of the body.
+
+    ValueError if there is no line `end_header`.
+    """
+    found = re.search(rb"[\r\n]end_header[ \t]*(\r\n|[\r\n])", data)
+    if found is None:
+        raise ValueError("its header has no line 'end_header'")
+    head, end = data[: found.start()], found.end()
+    if b"\n" not in head and found[1] == b"\r\n":
+        end -= 1  # the first byte of a body behind lines that end in CR
+    lines = head.splitlines()
+    kept = [line for line in lines if not line.startswith((b"comment", b"obj_info"))]
+    return b"\n".join([*kept, b"end_header\n"]), end
+
+
 def triangles(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) and triangles (F, 3) int64; polygons are divided.
 
     ValueError if the file ends early.
     """
-    head, _, body = data.partition(b"end_header")
-    at, order = body.index(b"\n") + 1, ">" if b"binary_big" in head else "<"
+    (head, at), body = header(data), data
+    order = ">" if b"binary_big" in head else "<"
     found: dict[str, list[np.ndarray]] = {}
     for name, count, properties in _elements(head.decode("latin-1")):
         found[name], at = _rows(body, at, count, properties, order)
