@@ -178,6 +178,10 @@ def test_units_are_not_sure_because_others_are_unusual():
         guess_units("arch", vertices / 25.4e-3, faces, None)
     assert guess_units("arch", vertices / 25.4e-3, faces, "inch")[0] == "inch"
     assert guess_units("arch", 1e3 * vertices, faces, None)[0] == "mm"
+    # An aorta in feet has the size of a mouse's in inches.
+    aorta, round_it = tube(24e-3, 550e-3)
+    with pytest.raises(ValueError, match=r"no usual scan.*units='inch' \(--units\)"):
+        guess_units("arch", aorta / 0.3048, round_it, None)
     # A mouse's in mm is a man's in cm.
     vertices, faces = tube(1.7e-3, 25e-3)
     unit, why, _ = guess_units("mouse", 1e3 * vertices, faces, None)

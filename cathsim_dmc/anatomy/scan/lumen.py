@@ -21,7 +21,7 @@ WIDTH = (1.0e-3, 35e-3)  # m, 95th percentile of radii: cerebral artery, aneurys
 NO_WIDTH = (0.5e-3, 50e-3)  # m: outside this range a given unit is refused
 VOLUME = 2e-3  # m^3, largest lumen that is searched, at 10^9 points per m^3
 RARE = {"inch": 0.035}  # rare units of scans, and their relative frequency
-POOR = 1e-3  # likelihood below which even the only likely unit must be given
+POOR = 1e-3  # likelihood below which even the only likely unit is asked for
 # Usual scans, to tell units apart: radius as in WIDTH and size, m, deviations of their
 # logarithms, and relative frequency.
 SCANS = {
@@ -236,10 +236,10 @@ def guess_units(
     sure = odds[best] / total
     listed = "; ".join(f"{unit} makes {makes[unit]}" for unit in likely)
     ask = " or ".join(map(repr, likely))
-    if odds[best] < POOR:
+    if odds[best] < POOR or best in RARE:
         raise ValueError(
-            f"{name} fits no usual scan in any unit: {listed}; if that is right, pass "
-            f"units={ask} (--units)."
+            f"{name} fits no usual scan in a usual unit: {listed}; if that is right, "
+            f"pass units={ask} (--units)."
         )
     if sure < SURE:
         raise ValueError(
