@@ -230,3 +230,24 @@ def test_without_a_display_the_message_says_so(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(ValueError, match="DISPLAY|tkinter"):
         play("simple1_bca")
+
+
+def test_sessions_in_one_folder_take_different_numbers(tmp_path):
+    """One finishes an episode while the other writes its own."""
+
+    class Kept(types.SimpleNamespace):
+        def save(self, path):
+            if self.other:
+                saved = session._save(self.other, tmp_path)
+                assert saved.read_text() == "other"
+            path.write_text(self.text)
+            return path
+
+    other = Kept(task="t", text="other", other=None)
+    one = session._save(Kept(task="t", text="one", other=other), tmp_path)
+    assert one.read_text() == "one"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["t_000.npz", "t_001.npz"]
+    full = Kept(task="t", save=lambda path: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        session._save(full, tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2

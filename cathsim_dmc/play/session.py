@@ -121,7 +121,14 @@ def _play(
 
 
 def _save(episode: Episode, directory: Path) -> Path:
-    number = 0
-    while (path := directory / f"{episode.task}_{number:03d}{SUFFIX}").exists():
-        number += 1
-    return episode.save(path)
+    """Saves an episode by the next number that is free, also of other sessions."""
+    for number in itertools.count():
+        path = directory / f"{episode.task}_{number:03d}{SUFFIX}"
+        with contextlib.suppress(FileExistsError):
+            path.open("xb").close()
+            break
+    try:
+        return episode.save(path)
+    except BaseException:
+        path.unlink()
+        raise
