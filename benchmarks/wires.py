@@ -5,6 +5,7 @@ python benchmarks/wires.py DIRECTORY > REPORT.json
 
 from __future__ import annotations
 
+import argparse
 import math
 import sys
 from collections.abc import Callable
@@ -121,4 +122,6 @@ def say(text: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("directory", help="the measured wires")
+    sys.exit(main(parser.parse_args().directory))

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -29,6 +30,21 @@ def test_an_interpreter_that_is_only_a_name_is_not_there(tmp_path):
     assert done.returncode == 0, done.stderr
     results = [json.loads(line)["result"] for line in done.stdout.splitlines()]
     assert results == ["no such interpreter"] * 2
+
+
+def test_scripts_answer_help_and_refuse_what_they_do_not_know():
+    """Else `--help` begins to measure, or writes pages."""
+    folders = "docs/scripts", "benchmarks", "tools", "examples"
+    paths = [p for name in folders for p in (TOOLS.parent / name).glob("*.py")]
+    texts = {path.name: path.read_text() for path in paths}
+    scripts = {name for name, text in texts.items() if "__main__" in text}
+    reading = {n for n in scripts if re.search(r"ArgumentParser|tyro", texts[n])}
+    assert len(scripts) > 40 and scripts == reading
+    for words in (["--help"], ["--no-such-option"]):
+        command = [sys.executable, TOOLS.parent / "docs/scripts/figures.py", *words]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.stdout.startswith("usage:") == (words == ["--help"])
+        assert done.returncode == (0 if words == ["--help"] else 2)
 
 
 def test_what_stands_for_labmaze_is_the_version_that_is_pinned():

@@ -7,9 +7,9 @@ packages are left out, so `pip install --no-deps` installs the file: labmaze, wh
 dm-control requires but nothing here imports, and packages for CUDA.
 """
 
+import argparse
 import re
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -25,7 +25,9 @@ LEFT_OUT = re.compile(r"(labmaze|nvidia-|cuda-|numba-cuda|triton)")
 
 
 def main() -> None:
-    uv = sys.argv[1] if len(sys.argv) > 1 else "uv"
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("uv", nargs="?", default="uv", help="the program uv")
+    uv = parser.parse_args().uv
     with tempfile.TemporaryDirectory() as folder:
         override, out = Path(folder) / "override.txt", Path(folder) / "lock.txt"
         override.write_text("labmaze ; python_version < '3'\n")

@@ -4,6 +4,7 @@ Run it after a change of their centrelines, or of the code that builds fields;
 tests/test_anatomy_field_cache.py fails when it is needed.
 """
 
+import argparse
 from pathlib import Path
 
 import cathsim_dmc.anatomy
@@ -30,4 +31,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     main()

@@ -1,5 +1,6 @@
 """Smoke test of an installed package: a task, images, the command line, an episode."""
 
+import argparse
 import json
 import subprocess
 import sys
@@ -22,9 +23,12 @@ def command_line(*words: str) -> str:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--installed", action="store_true", help="refuse the checkout")
+    installed = parser.parse_args().installed
     home = Path(cathsim_dmc.__file__).resolve()
     checkout = Path(__file__).resolve().parents[1] / "cathsim_dmc"
-    if len(sys.argv) > 1 and sys.argv[1] == "--installed":
+    if installed:
         # The environment itself may be in the checkout, as with `make dist`.
         assert home.parent != checkout, f"{home} is the checkout, not the package"
     environment = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 0})

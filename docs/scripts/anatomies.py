@@ -3,6 +3,7 @@
 python docs/scripts/anatomies.py
 """
 
+import argparse
 import json
 from pathlib import Path
 
@@ -227,4 +228,5 @@ def main():
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     main()

@@ -6,8 +6,8 @@ REPORT is the output of ``python benchmarks/wires.py DIRECTORY``. Only statistic
 written: the measured data may not be redistributed.
 """
 
+import argparse
 import json
-import sys
 from pathlib import Path
 
 import figures
@@ -101,4 +101,6 @@ def figure(rows):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("report", help="output of benchmarks/wires.py")
+    main(parser.parse_args().report)

@@ -11,12 +11,12 @@ and recordings of policies that ship. None of these files is in the repository.
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import shutil
 import socket
 import subprocess
-import sys
 import time
 import urllib.error
 import urllib.request
@@ -71,7 +71,9 @@ RECORDINGS = (
 
 
 def main() -> None:
-    site = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "build" / "site")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("site", nargs="?", type=Path, default=ROOT / "build" / "site")
+    site = parser.parse_args().site
     out = site / "browser"
     if not (out / "steer.html").is_file():
         raise SystemExit(f"{out} holds no pages; run `make docs` first")

@@ -4,6 +4,7 @@ python docs/scripts/cluster.py          (with nothing else running)
 python docs/scripts/cluster.py --write  (the tables alone, from docs/data)
 """
 
+import argparse
 import json
 import subprocess
 import sys
@@ -64,7 +65,9 @@ def costs(found):
 
 
 def main():
-    if "--write" not in sys.argv:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--write", action="store_true", help="tables alone")
+    if not parser.parse_args().write:
         measure()
     report = json.loads((figures.DATA / "cluster.json").read_text())
     found = report["findings"]

@@ -6,6 +6,7 @@ The expert's actions with the stated damping are replayed with other damping (op
 loop), and the expert plays with other damping (closed loop).
 """
 
+import argparse
 from pathlib import Path
 
 import figures
@@ -57,4 +58,5 @@ def main():
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     main()

@@ -8,6 +8,7 @@ docs/scripts/difficulty.py REPORT.json ... If several have the same policy and t
 one with most episodes is kept, or else the last.
 """
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -112,4 +113,6 @@ def _force(trial):
 
 
 if __name__ == "__main__":
-    main([Path(argument) for argument in sys.argv[1:]])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("reports", nargs="*", type=Path, help="further reports")
+    main(parser.parse_args().reports)

@@ -13,6 +13,7 @@ The marker `report FILE` of a page holds the report's own `table`, or else its c
 one row, with the worst value, for checks whose names differ only in numbers or devices.
 """
 
+import argparse
 import datetime
 import json
 import os
@@ -249,4 +250,6 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("report", nargs="*", metavar="NAME COMMAND", help="see above")
+    main(parser.parse_args().report)

@@ -7,6 +7,7 @@ the commits between which a part of them gave the same results although its file
 changed. The current files are compared with those of the commit of the figure.
 """
 
+import argparse
 import fnmatch
 import functools
 import json
@@ -119,4 +120,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     sys.exit(main())

@@ -9,8 +9,8 @@ docs/images/cannulation.webp. Needs no OpenGL; the same seeds give the same clip
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-import sys
 from pathlib import Path
 
 from cathsim_dmc.agents import load_policy  # must be imported before dm_control
@@ -138,9 +138,15 @@ README = Clip("cannulation", "", "expert", "femoral_type1_lcca", 3)
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    clips = {clip.name: clip for clip in (*CLIPS, README)}
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {[*clips]}")
+    names = parser.parse_args().names
+    if unknown := set(names) - clips.keys():
+        parser.error(f"no clips {sorted(unknown)}; there are {[*clips]}")
     FOLDER.mkdir(exist_ok=True)
-    for clip in (*CLIPS, README):
-        if len(sys.argv) > 1 and clip.name not in sys.argv[1:]:
+    for clip in clips.values():
+        if names and clip.name not in names:
             continue
         policy = load_policy(clip.policy, clip.seed)
         task, kwargs = task_and_options(policy, clip.task, clip.options)

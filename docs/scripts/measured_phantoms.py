@@ -8,6 +8,7 @@ points are unchanged; the splines of `anatomy.curves` smooth them. The radii bec
 those of each vessel's own lumen, see `own_radii`.
 """
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -111,11 +112,13 @@ def text(content):
 
 
 def main():
-    stale = []
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="compare, write nothing")
+    check, stale = parser.parse_args().check, []
     for name in MEASURED:
         new = text(tree_file(name)).encode()
         path = _DATA / f"{name}.json"
-        if "--check" in sys.argv:
+        if check:
             if path.read_bytes() != new:
                 stale.append(str(path))
         else:

@@ -10,9 +10,9 @@ notebook there.
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -93,13 +93,17 @@ def _processor_seconds() -> float:
 
 
 def main() -> None:
-    chosen = sys.argv[1:]
-    if chosen[:1] == ["--repository"]:
-        if len(chosen) != 2 or not re.fullmatch(r"[\w.-]+/[\w.-]+|", chosen[1]):
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help="part of a file name")
+    parser.add_argument("--repository", metavar="OWNER/NAME", help="for Colab")
+    options = parser.parse_args()
+    chosen, repository = options.names, options.repository
+    if repository is not None:
+        if chosen or not re.fullmatch(r"[\w.-]+/[\w.-]+|", repository):
             raise SystemExit("give --repository OWNER/NAME")
         for path in notebooks():
             notebook = nbformat.read(path, as_version=4)
-            for_colab(notebook, path.name, chosen[1])
+            for_colab(notebook, path.name, repository)
             nbformat.write(notebook, path)
         return
     for path in notebooks():

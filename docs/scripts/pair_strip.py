@@ -10,8 +10,8 @@ the same pictures.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -125,9 +125,11 @@ def strip(
 
 
 def main() -> None:
-    if len(sys.argv) > 1:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scan", nargs="?", help="directory of an imported scan")
+    if scan := parser.parse_args().scan:
         options = {
-            "anatomy": sys.argv[1],
+            "anatomy": scan,
             "goal": "lva",
             "devices": suite.COAXIAL["pair"][0],
         }

@@ -4,6 +4,7 @@ python docs/scripts/performance.py          (with nothing else running)
 python docs/scripts/performance.py --write  (the tables alone, from docs/data)
 """
 
+import argparse
 import json
 import re
 import subprocess
@@ -90,7 +91,9 @@ def batches(report):
 
 
 def main():
-    if "--write" not in sys.argv:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--write", action="store_true", help="tables alone")
+    if not parser.parse_args().write:
         measure()
     report = json.loads(DATA.read_text())
     makers = (factors, others, depths, stages, batches)

@@ -8,6 +8,7 @@ time and with the commands of the user, and writes the table into the page.
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import subprocess
@@ -76,4 +77,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     main()

@@ -3,6 +3,7 @@
 Needs an OpenGL library: MUJOCO_GL=egl or osmesa python docs/scripts/scene_picture.py
 """
 
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -44,4 +45,5 @@ def main():
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     main()

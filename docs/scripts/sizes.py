@@ -9,6 +9,7 @@ table between the markers of the page.
 
 from __future__ import annotations
 
+import argparse
 import tomllib
 from importlib import metadata
 from pathlib import Path
@@ -88,4 +89,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     main()
