@@ -9,6 +9,20 @@ from typing import Any
 import numpy as np
 
 
+class Constant(dict[str, Any]):
+    """A mapping that cannot be changed; JSON, pickles and copies take it."""
+
+    def __reduce__(self):
+        return type(self), (dict(self),)
+
+    def _unchanged(self, *_: Any, **__: Any) -> Any:
+        raise TypeError(f"{dict(self)} cannot be changed; change a copy, dict(...)")
+
+    _never: Any = _unchanged  # of any signature
+    __setitem__ = __delitem__ = __ior__ = _never
+    update = pop = popitem = clear = setdefault = _never
+
+
 def split(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Splits options into JSON values and the objects that JSON cannot hold."""
     plain, objects = dict[str, Any](), dict[str, Any]()

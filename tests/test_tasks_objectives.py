@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import json
 import pickle
 
 import numpy as np
@@ -305,6 +306,18 @@ def test_an_objective_is_copied_and_pickled(anatomy, way):
     np.testing.assert_array_equal(
         other.lumen_distance(head), objective.lumen_distance(head)
     )
+
+
+@pytest.mark.parametrize("way", [copy.copy, copy.deepcopy, pickled])
+def test_the_published_reward_reaches_other_processes_and_files(way):
+    """As an option of a task, `reward=PUBLISHED_REWARD`."""
+    other = way(PUBLISHED_REWARD)
+    assert other == json.loads(json.dumps(PUBLISHED_REWARD)) == dict(PUBLISHED_REWARD)
+    for change in (other.clear, other.popitem, lambda: other.update(force=1.0)):
+        with pytest.raises(TypeError, match="cannot be changed"):
+            change()
+    with pytest.raises(TypeError, match="cannot be changed"):
+        other |= {"force": 1.0}
 
 
 def test_a_simulation_that_has_diverged_does_not_keep_others_from_beginning():

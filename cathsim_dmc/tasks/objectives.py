@@ -13,6 +13,7 @@ import numpy as np
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Centreline, Goal
 from cathsim_dmc.anatomy.geodesic import LumenDistance
+from cathsim_dmc.json_options import Constant
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.readings import part
 
@@ -21,9 +22,7 @@ GOAL_RADIUS = 8e-3  # m, δ of the published task
 _FARTHEST = 1.0  # m; a larger δ is taken for one given in millimetres
 GENTLE = 0.1  # N, sum of all contacts above which a push counts as hard
 # Weights of the published reward: minus the distance in metres, or 10 at success.
-PUBLISHED_REWARD: Mapping[str, float] = MappingProxyType(
-    {"distance": -1.0, "success": 10.0}
-)
+PUBLISHED_REWARD: Mapping[str, float] = Constant(distance=-1.0, success=10.0)
 
 
 class Measurement(NamedTuple):
@@ -282,14 +281,7 @@ class Cannulation(Shiftable, Routed):
         if not bounds.mapping("reward", self.weights, known):
             bounds.refuse("reward", self.weights, f"some of {', '.join(known)}")
         weights = {n: bounds.number(f"reward {n}", w) for n, w in self.weights.items()}
-        object.__setattr__(self, "weights", MappingProxyType(weights))
-
-    def __getstate__(self):
-        """State of copies and pickles, which hold no read-only view of a mapping."""
-        return {**vars(self), "weights": dict(self.weights)}
-
-    def __setstate__(self, state):
-        vars(self).update(state, weights=MappingProxyType(state["weights"]))
+        object.__setattr__(self, "weights", Constant(weights))
 
     @classmethod
     def to(
