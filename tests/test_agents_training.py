@@ -298,7 +298,7 @@ def test_an_interrupt_saves_and_can_be_resumed(tmp_path, capsys):
 
 def test_a_run_is_neither_overwritten_nor_resumed_with_other_settings(tmp_path):
     run(small_ppo(total_frames=512), tmp_path)
-    with pytest.raises(ConfigError, match="already holds a run"):
+    with pytest.raises(ConfigError, match="already holds a run: resume .*--resume"):
         run(small_ppo(total_frames=512), tmp_path)
     with pytest.raises(ConfigError, match="clip: it has 0.1, given is 0.3"):
         run(small_ppo(clip=0.3), tmp_path, resume=True)

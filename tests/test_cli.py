@@ -608,6 +608,22 @@ BAD = {
         ["test_cli.py is a file", "directory", "--out"],
     ),
     "no such checkpoint": (["eval", "OUT"], ["no policy OUT", "expert"]),
+    "no such policy to drive": (
+        ["drive", "OUT", "--connect", "127.0.0.1:1"],
+        ["no policy OUT", "none of pretrained:NAME"],
+    ),
+    "no such policy to start from": (
+        [*TRAIN, "--initial-policy", "nobody", "--num-envs", 1],
+        ["no policy nobody", "none of pretrained:NAME"],
+    ),
+    "a place of two numbers": (
+        ["eval", "push", "--anatomy", "type1", "--goal", "22,15"],
+        ["goal (--goal) is '22,15'", "x,y,z"],
+    ),
+    "a reward of the training": (
+        [*TRAIN, "--training-reward", "paht", -1],
+        ["training_reward is {'paht': -1.0}", "path"],
+    ),
     "a picture that would be no PNG": (
         ["phantom", "check", "type1", "--figure", "OUT.jpg"],
         ["OUT.jpg does not end in .png"],

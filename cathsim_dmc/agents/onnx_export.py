@@ -102,7 +102,7 @@ def write_onnx(
         raise FileExistsError(f"{directory} exists; give a directory that does not")
     files.require_place(directory.parent)
     bounds.seed("seed", seed)
-    player = load_policy(policy)
+    player = load_policy(policy, scripted=False)
     if not isinstance(player, TrainedPolicy):
         raise ValueError(
             f"the policy {player.name!r} has no network; give a run, a checkpoint or "

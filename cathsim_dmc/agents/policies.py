@@ -150,7 +150,7 @@ def _require(policy: Policy, what: str, own: Any, given: Any) -> None:
         )
 
 
-def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
+def load_policy(policy: PolicyLike, seed: int = 0, scripted: bool = True) -> Policy:
     """Returns a policy from its name, file, run or function.
 
     Args:
@@ -158,6 +158,7 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
             hub, file of a pretrained policy, directory of a run or of a checkpoint,
             Checkpoint, policy, or function as for `FunctionPolicy`.
         seed: Seed of a named policy's own randomness.
+        scripted: Whether an error lists `POLICIES`, which not every caller takes.
 
     Raises:
         CheckpointError: there is no policy of that name, or it is damaged.
@@ -180,9 +181,10 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
         return make_policy(str(policy), seed)
     path = pretrained.pretrained_path(policy)
     if not (path or Path(policy)).exists():
+        named = [*(POLICIES if scripted else ()), "pretrained:NAME"]
         raise CheckpointError(
             f"no policy {policy}: it is no file or directory, and none of "
-            f"{', '.join(POLICIES)}, pretrained:NAME"
+            f"{', '.join(named)}"
         )
     return TrainedPolicy(Checkpoint.open(policy) if path is None else path)
 

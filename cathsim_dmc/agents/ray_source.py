@@ -138,7 +138,7 @@ class RaySource:
             raise RuntimeError(
                 f"collectors {sorted(lost)} were lost {MOST_LOSSES} times in a row "
                 f"without a batch ({_line(lost.popitem()[1])}); the run can be resumed "
-                "from its last checkpoint"
+                "from its last checkpoint (resume=True, --resume)"
             )
         self._frames += self._config.frames_per_batch
         return torch.cat([parts[number] for number in sorted(parts)])

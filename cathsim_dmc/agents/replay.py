@@ -88,8 +88,8 @@ class ReplayMemory:
             text = (
                 f"the replay of {size:,} transitions is lost: {path} is missing, "
                 "damaged or of another checkpoint. Resume without it "
-                "(without_replay=True, --without-replay): the run keeps its networks "
-                "and collects new transitions. What was found"
+                "(without_replay=True, --resume --without-replay): the run keeps its "
+                "networks and collects new transitions. What was found"
             )
             wrong = OSError, ValueError, TypeError, RuntimeError, EOFError
             with files.refused(ReplayError, text, wrong):

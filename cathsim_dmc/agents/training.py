@@ -144,12 +144,17 @@ def _environment(config: TrainingConfig, make_env: EnvFactory, frames: int) -> E
     # The seed depends on the frames, so that a resumed run gets new episodes.
     stretch = [config.seed, frames]
     seed = int(np.random.SeedSequence(stretch).generate_state(1)[0]) % 2**31
-    return make_env(
-        config.task, observation=config.collected_observation,
-        num_envs=config.num_envs, num_threads=config.num_threads, seed=seed,
-        task_kwargs=config.training_kwargs,
-        **bounds.option_simulation_device(config.simulation_device),
-    )  # fmt: skip
+    try:
+        return make_env(
+            config.task, observation=config.collected_observation,
+            num_envs=config.num_envs, num_threads=config.num_threads, seed=seed,
+            task_kwargs=config.training_kwargs,
+            **bounds.option_simulation_device(config.simulation_device),
+        )  # fmt: skip
+    except ValueError as error:
+        if config.training_reward and str(error).startswith("reward "):
+            raise ConfigError(f"training_{error}") from error
+        raise
 
 
 @contextlib.contextmanager
@@ -175,7 +180,7 @@ def no_run(path: str | Path) -> str:
     """Return the error message for resuming in a directory without a run."""
     return (
         f"there is no run in {path} to resume: give the directory of one, or start a "
-        "new one without resume."
+        "new one without resume (--resume)."
     )
 
 
@@ -187,7 +192,8 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
     read_metrics(run / "metrics.csv")  # raises before any work if damaged
     if existing and not resume:
         raise ConfigError(
-            f"{run} already holds a run: resume it, or choose another directory."
+            f"{run} already holds a run: resume it (resume=True, --resume), or choose "
+            "another directory."
         )
     if resume and not existing and not (run / CONFIG_FILE).exists():
         raise ConfigError(no_run(run))
@@ -262,7 +268,7 @@ def take_over(
         CheckpointError: the initial policy is missing or damaged.
     """
     name = f"initial_policy={config.initial_policy!r}"
-    source = load_policy(str(config.initial_policy))
+    source = load_policy(str(config.initial_policy), scripted=False)
     if not isinstance(source, TrainedPolicy):
         raise ConfigError(
             f"{name} has no network: give the directory of a run or of a checkpoint, "

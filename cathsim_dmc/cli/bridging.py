@@ -114,7 +114,7 @@ def drive(
     if seed is not None:
         bounds.seeds("seed", seed, episodes)
     bridge.Log.require(log)
-    player = agents.load_policy(policy)
+    player = agents.load_policy(policy, scripted=False)
     if not isinstance(player, FunctionPolicy):
         raise ValueError(
             f"the policy {player.name!r} looks at the simulation, which is not in this "

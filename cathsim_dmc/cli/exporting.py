@@ -66,7 +66,7 @@ def export(
         if wall != "merged":
             raise ValueError(f"the policy {what} has no wall; leave --wall out")
         seed = EVALUATION_SEED if seed is None else seed
-        player = agents.load_policy(what)
+        player = agents.load_policy(what, scripted=False)
         written = write_onnx(
             player, out, task=task, task_kwargs=options.given, seed=seed
         )

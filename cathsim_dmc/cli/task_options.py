@@ -9,6 +9,7 @@ import docstring_parser
 from tyro import conf
 from tyro.constructors import PrimitiveConstructorSpec
 
+from cathsim_dmc import bounds
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import Cannulation
 
@@ -52,13 +53,20 @@ class TaskOptions:
 
 
 def _several(text: str) -> list[float] | list[str] | None:
-    """Returns the parts of "12,-30.5,110" (a place) or "lcca,any"; None of one part."""
+    """Returns the parts of "12,-30.5,110" (a place) or "lcca,any"; None of one part.
+
+    ValueError for another count of numbers.
+    """
     parts = text.strip("[]() ").split(",")
     try:
         place = [float(part) for part in parts]
     except ValueError:
         return [part.strip() for part in parts] if len(parts) > 1 else None
-    return place if len(place) == 3 else None
+    if len(place) == 1:
+        return None
+    if len(place) != 3:
+        bounds.refuse("goal (--goal)", text, "a name, names, or a place x,y,z")
+    return place
 
 
 def _read(words: list[str]) -> Any:
