@@ -61,6 +61,14 @@ def test_what_is_missing_is_told_before_the_environment_is_made():
         check_usable(make_config(task="own_task", modules=["no_such_module"]))
 
 
+def test_options_of_the_evaluation_alone_are_checked_before_a_training():
+    own, path = {"reward": {"paht": -1.0}}, {"path": -1.0}
+    config = make_config(task="simple1_bca", training_reward=path, task_kwargs=own)
+    with pytest.raises(ValueError, match="reward is {'paht': -1.0}"):
+        check_usable(config)
+    check_usable(config.replace(task_kwargs={"reward": path}))
+
+
 def test_unknown_names_list_the_valid_ones():
     with pytest.raises(ConfigError, match="ppo.*sac"):
         make_config("dqn")

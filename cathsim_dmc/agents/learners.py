@@ -62,7 +62,8 @@ def check_usable(config: TrainingConfig) -> None:
     Raises:
         ConfigError: device, compiler, logger or collectors cannot be used; says what
             can.
-        ValueError: the task is unknown, as while its modules are not imported.
+        ValueError: the task is unknown, as while its modules are not imported, or does
+            not take an option that only the evaluation has.
         DatasetError: the demonstrations are missing.
     """
     if config.modules:
@@ -81,3 +82,10 @@ def check_usable(config: TrainingConfig) -> None:
     if shown or config.algorithm == "bc":
         require_dataset(shown)
     check_collector(config, LEARNERS[config.algorithm].learner)
+    definition, own = suite.TASKS.get(config.task), {**config.task_kwargs}
+    if definition and any(
+        config.training_kwargs[name] is not own[name] for name in own
+    ):
+        if definition.random_arch and "numbers" not in own:
+            own["pool"] = 1  # one arch suffices, and more take longer
+        suite.make_task(config.task, **own)
