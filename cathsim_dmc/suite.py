@@ -172,6 +172,8 @@ def _configured(
     if unknown := sorted(set(options) - {*task_options(name)}):
         having = [task for task in TASKS if {*unknown} <= {*task_options(task)}]
         others = f"; {', '.join(having)} have it" if having else ""
+        if "task_kwargs" in unknown:
+            others = "; give the options themselves, not a mapping of them"
         raise ValueError(
             f"{name} has no task option {', '.join(map(repr, unknown))}; there are "
             f"random, {', '.join(task_options(name))}{others}"

@@ -232,6 +232,9 @@ def test_a_physics_error_ends_an_episode_of_a_vector_as_of_a_single_one():
         ({"autoreset_mode": "Never"}, "SameStep"),
         ({"dtype": "int8"}, "dtype"),
         ({"num_envs": 0}, "num_simulations"),
+        ({"max_episode_steps": 3, "max_steps": 4}, "max_episode_steps is 3; .*be 4"),
+        ({"max_episode_steps": 0}, "max_steps is 0"),
+        ({"task_kwargs": {"max_steps": 3}}, "'task_kwargs'.*options themselves"),
     ],
 )
 def test_wrong_arguments_of_a_vector_are_refused(options, word):
@@ -289,7 +292,7 @@ def test_a_vector_takes_the_seed_of_its_task():
 
 def test_gymnasiums_vector_wrappers_take_the_batch():
     wrappers = gymnasium.wrappers.vector
-    env = gymnasium.make_vec(TASK, 2, max_steps=3)
+    env = gymnasium.make_vec(TASK, 2, max_episode_steps=3)
     env = wrappers.RecordEpisodeStatistics(wrappers.FlattenObservation(env))
     observation, _ = env.reset(seed=0)
     assert observation.shape == (2, *env.single_observation_space.shape)

@@ -205,10 +205,15 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
             **task_kwargs: Options of the task, such as `observation`, and `random`, a
                 seed of the first simulation, from which the others count up, or one
                 seed for each; without it they are seeded from the system.
+                Gymnasium's `max_episode_steps` is `max_steps`.
         """
         self.render_mode = _render_mode(render_mode)
         self._dtype = _float_type(dtype)
         seed = task_kwargs.pop("random", None)
+        most = task_kwargs.pop("max_episode_steps", None)
+        if most is not None and task_kwargs.setdefault("max_steps", most) != most:
+            usual = f"{task_kwargs['max_steps']}, as max_steps; give one of the two"
+            bounds.refuse("max_episode_steps", most, usual)
         modes = [mode.value for mode in AutoresetMode]
         mode = getattr(autoreset_mode, "value", autoreset_mode)
         mode = bounds.choice("autoreset_mode", mode, modes)
