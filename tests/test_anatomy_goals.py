@@ -131,7 +131,8 @@ def test_a_goal_beyond_a_fork_is_reached_by_the_branch_that_the_inlet_passes():
 def test_the_command_line_takes_a_place(text):
     assert TaskOptions(goal=text).given == {"goal": [1.5, -2.0, 30.0]}
     assert TaskOptions(goal="lcca").given == {"goal": "lcca"}
-    assert TaskOptions(goal="1,2").given == {"goal": "1,2"}
+    with pytest.raises(ValueError, match="goal .--goal. is '1,2'.*place x,y,z"):
+        assert TaskOptions(goal="1,2").given
     assert TaskOptions(goal="lcca, any").given == {"goal": ["lcca", "any"]}
 
 

@@ -104,6 +104,42 @@ def test_commands_take_own_tasks(cathsim, module, command):
     assert "own_demo" in out or "episodes succeed" in out
 
 
+OBJECTIVE = """
+from cathsim_dmc import suite
+from cathsim_dmc.tasks.objectives import Cannulation
+
+def objective(anatomy, goal, *, bonus=1.0, terms=()):
+    reward = {"success": bonus} | dict.fromkeys(terms, -1.0)
+    return Cannulation.to(anatomy, goal, reward=reward, goal_radius=0.5)
+
+suite.register(
+    "own_bonus", suite.TaskDefinition("A bonus.", "simple1", "bca", None, objective)
+)
+"""
+
+
+def test_options_of_an_own_objective_are_given_on_the_command_line(
+    cathsim, module, tmp_path
+):
+    module("own_four", "own_fourth")
+    (tmp_path / "own_four.py").write_text(OBJECTIVE)
+    play = "eval", "push", "--task", "own_bonus", "--import", "own_four", "--json"
+    play += "--no-baseline", "--episodes", 1
+    given = "--option", "bonus=70", "--option", 'terms=["time"]'
+    code, out, err = cathsim(*play, *given)
+    assert code == 0, err
+    result = json.loads(out)["policy"]
+    options = {"bonus": 70, "terms": ["time"]}
+    assert options.items() <= result["settings"]["task_kwargs"].items()
+    (episode,) = result["episodes"]
+    assert abs(episode["reward"] + episode["length"] - 70) <= 1
+    for wrong in ("bonus", "=3", "bonus=3 --option bonus=4"):
+        code, _, err = cathsim(*play, "--option", *wrong.split())
+        assert code == 2 and "it must be name=value" in err
+    code, _, err = cathsim(*play, "--option", "bonuss=3")
+    assert code == 2 and "no task option 'bonuss'" in err
+
+
 @pytest.mark.parametrize("command", cli.COMMANDS)
 def test_commands_with_the_option_import_the_modules(cathsim, command):
     """`serve`, `export` and `replay-error` once had it and imported nothing."""

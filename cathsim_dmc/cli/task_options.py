@@ -33,6 +33,8 @@ class TaskOptions:
         pool: Number of arches that episodes draw from (the same tasks).
         first: Number in the set of the first of them (the same tasks).
         numbers: Their numbers in the set, in place of pool and first.
+        option: Option of the objective of a task of your own, name=value, repeated for
+            several; the value is text or JSON.
     """
 
     anatomy: Annotated[str | None, conf.arg(aliases=("--phantom",))] = None
@@ -42,6 +44,9 @@ class TaskOptions:
     pool: int | None = None
     first: int | None = None
     numbers: tuple[int, ...] | None = None
+    option: Annotated[
+        tuple[str, ...], conf.UseAppendAction, conf.arg(metavar="NAME=VALUE")
+    ] = ()
 
     @property
     def given(self) -> dict[str, Any]:
@@ -49,6 +54,11 @@ class TaskOptions:
         given = {name: one for name, one in vars(self).items() if one is not None}
         if self.goal is not None and (several := _several(self.goal)):
             given["goal"] = several
+        for text in given.pop("option"):
+            name, sign, value = text.partition("=")
+            if not name or not sign or name in given:
+                bounds.refuse("--option", text, "name=value, each name given once")
+            given[name] = _read([value])
         return given
 
 
