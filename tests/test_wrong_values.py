@@ -9,6 +9,7 @@ from dm_control import composer
 
 import cathsim_dmc
 from cathsim_dmc import bounds, suite
+from cathsim_dmc.bridge.serving import ServeOptions
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
@@ -133,6 +134,18 @@ def test_settings_of_the_expert_are_checked(kind, given, words):
     with pytest.raises(ValueError, match=words):
         kind(**given)
     assert kind() == dataclasses.replace(kind())
+
+
+@pytest.mark.parametrize("goal", [[1, [2]], [[1, 8, 4], [1]], ["1", 2, 3], (1, 2), {}])
+def test_a_goal_that_is_no_place_is_refused(goal):
+    with pytest.raises(ValueError, match="^goal is .*the name of a goal, a Goal, or"):
+        suite.make_task("navigate", goal=goal)
+
+
+@pytest.mark.parametrize("value", [1, "no", None, [True], {"a": 1}])
+def test_a_device_is_served_in_lockstep_or_not(value):
+    with pytest.raises(ValueError, match="^lockstep is .*True or False"):
+        ServeOptions(lockstep=value)
 
 
 def test_so_are_numbers_in_a_row():

@@ -47,6 +47,7 @@ class ServeOptions:
     force_limit: float | None = FORCE_LIMIT
 
     def __post_init__(self) -> None:
+        bounds.switch("lockstep", self.lockstep)
         bounds.choice("missed", self.missed, ("still", "hold"))
         bounds.number("watchdog", self.watchdog, 0.0, 3600.0, "s", positive=True)
         if self.force_limit is not None:

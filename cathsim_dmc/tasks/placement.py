@@ -85,7 +85,9 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal | Sequence[float]") -> Goal
     if isinstance(goal, str):
         goal = anatomy.goal(goal)
     elif not isinstance(goal, Goal):
-        if np.shape(goal) != (3,):
+        try:
+            goal = bounds.vector("goal", goal, 3)
+        except ValueError:
             bounds.refuse("goal", goal, "the name of a goal, a Goal, or (x, y, z)")
         goal = anatomy.goal_at(goal)
         alone = dataclasses.replace(anatomy, goals={goal.name: goal})
