@@ -17,6 +17,7 @@ from cathsim_dmc.analysis.force_statistics import FIGURES, EpisodeForces, Statis
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.cli import agents as commands
 from cathsim_dmc.cli import task_options
+from cathsim_dmc.cli.options import told_of_replaced
 from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.forces import NAMES
@@ -495,3 +496,16 @@ def test_effects_of_a_task_are_no_option_of_its_episodes(monkeypatch):
     given = {"effects": []}
     (part,) = protocols.parts(protocols.get("published"), "blown", given, 2, 0)
     assert part.task_kwargs == {"max_steps": 3, "effects": []}
+
+
+def test_an_earlier_heatmap_does_not_stay_beside_other_results(
+    tmp_path, monkeypatch, capsys
+):
+    old, task = tmp_path / "heatmap.png", types.SimpleNamespace(num_anatomies=2)
+    monkeypatch.setattr(suite, "make_task", lambda name, **options: task)
+    result = types.SimpleNamespace(task="arch_bca", settings={"task_kwargs": {}})
+    old.write_bytes(b"of another evaluation")
+    with told_of_replaced([old]):
+        evaluation.ContactLog().draw(result, old)
+    assert not old.exists()
+    assert f"{old}, which was there before, is removed" in capsys.readouterr().err

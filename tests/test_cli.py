@@ -657,6 +657,10 @@ BAD = {
         ["eval", "push", "--task", "type1_bca", "--pool", 2],
         ["no task option 'pool'"],
     ),
+    "a port without a page": (
+        ["replay", "OUT.rrd", "--port", 9191],
+        ["--port is 9191", "add --web"],
+    ),
     "an option that is no JSON": (
         ["eval", "push", "--task", "type1_bca", "--randomisation", "{delay"],
         ["randomisation", "{delay", "friction"],

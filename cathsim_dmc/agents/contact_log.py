@@ -43,9 +43,13 @@ class ContactLog:
         return _joined(self._steps)
 
     def draw(self, result: Any, path: Path) -> None:
-        """Writes the heatmap of an `EvaluationResult` as PNG, if of one anatomy."""
+        """Writes the heatmap of an `EvaluationResult` as PNG, if of one anatomy.
+
+        Otherwise removes that of an earlier evaluation.
+        """
         task = suite.make_task(result.task, **result.settings["task_kwargs"])
         if task.num_anatomies > 1:
+            path.unlink(missing_ok=True)
             return
         title = f"{result.task}, {result.policy}: {len(result.episodes)} episodes"
         anatomy = task.scene.anatomy

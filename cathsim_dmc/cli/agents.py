@@ -211,7 +211,7 @@ def record(
         gif: Path of a film for slides, .gif, .webp or, with the extra `video`, .mp4;
             needs no OpenGL.
         seed: Seed of the episode.
-        fluoroscopy: Whether to include X-ray images.
+        fluoroscopy: Whether an .rrd file has X-ray images.
         options: Options of the task, over those that the policy was trained with.
     """
     targets = [path for path in (out, gif) if path is not None]

@@ -46,11 +46,13 @@ def told_of_losses() -> contextlib.redirect_stdout:
 
 @contextlib.contextmanager
 def told_of_replaced(paths: Iterable[Path]) -> Iterator[None]:
-    """Report on standard error which of some files the block has replaced."""
+    """Report on standard error which of some files the block replaces or removes."""
     before = {path: path.stat().st_mtime_ns for path in paths if path.is_file()}
     yield
     for path, written in before.items():
-        if path.stat().st_mtime_ns != written:
+        if not path.is_file():
+            say(f"{path}, which was there before, is removed")
+        elif path.stat().st_mtime_ns != written:
             say(f"{path}, which was there before, is replaced")
 
 

@@ -50,7 +50,7 @@ def replay(
     recording: Annotated[Path, conf.Positional],
     /,
     web: bool = False,
-    port: int = viewer.WEB_PORT,
+    port: int | None = None,
     data_port: int | None = None,
 ) -> int:
     """Open a recording in the Rerun viewer.
@@ -58,7 +58,7 @@ def replay(
     Args:
         recording: Path of an .rrd file.
         web: Whether to serve it to a browser instead of opening a window.
-        port: Port of the web page.
+        port: Port of the web page; by default 9090.
         data_port: Port that the page reads the recording from; by default 9876, or
             another one if it is taken. A browser on another machine needs both ports:
             ssh -L 9090:localhost:9090 -L 9876:localhost:9876 MACHINE
@@ -66,6 +66,9 @@ def replay(
     for name, one in {"port": port, "data_port": data_port}.items():
         if one is not None:
             bounds.whole(name, one, 1, 65535)
+    if port is not None and not web:
+        raise ValueError(f"--port is {port}, the port of a web page; add --web")
+    port = viewer.WEB_PORT if port is None else port
     viewer.open_viewer(recording, web=web, port=port, data_port=data_port)
     return 0
 
