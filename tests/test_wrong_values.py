@@ -21,7 +21,7 @@ from cathsim_dmc.physics.effects import Draw, Effect
 from cathsim_dmc.physics.forces import Contacts
 from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.play.session import play
-from cathsim_dmc.policies import POLICIES, make_policy
+from cathsim_dmc.policies import POLICIES, Policy, make_policy
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
 from cathsim_dmc.policies.pursuit import Plan, Settings
 from cathsim_dmc.tasks.coaxial_ends import CoaxialEnds
@@ -140,6 +140,17 @@ def test_settings_of_the_expert_are_checked(kind, given, words):
 def test_a_goal_that_is_no_place_is_refused(goal):
     with pytest.raises(ValueError, match="^goal is .*the name of a goal, a Goal, or"):
         suite.make_task("navigate", goal=goal)
+
+
+def test_own_policies_are_policies_that_act(monkeypatch):
+    monkeypatch.setitem(POLICIES, "function", lambda seed: lambda observation: None)
+    with pytest.raises(
+        ValueError, match=r"POLICIES\['function'\]\(seed\) is .*a Policy"
+    ):
+        make_policy("function")
+    monkeypatch.setitem(POLICIES, "idler", lambda seed: type("Idler", (Policy,), {})())
+    with pytest.raises(NotImplementedError, match=r"Idler lacks act\(observation\)"):
+        make_policy("idler").act(None)
 
 
 @pytest.mark.parametrize("value", [1, "no", None, [True], {"a": 1}])

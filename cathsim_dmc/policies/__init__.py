@@ -26,9 +26,12 @@ def make_policy(name: str, seed: int = 0) -> Policy:
             up.
 
     Raises:
-        ValueError: there is no policy of that name; lists the names.
+        ValueError: there is no policy of that name; lists the names. Or its entry in
+            `POLICIES` makes no policy.
     """
-    return POLICIES[bounds.choice("policy", name, POLICIES)](bounds.seed("seed", seed))
+    make = POLICIES[bounds.choice("policy", name, POLICIES)]
+    made = make(bounds.seed("seed", seed))
+    return bounds.instance(f"POLICIES[{name!r}](seed)", made, Policy)
 
 
 __all__ = ["POLICIES", "Policy", "Teacher", "View", "in_environment", "make_policy"]

@@ -89,7 +89,7 @@ class Policy:
         Returns:
             (N, A) actions in [-1, 1].
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} lacks act(observation)")
 
 
 def in_environment(
