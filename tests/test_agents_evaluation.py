@@ -421,6 +421,9 @@ def test_the_table_says_which_force_is_which(capsys, monkeypatch):
     mean, deviation = result.mean_sd("forces.sum.mean")
     assert mean > 0.1
     assert f"│ {1e3 * mean:.0f} ± {1e3 * deviation:.0f}" in text
+    for wrong in ("forces.sum.maen", "forces", "forces.sum", "lenght", 3, "policy"):
+        with pytest.raises(ValueError, match=r"the figure is .*length.*peak_sum.*mean"):
+            result.values(wrong)
 
 
 def test_a_function_of_one_observation_is_told_what_to_do():

@@ -2,14 +2,14 @@
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import json_options
+from cathsim_dmc import bounds, json_options
 from cathsim_dmc.agents.episodes import EpisodeOutcome
-from cathsim_dmc.analysis.force_statistics import QUANTITIES, STATISTICS
+from cathsim_dmc.analysis.force_statistics import FIGURES, QUANTITIES, STATISTICS
 from cathsim_dmc.analysis.intervals import success_interval
 
 # Largest sums of the force on the wall up to which success is called safe, N.
@@ -45,6 +45,9 @@ class EvaluationResult:
         Args:
             name: Name of an attribute of `EpisodeOutcome`, with dots for nested ones,
                 such as "reward" or "forces.peak_sum.maximum".
+
+        Raises:
+            ValueError: there is no figure of that name; lists those that are.
         """
 
         def value(outcome: Any) -> Any:
@@ -52,7 +55,14 @@ class EvaluationResult:
                 outcome = None if outcome is None else getattr(outcome, part)
             return outcome
 
-        return np.array([value(e) for e in self.episodes], dtype=np.float64)
+        try:
+            return np.array([value(e) for e in self.episodes], dtype=np.float64)
+        except (AttributeError, TypeError):
+            known = [f.name for f in fields(EpisodeOutcome) if f.name != "forces"]
+            known += [f"forces.{one}" for one in FIGURES]
+            each = f"{' or '.join(QUANTITIES)} and {' or '.join(STATISTICS)}"
+            allowed = f"one of {', '.join(known)}, or forces.QUANTITY.STATISTIC, {each}"
+            bounds.refuse("the figure", name, allowed)
 
     def mean_sd(self, name: str) -> tuple[float | None, float | None]:
         """Return mean and sample standard deviation over the episodes, or None."""
