@@ -900,7 +900,7 @@ def test_the_seeds_of_episodes_that_a_command_drives_count_up(
         return np.zeros((1, 2))
 
     policy = FunctionPolicy(still)
-    monkeypatch.setattr(bridging.agents, "load_policy", lambda *_: policy)
+    monkeypatch.setattr(bridging.agents, "load_policy", lambda *_, **__: policy)
     robot = Robot(steps=2)
     served = Served(robot, episodes=3, lockstep=True)
     code, out, err = cathsim(
