@@ -164,3 +164,24 @@ def test_the_example_of_ppo_learns_what_it_prints(tmp_path):
     options = "--total-frames 512 --num-envs 4 --max-steps 60 --evaluation-episodes 2"
     out = run([str(script), *options.split(), "--evaluation-steps", "50"], tmp_path)
     assert "512 frames" in out and "success: " in out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "options", "printed"),
+    [
+        (
+            "identify_device",
+            "--candidates 24 --rounds 2 --steps 40",
+            r"true: 1\.200, 0\.0800; found: 1\.[12]\d\d, 0\.[01]",
+        ),
+        (
+            "random_shooting",
+            "--sequences 4 --horizon 5 --steps 10",
+            r"10 steps, [\d.]+ mm",
+        ),
+    ],
+)
+def test_examples_print_what_they_find(tmp_path, name, options, printed):
+    script = str(ROOT / "examples" / f"{name}.py")
+    assert re.search(printed, run([script, *options.split()], tmp_path))

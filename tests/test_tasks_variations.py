@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import twin
-from dm_control.composer.variation import distributions
+from dm_control.composer.variation import deterministic, distributions
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cathsim_dmc import suite
+from cathsim_dmc import compiled_cache, suite
 from cathsim_dmc.entities.devices import get
 from cathsim_dmc.physics.randomisation import (
     DEFAULT_RANGES,
@@ -19,6 +19,7 @@ from cathsim_dmc.physics.randomisation import (
     Randomisation,
     start_displacement,
 )
+from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import objectives
 
 
@@ -99,6 +100,21 @@ def test_a_composer_variation_is_a_range_too():
     ]
     np.testing.assert_allclose(draws, 0.05, atol=1e-7)
     assert len(set(draws)) == 5
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_sequence_gives_each_simulation_its_own_value(monkeypatch, compiled):
+    """Also in a process that has compiled loops, where loading rehearses an episode."""
+    monkeypatch.setattr(compiled_cache, "has_compiled", lambda: compiled)
+    factors = np.array([0.8, 1.0, 1.3])
+    given = {"stiffness": deterministic.Sequence(factors)}
+    task = suite.make_task("simple1_bca", randomisation=given)
+    simulation = BatchSimulation(task, len(factors), num_threads=1)
+    simulation.reset()
+    stiffness = simulation.batch.expand("jnt_stiffness")
+    joint = stiffness[0].argmax()
+    found = stiffness[:, joint] / stiffness[0, joint] * factors[0]
+    np.testing.assert_allclose(found, factors)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ cached on disk, a copy of the simulations begins an episode and does a control s
 from typing import Any
 
 import numpy as np
+from dm_control.composer.variation import Variation
 from numpy.random import RandomState
 
 from cathsim_dmc.tasks.config import NavigationConfig
@@ -14,13 +15,16 @@ from cathsim_dmc.tasks.rollout import Rollout
 
 
 def is_due(config: NavigationConfig) -> bool:
-    """Whether loops have been compiled; always False with a user's own effects.
+    """Whether loops have been compiled; always False with objects of the user.
 
-    These may share state with their copies.
+    Effects may share state with their copies. A Variation may have a state, such as the
+    place in a sequence, which would otherwise depend on what has been compiled.
     """
     from cathsim_dmc import compiled_cache  # late, as numba takes long
 
-    return compiled_cache.has_compiled() and not config.effects
+    ranges = vars(config.randomisation).values()
+    varied = any(isinstance(one, Variation) for one in ranges)
+    return compiled_cache.has_compiled() and not config.effects and not varied
 
 
 def rehearse(rollout: Rollout, stepper: Any, num_actions: int) -> None:
