@@ -9,7 +9,7 @@ import pytest
 minari = pytest.importorskip("minari")
 
 from cathsim_dmc.recording import dataset  # noqa: E402
-from cathsim_dmc.recording.dataset import export  # noqa: E402
+from cathsim_dmc.recording.dataset import export, repeat_episodes  # noqa: E402
 from cathsim_dmc.recording.recorder import EpisodeRecorder  # noqa: E402
 
 TASK, SHORT = "simple1_bca", {"max_steps": 9}
@@ -75,6 +75,30 @@ def test_room_for_the_arrays_of_all_episodes_is_asked_for(tmp_path, monkeypatch)
     one.actions = np.zeros((19, 3))
     dataset._check_space(tmp_path / "space", [one, one])
     assert 2.1 * images.nbytes < asked[0] < 3 * images.nbytes
+
+
+def test_a_learner_repeats_actions_of_double_precision(shared_environment, tmp_path):
+    """As a function of the user's own returns them; the learner rounds them."""
+    env, draw = shared_environment(TASK, **SHORT), np.random.default_rng(1)
+    recorder = EpisodeRecorder(env, TASK, SHORT)
+    episode = recorder.record_episode(lambda _: draw.uniform(-1, 1, 21), 6)
+    assert (episode.action != episode.action.astype(np.float32)).any()
+    episode.save(tmp_path / "own.npz")
+    (read,) = repeat_episodes(tmp_path, "tracking", task=TASK)
+    np.testing.assert_array_equal(read.actions, episode.action.astype(np.float32))
+    np.testing.assert_array_equal(read.rewards, episode.reward)
+
+
+def test_episodes_get_another_reward(episodes, tmp_path):
+    reward = {"path": -1.0, "success": 10.0}
+    export(episodes, tmp_path / "own", task_kwargs={"reward": reward})
+    found = minari.MinariDataset(tmp_path / "own" / "data")
+    for read, episode in zip(found.iterate_episodes(), episodes, strict=True):
+        np.testing.assert_array_equal(read.rewards, read.infos["reward_path"][1:])
+        assert (read.rewards != episode.reward).all()
+    moved = dataclasses.replace(episodes[0], qpos=episodes[0].qpos + 1e-6)
+    with pytest.raises(ValueError, match="positions 1e-06 apart, at step 0"):
+        export([moved], tmp_path / "x", task_kwargs={"reward": reward})
 
 
 def test_what_cannot_be_repeated_is_refused(episodes, tmp_path):

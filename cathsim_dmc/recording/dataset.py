@@ -23,7 +23,9 @@ from cathsim_dmc.tasks.config import NavigationConfig
 
 # Options of the observation, which a recorded episode does not hold.
 _OBSERVED = ("observation", "fluoroscopy", "endoluminal_size", "cameras")
-_SAME_REWARD = 1e-9  # tolerance of a repeated reward: machines round differently
+# Tolerances of a repeated episode, of the reward and of each position (m, rad):
+# machines round differently.
+_SAME_REWARD = _SAME_POSITION = 1e-9
 
 
 def write(
@@ -212,13 +214,14 @@ def export(
     """Repeats recorded episodes and writes them as a dataset, see `write`.
 
     Each episode is simulated again from its seed; its rewards must equal the recorded
-    ones.
+    ones. With another `reward`, its positions must.
 
     Args:
         episodes: Episodes of one task with equal options, with a seed and with steps.
         path: Directory of the dataset, which must not exist.
         observation: Names of observations; None for those of the record.
-        task_kwargs: Further options of the observation, such as `fluoroscopy`.
+        task_kwargs: Further options of the observation, such as `fluoroscopy`, and
+            `reward` for rewards other than the recorded ones.
 
     Returns:
         The directory.
@@ -236,7 +239,9 @@ def export(
 
     episodes = [bounds.instance("an episode", each, Episode) for each in episodes]
     task, options = _common(episodes)
-    options |= bounds.options("task_kwargs", task_kwargs)
+    further = bounds.options("task_kwargs", task_kwargs)
+    rewarded = further.get("reward", options.get("reward")) == options.get("reward")
+    options |= further
     if observation is not None:
         options["observation"] = observation
     single = all((e.action == e.action.astype(np.float32)).all() for e in episodes)
@@ -245,7 +250,10 @@ def export(
         seen = environment.task.observation_specs
         return write(
             path,
-            [EpisodeBuffer(**_repeated(environment, e, kind)) for e in episodes],
+            [
+                EpisodeBuffer(**_repeated(environment, e, kind, rewarded))
+                for e in episodes
+            ],
             env_spec=gymnasium.env_spec(task, **options, dtype=kind.name),
             observation_space=gymnasium.space_of(seen, kind),
             action_space=gymnasium.space(environment.action_spec(), kind),
@@ -314,10 +322,17 @@ def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:
     return tasks[0], {k: v for k, v in given[0].items() if k != "random"}
 
 
-def _repeated(environment: Any, episode: Episode, kind: np.dtype) -> dict[str, Any]:
-    """Simulates an episode again; returns its columns, or ValueError if it differs."""
+def _repeated(
+    environment: Any, episode: Episode, kind: np.dtype, rewarded: bool = True
+) -> dict[str, Any]:
+    """Simulates an episode again; returns its columns, or ValueError if it differs.
+
+    Args:
+        kind: Type of the numbers in the columns. The simulation gets the recorded
+            actions, in double precision.
+        rewarded: Whether the environment has the reward of the record.
+    """
     name = f"episode with seed {episode.seed}"
-    actions = episode.action.astype(kind)
 
     def shown(timestep: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         row = {
@@ -328,15 +343,19 @@ def _repeated(environment: Any, episode: Episode, kind: np.dtype) -> dict[str, A
 
     environment.random_state.seed(episode.seed)
     seen, ends = [shown(environment.reset())], []
-    for step, action in enumerate(actions):
+    rewards: list[float] = []
+    for step, action in enumerate(episode.action):
         timestep = environment.step(action)
         seen.append(shown(timestep))
         ends.append(timestep.last())
-        reward = float(timestep.reward)
-        if abs(reward - episode.reward[step]) > _SAME_REWARD:
+        rewards.append(float(timestep.reward))
+        moved = np.abs(environment.physics.data.qpos - episode.qpos[step + 1]).max()
+        off = abs(rewards[step] - episode.reward[step]) > _SAME_REWARD
+        if off if rewarded else moved > _SAME_POSITION:
             raise ValueError(
-                f"{name} does not repeat: reward {reward} instead of "
-                f"{episode.reward[step]} at step {step}; it was recorded with "
+                f"{name} does not repeat: reward {rewards[step]} instead of "
+                f"{episode.reward[step]}, positions {moved:.2g} apart, at step "
+                f"{step}; it was recorded with "
                 f"{episode.meta.get('versions')} and the options "
                 f"{episode.meta.get('task_kwargs')}, without effects and other objects"
             )
@@ -354,8 +373,8 @@ def _repeated(environment: Any, episode: Episode, kind: np.dtype) -> dict[str, A
     return {
         "seed": episode.seed,
         "observations": observations,
-        "actions": actions,
-        "rewards": episode.reward.tolist(),
+        "actions": episode.action.astype(kind),
+        "rewards": episode.reward.tolist() if rewarded else rewards,
         "terminations": terminated.tolist(),
         # An episode that the operator has stopped is truncated too.
         "truncations": (truncated & ~terminated).tolist(),
