@@ -5,6 +5,8 @@ import pytest
 import synthetic_env
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import CatTensors, TransformedEnv
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.agents import evaluate, load_policy
@@ -12,6 +14,7 @@ from cathsim_dmc.agents.training import train
 from cathsim_dmc.pictures import record
 from cathsim_dmc.policies import POLICIES, Policy, View, in_environment, make_policy
 from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.simulation.torchrl import BatchedEnv
 
 TASK = "simple1_bca"
 SHORT = {"max_steps": 12}
@@ -212,3 +215,65 @@ def test_noise_on_an_action_does_not_stay_in_the_policy(name):
     told = action.copy()
     action += 0.5
     np.testing.assert_array_equal(policy.act(None), told)
+
+
+class Counting(TensorDictModuleBase):
+    """Counts the steps of an episode, as a recurrent module keeps its state."""
+
+    in_keys = ("observation_vector", "count", "is_init")
+    out_keys = ("action", ("next", "count"))
+
+    def forward(self, tensordict):
+        begun = tensordict["is_init"]
+        count = tensordict.get("count", torch.zeros(begun.shape))
+        count = torch.where(begun, 0.0, count) + 1.0
+        tensordict["next", "count"] = count
+        # Grows towards full speed, so that the outcome shows the memory.
+        tensordict["action"] = (count / 20).clamp(max=1.0).expand(-1, 21)
+        return tensordict
+
+
+def test_a_recurrent_module_remembers_until_an_episode_ends():
+    policy = load_policy(Counting())
+
+    def steps(number=3):
+        seen = {"observation_vector": torch.zeros(number, 2)}
+        return (20 * policy.act(TensorDict(seen, [number]))[:, 0]).round().tolist()
+
+    assert [steps(), steps()] == [[1] * 3, [2] * 3]
+    policy.reset(None, np.array([False, True, False]))
+    assert [steps(), steps()] == [[3, 1, 3], [4, 2, 4]]
+    policy.reset(None, np.ones(3, bool))
+    assert steps() == [1] * 3
+    # Some of many: the policy acts on rows for all, of which the others are copies.
+    part = policy.among(1, 3)
+    part.reset(None, np.ones(2, bool))
+    seen = TensorDict({"observation_vector": torch.zeros(2, 2)}, [2])
+    assert (20 * part.act(seen)[:, 0]).round().tolist() == [1, 1]
+    part.reset(None, np.array([True, False]))
+    assert (20 * part.act(seen)[:, 0]).round().tolist() == [1, 2]
+
+
+def test_a_recurrent_module_is_evaluated_and_recorded():
+    """Also in an environment without a StepCounter."""
+
+    def bare(*arguments, **options):
+        env = BatchedEnv(*arguments, **options)
+        key, seen = "observation_vector", "tracking_points"
+        return TransformedEnv(env, CatTensors([seen], key, del_keys=False))
+
+    options = {"max_steps": 12, "observation": "tracking"}
+    done = evaluate(
+        Counting(), TASK, 2, 5, make_env=bare, observation="tracking", task_kwargs=SHORT
+    )
+    env = suite.load("cathsim", TASK, options)
+    for number, outcome in enumerate(done.episodes):
+        episode = record(env, load_policy(Counting()), seed=5 + number)
+        rounded = np.float32(np.arange(1, 13) / np.float32(20))
+        np.testing.assert_array_equal(episode.action[:, -1], rounded[: episode.steps])
+        assert outcome.length == episode.steps
+        assert outcome.reward == sum(episode.reward.astype(np.float32).astype(float))
+    with pytest.raises(TypeError, match=r"agents.load_policy\(policy\)"):
+        record(env, Counting())
+    with pytest.raises(ValueError, match=r"shape \(1, 21\), for a batch of one"):
+        record(env, lambda observation: torch.zeros(1, 21), seed=5)

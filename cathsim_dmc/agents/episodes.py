@@ -52,7 +52,8 @@ class EpisodeTracker:
     def add(self, batch: TensorDictBase) -> list[EpisodeOutcome]:
         """Add steps (num_envs, steps); return the episodes that ended, in order.
 
-        An episode whose end is never seen, because its process was lost, is left out.
+        An episode whose end is never seen, because its process was lost, is left out,
+        if the steps have a "step_count".
         """
 
         def read(value: torch.Tensor) -> np.ndarray:
@@ -64,10 +65,11 @@ class EpisodeTracker:
         names = "reward", "done", "terminated"
         reward, done, terminated = (read(after[name]) for name in names)
         forces = [read(info[name]) for name in NAMES]
-        begun = read(batch["step_count"]) == 0
+        counted = batch.get("step_count", None)
+        lost = np.zeros(batch.shape, bool) if counted is None else read(counted) == 0
         finished = []
         for step in range(batch.shape[1]):
-            for env in map(int, np.flatnonzero(begun[:, step] & (self.length > 0))):
+            for env in map(int, np.flatnonzero(lost[:, step] & (self.length > 0))):
                 self.forces.finish(env)
                 self.reward[env] = self.length[env] = 0
             self.reward += reward[:, step]

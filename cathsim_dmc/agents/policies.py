@@ -30,13 +30,25 @@ class FunctionPolicy(Policy):
     """A function of the standard observations.
 
     A stochastic function, such as a network, acts deterministically, with the middle of
-    its distribution.
+    its distribution. A TensorDict module that reads "is_init", as recurrent modules of
+    TorchRL do, also reads what it has written under "next" in the step before.
     """
 
     def __init__(self, function: PolicyFunction, name: str | None = None):
         """Wraps a function; the name for reports is by default that of the function."""
         self._function = function
         self.name = name or getattr(function, "__name__", type(function).__name__)
+        self._keys = tuple(getattr(function, "in_keys", ()))
+        self._begun: torch.Tensor | None = None  # (N,) bool; None for all
+        self._memory: TensorDictBase | None = None
+
+    def reset(self, view: View, which: np.ndarray) -> None:
+        """Begins new episodes, in whose first step "is_init" is true."""
+        began = torch.as_tensor(np.array(which))
+        if began.all():
+            self._begun = self._memory = None
+        elif self._begun is not None:
+            self._begun |= began
 
     def among(self, first: int, count: int) -> Policy:
         """Returns a policy that calls the function with rows for all episodes."""
@@ -48,8 +60,14 @@ class FunctionPolicy(Policy):
         if not isinstance(observation, TensorDictBase):
             entries = {k: torch.as_tensor(one)[None] for k, one in observation.items()}
             observation = TensorDict(environments.standard(entries, 1), batch_size=[1])
+        if "is_init" in self._keys:
+            observation = self._recalled(observation)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             answer: Any = self._function(observation)
+        if "is_init" in self._keys and isinstance(answer, TensorDictBase):
+            written = answer.get("next", TensorDict())
+            self._memory = written.select(*self._keys, strict=False)
+            self._begun = torch.zeros(answer.batch_size, dtype=torch.bool)
         action = answer["action"] if isinstance(answer, TensorDictBase) else answer
         with files.refused(
             TypeError,
@@ -58,6 +76,14 @@ class FunctionPolicy(Policy):
             (TypeError, ValueError, RuntimeError),
         ):
             return torch.as_tensor(action, dtype=torch.float32).numpy()
+
+    def _recalled(self, observation: TensorDictBase) -> TensorDictBase:
+        """Returns a copy of the observation with the memory of the function."""
+        begun = self._begun
+        if begun is None:
+            begun = torch.ones(observation.batch_size, dtype=torch.bool)
+        own = observation.copy().set("is_init", begun[:, None])
+        return own if self._memory is None else own.update(self._memory)
 
 
 class _Among(Policy):
@@ -72,14 +98,18 @@ class _Among(Policy):
         self.name = policy.name
 
     def reset(self, view: View, which: np.ndarray) -> None:
-        self._policy.reset(view, which)
+        self._policy.reset(view, np.asarray(which)[self._rows(len(which))])
 
     def act(self, observation: Any) -> np.ndarray:
         own = len(observation)
         if own == self._count:
             return self._policy.act(observation)
-        rows = (torch.arange(self._count) - self._first).clamp(0, own - 1)
+        rows = torch.from_numpy(self._rows(own))
         return self._policy.act(observation[rows])[self._first : self._first + own]
+
+    def _rows(self, own: int) -> np.ndarray:
+        """Own row (count,) that stands in each row of all episodes."""
+        return (np.arange(self._count) - self._first).clip(0, own - 1)
 
 
 class TrainedPolicy(FunctionPolicy):

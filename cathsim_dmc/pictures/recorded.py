@@ -99,6 +99,11 @@ def as_function(
             "cathsim_dmc.policies.Policy, or a function from the observation to the "
             "action"
         )
+    if hasattr(policy, "in_keys"):
+        raise TypeError(
+            f"the policy is a {type(policy).__name__}, which reads a TensorDict; give "
+            "cathsim_dmc.agents.load_policy(policy)"
+        )
     return lambda timestep: np.asarray(policy(timestep.observation))
 
 

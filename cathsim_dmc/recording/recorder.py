@@ -142,8 +142,14 @@ class EpisodeRecorder:
         return self._episode(rows, None, {"termination": None, "discount": 1.0})
 
     def _action(self, policy: Policy, timestep: Any) -> np.ndarray:
-        shape = self._env.action_spec().shape
-        action = bounds.array("the policy's action", policy(timestep), "biuf", shape)
+        shape, answer = self._env.action_spec().shape, policy(timestep)
+        if np.shape(answer) == (1, *shape):
+            raise ValueError(
+                f"the policy's action is of shape {np.shape(answer)}, for a batch of "
+                f"one; it must be of shape {shape}, or give "
+                "cathsim_dmc.agents.load_policy(policy) for a function of batches"
+            )
+        action = bounds.array("the policy's action", answer, "biuf", shape)
         return np.array(action, dtype=np.float64)
 
     def _state(self) -> dict[str, Any]:
