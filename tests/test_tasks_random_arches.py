@@ -304,3 +304,27 @@ def test_an_arch_that_no_sheath_fits_before_is_named(monkeypatch):
     monkeypatch.setattr(placement, "sheath_direction", lambda *_: None)
     with pytest.raises(ValueError, match=f"{names(0, 1)[0]}.*give another first"):
         suite.load_arches(pool=1)
+
+
+@pytest.mark.parametrize("task", ["arch_any", "arch_any_pair"])
+def test_an_arch_entered_from_the_other_side_has_its_own_sheath(task):
+    """Its mouth is at another distance from the end of the device, as is the stroke."""
+    options = {"observation": "force", "randomisation": {"start_radius": 0.0}}
+    pooled = suite.make_task(task, random=0, numbers=[0, 1], **options)
+    places = [case.scene.placement for case in pooled._cases]
+    assert places[0].start_depth < places[1].start_depth - 0.03
+    length, pooled = pooled.config.working_length, suite.environment(pooled)
+    alone = suite.make_task(task, 0, numbers=[1], working_length=length, **options)
+    alone = suite.environment(alone)
+    seed = next(n for n in range(9) if np.random.RandomState(n).randint(2) == 1)
+    for env in (pooled, alone):
+        env.random_state.seed(seed)
+        env.reset()
+    push = np.zeros(pooled.action_spec().shape)
+    push[[0, 2] if "pair" in task else -1] = 1.0
+    # A pair is pushed to the end of its stroke.
+    for _ in range(170 if "pair" in task else 20):
+        one, other = (env.step(push) for env in (pooled, alone))
+        assert one.reward == other.reward
+        for key, value in other.observation.items():
+            np.testing.assert_array_equal(one.observation[key], value)

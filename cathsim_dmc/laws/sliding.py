@@ -257,17 +257,17 @@ def gaps(insertion, ways):
 def advance(before, step, limits, target, lead):
     """Writes the target insertions (N, K) of the devices and (N,) of the chain, m.
 
-    The devices move from `before` (N, K) by `step` (N, K) within `limits` (least,
-    most), m. A device that starts behind them is not drawn back further. The chain
-    cannot retract behind its start.
+    The devices move from `before` (N, K) by `step` (N, K) within `limits` (least and
+    most, (N,) m each). A device that starts behind them is not drawn back further. The
+    chain cannot retract behind its start.
     """
     count, devices = before.shape
     least, most = limits
     for i in range(count):
         leader = 0
         for k in range(devices):
-            back = min(least, before[i, k])
-            target[i, k] = min(max(before[i, k] + step[i, k], back), most)
+            back = min(least[i], before[i, k])
+            target[i, k] = min(max(before[i, k] + step[i, k], back), most[i])
             if target[i, k] > target[i, leader]:
                 leader = k
         lead[i] = max(target[i, leader], 0.0)
@@ -278,7 +278,7 @@ def advance(before, step, limits, target, lead):
 def rubbing(force, lead, depth, nodes, size):
     """Writes magnitudes (N, L) of contact forces (N, L, 6) on links past the sheath, N.
 
-    They are 0 on links in the sheath. The chain ends `lead` (N,) + `depth` past the
+    They are 0 on links in the sheath. The chain ends `lead` + `depth` (N,) past the
     mouth of the sheath, m. `nodes` (L + 1,) are the distances of the ends of the links
     from the end of the chain, m.
     """
@@ -286,7 +286,7 @@ def rubbing(force, lead, depth, nodes, size):
     for i in range(count):
         for link in range(links):
             size[i, link] = 0.0
-            if lead[i] - nodes[link + 1] > -depth:
+            if lead[i] - nodes[link + 1] > -depth[i]:
                 x, y, z = force[i, link, 3], force[i, link, 4], force[i, link, 5]
                 size[i, link] = np.sqrt(x * x + y * y + z * z)
 

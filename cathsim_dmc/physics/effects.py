@@ -65,8 +65,9 @@ class World:
         model: The compiled scene, as it is without effects.
         chain: The entity of the device, or of coaxial devices.
         index: Indices of the task's quantities in the model.
-        start_depth: Distance of the chain's end past the mouth of the sheath at zero
-            insertion, m.
+        start_depth: (N,), distance of the chain's end past the mouth of the sheath at
+            zero insertion, m; it depends on the anatomy.
+        stroke: (N,), largest insertion, m; it depends on the anatomy.
         arrays: The state, arrays (N, ...) with MuJoCo's names: those of
             `ModelIndex.FIELDS` and of `Effect.data_fields`.
         field: Returns a field of one simulation's own model, to be written, by the
@@ -78,7 +79,8 @@ class World:
     model: mujoco.MjModel
     chain: Chain
     index: ModelIndex
-    start_depth: float
+    start_depth: np.ndarray
+    stroke: np.ndarray
     arrays: Any
     field: Callable[[int, str], np.ndarray]
     parameters: Any
@@ -142,7 +144,10 @@ class Effect:
         self.world = world
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
-        """Takes the anatomy of one simulation, before an episode begins in it."""
+        """Takes the anatomy of one simulation, before an episode begins in it.
+
+        `world.start_depth` and `world.stroke` are those in this anatomy.
+        """
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Begins an episode of one simulation, whose device is at its start.

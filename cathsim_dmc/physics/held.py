@@ -24,6 +24,7 @@ class Held:
 
     Attributes:
         joints: `laws.sheath.Joints`.
+        ends: (J,), distance of each joint from the end of the chain, negative, m.
         nominal: (3, J, 2), stiffness, damping and rest angles without a sheath.
         out: (J,), fraction of the compliance of each joint that was out of the sheath
             when last written.
@@ -45,20 +46,20 @@ class Held:
             start_depth: Distance of the chain's end past the mouth at insertion 0, m.
         """
         lengths = chain.link_lengths
-        places = np.cumsum(lengths)[:-1] - np.sum(lengths) + start_depth
+        self.ends = np.cumsum(lengths)[:-1] - np.sum(lengths)
         joint = np.searchsorted(model.jnt_qposadr, bends_qpos)
         dofs, qpos = model.jnt_dofadr[joint].astype(np.int64), bends_qpos
         self.joints = sheath.Joints(
             joint=joint,
             dof=dofs,
             qpos=qpos.astype(np.int64),
-            place=places,
+            place=self.ends + start_depth,
             behind=lengths[:-1] / 2,
             ahead=lengths[1:] / 2,
             distal=chain.distal_shares,
         )
         self.nominal = self.read(fields_of(lambda name: getattr(model, name)))
-        self.out = np.ones(len(places))
+        self.out = np.ones(len(self.ends))
 
     def read(self, fields: sheath.Hinges) -> np.ndarray:
         """Values (3, J, 2) of the hinges in the fields of a model."""
@@ -115,7 +116,8 @@ class Sheathed(NamedTuple):
     """Hinges of N simulations in a sheath.
 
     Attributes:
-        joints: `laws.sheath.Joints`.
+        joints: `laws.sheath.Joints`, whose `place` is not used.
+        place: (N, J), distance of each joint past the mouth at insertion 0, m.
         insertion: (N,), m.
         free: (N, 3, J, 2), stiffness, damping and rest angles without a sheath.
         places: (N, 3) int64, see `addresses`; 0 before the first episode.
@@ -123,6 +125,7 @@ class Sheathed(NamedTuple):
     """
 
     joints: Any
+    place: Any
     insertion: Any
     free: Any
     places: Any

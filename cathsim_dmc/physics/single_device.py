@@ -6,6 +6,7 @@ import numpy as np
 from numpy.random import RandomState
 
 from cathsim_dmc import rows
+from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.robot import pose
@@ -70,9 +71,10 @@ class SingleDevice(Effect):
         # The shape lies in the plane of x and z.
         rest = model.qpos_spring[places[:, 1]]
         self._springs = Springs(rest, 1 / model.jnt_stiffness[hinges_x])
-        self._held = held.Held(model, world.chain, places, world.start_depth)
+        self._held = held.Held(model, world.chain, places, world.start_depth[0])
         self._sheathed = held.Sheathed(
             joints=self._held.joints,
+            place=self._held.ends + world.start_depth[:, None],
             insertion=world.arrays.qpos[:, world.index.insertion_qpos],
             free=np.stack([self._held.nominal] * world.num_simulations),
             places=np.zeros((world.num_simulations, len(held.FIELDS)), np.int64),
@@ -83,6 +85,11 @@ class SingleDevice(Effect):
         turned = world.index.rotation_qpos
         rotation = -1 if turned is None else turned
         self._base = np.array([world.index.insertion_qpos, rotation])
+
+    def enter(self, index: int, anatomy: Anatomy) -> None:
+        """Takes the place of the sheath's mouth in the anatomy of one simulation."""
+        place = self._held.ends + self.world.start_depth[index]
+        self._sheathed.place[index] = place
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Holds the base of one simulation in place, and its links in the sheath."""

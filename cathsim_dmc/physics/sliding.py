@@ -157,7 +157,7 @@ class SlidingDevices(SingleDevice):
         # A device may be withdrawn until its end has left the patient.
         least = -self.world.start_depth
         target, lead = np.empty(before.shape), np.empty(len(before))
-        limits = least, self._entity.stroke
+        limits = least, self.world.stroke
         sliding.advance(before, moved, limits, target, lead)
         slid = -np.diff(target - before, axis=1) / _PRESLIDING
         self._ways[:] = np.clip(self._ways + slid, -1.0, 1.0)

@@ -100,11 +100,12 @@ class Rollout(Restorable):
         stepper.deepest = config.vessel.deepest
         self.moving = of_kind(self.effects, Moving)
         self._devices = cast(SingleDevice, of_kind(self.effects, SingleDevice))
-        world = World(
+        self._world = world = World(
             model=model,
             chain=scene.catheter,
             index=self.index,
-            start_depth=scene.placement.start_depth,
+            start_depth=np.full(count, scene.placement.start_depth),
+            stroke=np.full(count, scene.placement.stroke),
             arrays=state,
             field=stepper.field,
             parameters=state.userdata,
@@ -188,8 +189,11 @@ class Rollout(Restorable):
         self._enter(index)
 
     def _enter(self, index: int) -> None:
+        scene = self.case(index).scene
+        self._world.start_depth[index] = scene.placement.start_depth
+        self._world.stroke[index] = scene.placement.stroke
         for effect in self.effects:
-            effect.enter(index, self.case(index).scene.anatomy)
+            effect.enter(index, scene.anatomy)
 
     def command(self, action: np.ndarray) -> None:
         """Applies the actions of a control step; its physics steps must follow.
@@ -239,11 +243,8 @@ class Rollout(Restorable):
         self._way[indices] = 0.0
         shortest = path_distances(self.objectives, self.resting.head, indices)
         self._shortest[indices] = shortest[indices]
-        begun = set(indices.tolist())
-        self._errors = tuple(
-            None if index in begun else error
-            for index, error in enumerate(self._errors)
-        )
+        old = enumerate(self._errors)
+        self._errors = tuple(None if n in indices else error for n, error in old)
         step = self._step(indices, begins=True)
         observations.check(step.observation, self._specs)
         self._open[indices] = False
