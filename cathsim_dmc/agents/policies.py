@@ -40,13 +40,13 @@ class FunctionPolicy(Policy):
         self.name = name or getattr(function, "__name__", type(function).__name__)
         self._keys = tuple(getattr(function, "in_keys", ()))
         self._begun: torch.Tensor | None = None  # (N,) bool; None for all
-        self._memory: TensorDictBase | None = None
+        self._memory: dict[Any, Any] = {}
 
     def reset(self, view: View, which: np.ndarray) -> None:
         """Begins new episodes, in whose first step "is_init" is true."""
         began = torch.as_tensor(np.array(which))
         if began.all():
-            self._begun = self._memory = None
+            self._begun, self._memory = None, {}
         elif self._begun is not None:
             self._begun |= began
 
@@ -66,7 +66,8 @@ class FunctionPolicy(Policy):
             answer: Any = self._function(observation)
         if "is_init" in self._keys and isinstance(answer, TensorDictBase):
             written = answer.get("next", TensorDict())
-            self._memory = written.select(*self._keys, strict=False)
+            kept = {key: written.get(key, None) for key in self._keys}
+            self._memory = {k: one for k, one in kept.items() if one is not None}
             self._begun = torch.zeros(answer.batch_size, dtype=torch.bool)
         action = answer["action"] if isinstance(answer, TensorDictBase) else answer
         with files.refused(
@@ -82,8 +83,7 @@ class FunctionPolicy(Policy):
         begun = self._begun
         if begun is None:
             begun = torch.ones(observation.batch_size, dtype=torch.bool)
-        own = observation.copy().set("is_init", begun[:, None])
-        return own if self._memory is None else own.update(self._memory)
+        return observation.copy().update({**self._memory, "is_init": begun[:, None]})
 
 
 class _Among(Policy):
