@@ -21,8 +21,9 @@ from dm_control.utils import containers
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.tasks import observations, placement, registered
-from cathsim_dmc.tasks.anatomies import load_anatomy, load_arches_to
+from cathsim_dmc.tasks.anatomies import load_anatomy as load_anatomy
 from cathsim_dmc.tasks.anatomies import load_arches as load_arches  # for users, too
+from cathsim_dmc.tasks.anatomies import load_arches_to, load_pool
 from cathsim_dmc.tasks.config import NavigationConfig, refuse_replaced
 from cathsim_dmc.tasks.definition import OF_ARCHES
 from cathsim_dmc.tasks.definition import TaskDefinition as TaskDefinition
@@ -124,9 +125,10 @@ def make_task(
         **options: Fields of `NavigationConfig`, options of the task's objective (such
             as `reward` and `goal_radius`); for `navigate`, `anatomy`, `goal` (a name,
             or (x, y, z) in the unit and frame of the file that the anatomy was
-            imported from) and `access`; for random arches, `goal` (a name, "any", or
-            one for each arch), `access`, and `arches`, `pool`, `first` and `numbers`,
-            see `load_arches`.
+            imported from) and `access`, or a list of anatomies, of which each episode
+            draws one, with a goal and an access for all or for each; for random arches,
+            `goal` (a name, "any", or one for each arch), `access`, and `arches`,
+            `pool`, `first` and `numbers`, see `load_arches`.
 
     Raises:
         ValueError: if the task or an option does not exist; lists those that do.
@@ -145,7 +147,8 @@ def make_task(
         anatomies, named = load_arches_to(goal, {**entered, **own})
     else:
         anatomy = own.get("anatomy", definition.anatomy or "type1")
-        anatomies, named = [load_anatomy(anatomy, access)], [goal]
+        anatomies, named = load_pool(anatomy, access, goal)
+    mixed = not definition.random_arch and len(anatomies) > 1
     if "farthest_shift" in definition.objective_options:
         chosen["farthest_shift"] = config.randomisation.farthest_shift
     goals = list(map(placement.resolve_goal, anatomies, named))
@@ -154,7 +157,8 @@ def make_task(
     def room(number: int) -> tuple[Scene, Objective]:
         anatomy, goal = anatomies[number], goals[number]
         objective = definition.objective(anatomy, goal, **chosen)
-        looks = {"goal_radius": objective.goal_radius, "drawn": number == 0}
+        looks: dict[str, Any] = {"one_goal": mixed, "drawn": number == 0}
+        looks["goal_radius"] = objective.goal_radius
         return Scene.build(anatomy, goal, config, **looks), objective
 
     others = map(room, range(1, len(anatomies))) if len(anatomies) > 1 else None

@@ -10,7 +10,7 @@ import numpy as np
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.physics.randomisation import Draw, Randomisation
-from cathsim_dmc.tasks.anatomies import arch_numbers
+from cathsim_dmc.tasks.anatomies import anatomy_name, arch_numbers, is_pool
 from cathsim_dmc.tasks.start import START_SPACING, STARTS_ALONG_ROUTE
 
 # Number of strata of each quantity, and of candidate seeds for each episode.
@@ -101,8 +101,7 @@ def parts(
     pools = [options]
     if protocol.devices and not (options.get("devices") or options.get("device")):
         pools = [{**options, "device": name} for name in protocol.devices]
-    drawn_from = definition is not None and definition.random_arch
-    arches = len(arch_numbers(options)) if drawn_from else 1
+    arches = max(len(_drawn_from(definition, options)), 1)
     most = episodes * (len(pools) * _CANDIDATES if protocol.task_kwargs else 1)
     bounds.seeds("seed", seed, most)
     found, played = [], 0
@@ -115,7 +114,8 @@ def parts(
             seeds = stratified(ranges, wanted, first, arches)
         played += count
         varied = () if ranges == Randomisation() else seeds
-        drawn = tuple(_conditions(ranges, one, arches, own) for one in varied)
+        pool = _drawn_from(definition, options)
+        drawn = tuple(_conditions(ranges, one, pool, own) for one in varied)
         # Effects are objects, which files cannot hold; the task makes its own.
         kept = {
             name: value
@@ -126,11 +126,29 @@ def parts(
     return tuple(found)
 
 
+def _drawn_from(
+    definition: suite.TaskDefinition | None, options: Mapping[str, Any]
+) -> Sequence[int | str]:
+    """Return numbers of arches or names of anatomies that an episode draws one of."""
+    if definition is None:
+        return ()
+    if definition.random_arch:
+        return arch_numbers(options)
+    given = options.get("anatomy", definition.anatomy)
+    return tuple(map(anatomy_name, given)) if is_pool(given) else ()
+
+
 def _conditions(
-    ranges: Randomisation, seed: int, arches: int, options: Mapping[str, Any]
+    ranges: Randomisation,
+    seed: int,
+    pool: Sequence[int | str],
+    options: Mapping[str, Any],
 ) -> Mapping[str, Any]:
-    arch, episode = ranges.draw_in(np.random.RandomState(seed), arches)
-    where = {"arch": arch_numbers(options)[arch]} if arches > 1 else {}
+    number, episode = ranges.draw_in(np.random.RandomState(seed), max(len(pool), 1))
+    where = {}
+    if len(pool) > 1:
+        one = pool[number]
+        where = {"arch" if isinstance(one, int) else "anatomy": one}
     values = {
         name + "_drawn" * (name in _REDUCED): np.asarray(value).tolist()
         for name, value in dataclasses.asdict(episode).items()
@@ -199,7 +217,7 @@ def distinct(task: str, task_kwargs: Mapping[str, Any], episodes: int) -> bool:
     if definition is None:
         return True
     ranges = Randomisation.make(task_kwargs.get("randomisation", False))
-    values = len(arch_numbers(task_kwargs)) if definition.random_arch else 1
+    values = max(len(_drawn_from(definition, task_kwargs)), 1)
     for name, step in _STEPS.items():
         if (chosen := getattr(ranges, name)) is not None:
             low, high = chosen if isinstance(chosen, Sequence) else (0.0, 1.0)

@@ -1,10 +1,12 @@
 """The phantom: the wall of an anatomy as a field, with goals and sensors."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from dm_control import composer, mjcf
 
 from cathsim_dmc import bounds
-from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.contact import DRAWN, FRICTION, wall_contact
 
@@ -33,6 +35,7 @@ class Phantom(composer.ModelWrapperEntity):
         friction: float = FRICTION,
         goal_radius: float = 8e-3,
         drawn: bool = True,
+        marked: Mapping[str, Goal] | None = None,
     ):
         """Builds the wall.
 
@@ -42,6 +45,7 @@ class Phantom(composer.ModelWrapperEntity):
             goal_radius: radius of the goal sites, m.
             drawn: whether the surface is drawn; otherwise a point replaces it, so that
                 all models have the same number of geoms.
+            marked: goals that get a site, by the name of the site; None for all.
         """
         bounds.instance("anatomy", anatomy, Anatomy)
         bounds.number("goal_radius", goal_radius, unit="m", positive=True)
@@ -59,15 +63,15 @@ class Phantom(composer.ModelWrapperEntity):
             "geom", name="lumen", **shape, **DRAWN, rgba=colour
         )
         self.goals = {
-            goal.name: self.body.add(
+            name: self.body.add(
                 "site",
-                name=f"goal_{goal.name}",
+                name=f"goal_{name}",
                 pos=goal.position,
                 size=[goal_radius],
                 rgba=_GOAL_COLOUR,
                 group=4,
             )
-            for goal in anatomy.goals.values()
+            for name, goal in (anatomy.goals if marked is None else marked).items()
         }
 
     def add_wall(self, device_body, hole: float = np.inf, moving: bool = False) -> None:

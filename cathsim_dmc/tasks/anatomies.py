@@ -36,7 +36,8 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> An
         raise ValueError(
             f"access {access!r} is given, but only a phantom "
             f"({', '.join(phantoms.PHANTOMS)}) has several; leave it out, or import "
-            "the scan with another inlet (--inlet)"
+            "the scan with another inlet (--inlet); for a list of anatomies, give a "
+            "list with None for this one"
         )
     if isinstance(anatomy, Anatomy):
         return anatomy
@@ -47,6 +48,50 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> An
             f"{', '.join(phantoms.PHANTOMS)}"
         )
     return Anatomy.load(anatomy)
+
+
+def is_pool(anatomy: Any) -> bool:
+    """Whether an option `anatomy` is a list, of which each episode draws one."""
+    return isinstance(anatomy, Sequence) and not isinstance(anatomy, str)
+
+
+def anatomy_name(anatomy: str | Path | Anatomy) -> str:
+    """Returns the name of an anatomy that `load_anatomy` takes, without loading it."""
+    return anatomy.name if isinstance(anatomy, Anatomy) else Path(anatomy).name
+
+
+def load_pool(
+    anatomy: Any, access: Any, goal: Any
+) -> tuple[list[Anatomy], list[str | Sequence[float]]]:
+    """Returns the anatomies that the options of a task name, and the goal in each.
+
+    Args:
+        anatomy: As for `load_anatomy`, or a list of such.
+        access: As for `load_anatomy`, or a list with one for each anatomy.
+        goal: A goal, or a list with one for each of several anatomies.
+
+    Raises:
+        ValueError: if there is no such anatomy or access, a list is empty, or lists
+            differ in length.
+    """
+    if not is_pool(anatomy):
+        return [load_anatomy(anatomy, access)], [goal]
+    if not anatomy:
+        bounds.refuse("anatomy", anatomy, "an anatomy, or a list with one at least")
+    ways, goals = (
+        _one_for_each(name, one, len(anatomy))
+        for name, one in {"access": access, "goal": goal}.items()
+    )
+    return [load_anatomy(a, w) for a, w in zip(anatomy, ways, strict=True)], goals
+
+
+def _one_for_each(name: str, given: Any, count: int) -> list[Any]:
+    """Returns an option as a list with an entry for each of several anatomies."""
+    if given is None or isinstance(given, str):
+        return [given] * count
+    if not isinstance(given, Sequence) or len(given) != count:
+        bounds.refuse(name, given, f"one name, or a list of {count}, as of anatomies")
+    return list(given)
 
 
 def arch_numbers(options: Mapping[str, Any]) -> tuple[int, ...]:

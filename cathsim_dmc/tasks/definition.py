@@ -2,7 +2,7 @@
 
 import dataclasses
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from cathsim_dmc.anatomy import Anatomy
@@ -17,7 +17,8 @@ class TaskDefinition:
 
     Attributes:
         description: one line.
-        anatomy: anatomy or its name; None where the user chooses.
+        anatomy: anatomy or its name, or a list of which each episode draws one; None
+            where the user chooses.
         goal: name of a goal; None where the user chooses.
         access: where the device enters a phantom or arch, see `load_anatomy`.
         objective: function of an anatomy, a goal and keyword options, which become
@@ -30,7 +31,7 @@ class TaskDefinition:
     """
 
     description: str
-    anatomy: str | Anatomy | None
+    anatomy: str | Anatomy | Sequence[str | Anatomy] | None
     goal: str | None
     access: str | None = None
     objective: Callable[..., Objective] = Cannulation.to

@@ -258,7 +258,8 @@ class Navigation(composer.Task, NotCopied):
             )
 
     def _place_goal(self, physics) -> None:
-        goal = self._scene.phantom.goals.get(self._scene.goal.name)
+        sites = self._scene.phantom.goals
+        goal = sites.get(self._scene.goal.name, sites.get("own"))
         if goal is not None and self.config.randomisation.goal_shift:
             physics.bind(goal).pos = self.goal_position
 

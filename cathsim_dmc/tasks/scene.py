@@ -64,6 +64,7 @@ class Scene:
         *,
         goal_radius: float = GOAL_RADIUS,
         drawn: bool = True,
+        one_goal: bool = False,
     ) -> "Scene":
         """Builds the entities and attaches all to the arena.
 
@@ -71,6 +72,8 @@ class Scene:
             goal: Name in `anatomy.goals`, or a goal inside the lumen.
             goal_radius: Radius of the goal markers, m, which are only visual.
             drawn: Whether the arena has a mesh of the lumen's surface.
+            one_goal: Whether only this goal has a marker, so that anatomies with other
+                goals can share a model.
 
         Raises:
             ValueError: if goal, device or vessel options do not fit the anatomy.
@@ -94,13 +97,14 @@ class Scene:
         if config.vessel.wall is not None:
             soften(catheter)
         radius = catheter.device.outer_radius
+        marked = {"own": goal} if one_goal else None
         bore = straight(place.working_length - place.start_depth)
         scene = cls(
             anatomy=anatomy,
             goal=goal,
             placement=place,
             arena=AngiographyArena(catheter.density, config.solver_tolerance),
-            phantom=Phantom(anatomy, friction, goal_radius, drawn),
+            phantom=Phantom(anatomy, friction, goal_radius, drawn, marked),
             catheter=catheter,
             sheath=Sheath(bore, radius, clearance=config.sheath_clearance),
             robot=Robot(device_radius=radius),
