@@ -438,6 +438,25 @@ def test_the_end_counts_of_a_device_that_closes_while_the_policy_computes():
     listener.close()
 
 
+def test_missed_periods_and_late_actions_are_said(tmp_path):
+    def slow(observation):
+        time.sleep(4 * PERIOD)
+        return push(observation)
+
+    file = tmp_path / "log.jsonl"
+    with bridge.Log(file) as log:
+        served = Served(Robot(steps=20), missed="still", log=log)
+        how = bridge.DriveOptions(overrun="latest", watchdog=WAIT, warm_up=0)
+        bridge.drive(slow, served.address, options=how)
+        (done,) = served.joined()
+    missed, late = done["missed"], done["late"]
+    assert missed > 5 and late > 0
+    told = f", {missed} periods without an action, {late} late actions"
+    assert served.said[-1].endswith(f"success after 20 steps{told}")
+    end = json.loads(file.read_text().splitlines()[-1])
+    assert (end["missed"], end["late"]) == (missed, late)
+
+
 def test_a_driver_that_reads_nothing_is_left():
     robot = Robot(steps=10**9)
     shape = [1000, 1000, 1]

@@ -119,7 +119,9 @@ def serve(
 def _told(episode: Mapping[str, Any]) -> str:
     """Return the outcome of an episode as text."""
     reason = "" if episode["reason"] is None else f": {episode['reason']}"
-    return f"{episode['end']} after {episode['steps']} steps{reason}"
+    counts = {"missed": "periods without an action", "late": "late actions"}
+    told = [f", {episode[key]} {text}" for key, text in counts.items() if episode[key]]
+    return f"{episode['end']} after {episode['steps']} steps{''.join(told)}{reason}"
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -247,7 +249,8 @@ class _Session:
                 state = device.read()
         finally:
             device.stop()
-        self._log.write("end", step=run.step, reason=end)
+        counts = {"missed": run.missed, "late": run.late}
+        self._log.write("end", step=run.step, reason=end, **counts)
         found = self.summary(end, reason)
         self.running, self.played = False, run.step
         return found
