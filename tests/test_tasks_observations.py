@@ -293,3 +293,22 @@ def test_biplane_sees_the_vessel_move_whatever_else_is_observed():
         seen.append(step.observation)
     for key, value in seen[0].items():
         np.testing.assert_array_equal(seen[1][key], value)
+
+
+def test_camera_matrices_project_the_points_that_are_tracked():
+    """Each simulation has its own, with the deviation of its C-arm."""
+    names, ranges = ["tracking", "tracking_2d"], {"view": (-9, 9)}
+    seen = {"observation": names, "randomisation": ranges}
+    machine = {"view": "LAO45", "biplane": "LATERAL", "size": (96, 128)}
+    task = suite.make_task("simple1_bca", fluoroscopy=machine, **seen)
+    simulation = BatchSimulation(task, 3, num_threads=1)
+    observation = simulation.reset().observation
+    matrices = simulation.rollout.camera_matrices
+    assert matrices.shape == (3, 2, 3, 4) and np.ptp(matrices, axis=0).max() > 1.0
+    points = observation["tracking_points"].reshape(3, -1, 3)
+    points = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=-1)
+    found = np.einsum("npij,nkj->npki", matrices, points)
+    pixels = (found[..., :2] / found[..., 2:]).reshape(3, -1)
+    np.testing.assert_allclose(pixels, observation["tracking_pixels"], atol=1e-9)
+    bare = BatchSimulation(suite.make_task("simple1_bca"), 2, num_threads=1)
+    assert bare.rollout.camera_matrices.shape == (2, 0, 3, 4)

@@ -203,6 +203,16 @@ class Restorable:
             self._sensors.planes[index] = machine.planes(self.deviations[index])
             self._sensors.thirds[index] = machine.third(self.deviations[index])
 
+    @property
+    def camera_matrices(self) -> np.ndarray:
+        """(N, P, 3, 4): project (x, y, z, 1), m, to (column w, row w, w) of P planes.
+
+        P is 0 without an observation of fluoroscopy.
+        """
+        planes = self._sensors.planes or [()] * len(self._case_of)
+        found = [[plane.carm.matrix for plane in machine] for machine in planes]
+        return np.array(found).reshape(len(planes), -1, 3, 4)
+
     def case(self, index: int = 0) -> Case:
         """Anatomy and objective of the episode of one simulation."""
         return self._cases[self._case_of[index]]
