@@ -86,7 +86,10 @@ class Learner(abc.ABC):
 
     def compiled(self, loss: nn.Module) -> Callable[[TensorDictBase], TensorDictBase]:
         """Return a loss, compiled by torch if the settings say so."""
-        return torch.compile(loss) if self.config.torch_compile else loss
+        if not self.config.torch_compile:
+            return loss
+        # Samples of the entropy are then those of the loss that is not compiled.
+        return torch.compile(loss, options={"fallback_random": True})
 
     def descend(self, loss: torch.Tensor, max_norm: float = math.inf) -> torch.Tensor:
         """Take a gradient step; return the norm before clipping, 0 without a limit."""
