@@ -105,16 +105,16 @@ def settings(owner: Any, limits: Mapping[str, tuple[float, float]]) -> None:
     """
     for field in dataclasses.fields(owner):
         name, usual = field.name, field.default
-        value, ends = getattr(owner, name), limits.get(name, (0, math.inf))
+        value, (least, most) = getattr(owner, name), limits.get(name, (0, math.inf))
         if isinstance(usual, int):
-            low, high = (None if math.isinf(end) else int(end) for end in ends)
+            low, high = (None if math.isinf(end) else int(end) for end in (least, most))
             whole(name, value, low, high)
         elif isinstance(usual, float):
             if value is not usual and value != usual:
-                number(name, value, *ends)
+                number(name, value, least, most)
         elif isinstance(usual, tuple):
             for one in _row(value) or refuse(name, value, "one number or more"):
-                number(f"an entry of {name}", one, *ends)
+                number(f"an entry of {name}", one, least, most)
         else:
             instance(name, value, type(usual))
 

@@ -106,7 +106,7 @@ class Cameras:
         if self._renderer is not None:
             return
         try:
-            self._renderer = thread.run(lambda: thread.open(self._model, *self._size))
+            self._renderer = thread.run(lambda: thread.open(self._model, self._size))
         except Exception as error:  # each back end fails in its own way
             message = _no_opengl(f"{type(error).__name__}: {error}")
             raise ValueError(message) from error

@@ -56,8 +56,9 @@ class RenderThread:
         self._jobs.put(job)
         return future.result()
 
-    def open(self, model: mujoco.MjModel, rows: int, columns: int) -> "mujoco.Renderer":
-        """Opens a renderer; to be called in this thread."""
+    def open(self, model: mujoco.MjModel, size: tuple[int, int]) -> "mujoco.Renderer":
+        """Opens a renderer of images (rows, columns); called in this thread."""
+        rows, columns = size
         renderer = mujoco.Renderer(model, rows, columns)
         self._renderers.add(renderer)
         if not self._closes_at_exit:
