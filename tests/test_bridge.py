@@ -338,7 +338,10 @@ def test_a_device_stops_when_its_driver_falls_silent():
         np.testing.assert_array_equal(action, [0.3, 0.0])
     assert done["missed"] == len(robot.taken) - 1 >= 2
     assert done["reason"].startswith("watchdog: no action for")
-    assert f"stopped after {done['steps']} steps: watchdog" in served.said[0]
+    told = (
+        f"{done['steps']} steps, {done['missed']} periods without an action: watchdog"
+    )
+    assert f"stopped after {told}" in served.said[0]
     kinds = []
     with contextlib.suppress(bridge.BridgeError):
         while message := link.receive(time.monotonic() + 1.0):
