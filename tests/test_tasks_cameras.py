@@ -167,6 +167,7 @@ def test_cameras_see_what_they_should(task, back_end):
     assert "seen" in done.stdout, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
 def test_contexts_of_others_threads_forks_and_the_exit(back_end):
     """Each environment of a process sees what it sees alone, whoever else renders."""
@@ -177,6 +178,7 @@ def test_contexts_of_others_threads_forks_and_the_exit(back_end):
     assert "Error" not in done.stderr, done.stderr
 
 
+@pytest.mark.slow
 def test_the_device_is_drawn_where_it_is(back_end):
     """Randomisation rolls the base of the device, coaxial devices have other radii."""
     done = python(back_end, DRAWN)

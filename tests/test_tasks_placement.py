@@ -41,7 +41,8 @@ def test_frame_turns_z_into_any_direction(azimuth, height):
         placed = placement.place_device(
             turned, anatomy.goal("bca"), devices.STEERABLE_5F
         )
-    assert np.linalg.norm(placed.quaternion) == pytest.approx(1, abs=1e-9)
+    # MuJoCo normalises it.
+    assert np.linalg.norm(placed.quaternion) == pytest.approx(1, abs=1e-7)
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, placed.quaternion)
     matrix = matrix.reshape(3, 3)
