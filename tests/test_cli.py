@@ -79,11 +79,17 @@ def test_a_closed_output_is_no_error(monkeypatch):
 @pytest.mark.parametrize(
     ("words", "place", "file"),
     [
-        (("phantom", "import", "x.stl"), "one", "one/anatomy.npz"),
+        pytest.param(
+            *(("phantom", "import", "x.stl"), "one", "one/anatomy.npz"),
+            marks=pytest.mark.slow,
+        ),
         (("phantom", "generate", "simple1"), "one", "one/anatomy.npz"),
         (("phantom", "build", "tree.json"), "one", "one/anatomy.npz"),
         (("eval", "push", "--task", "type1_bca"), "one", "one/evaluation.json"),
-        (("submit", "push", "--task", "type1_bca"), "one.json", "one.json"),
+        pytest.param(
+            *(("submit", "push", "--task", "type1_bca"), "one.json", "one.json"),
+            marks=pytest.mark.slow,
+        ),
         (("record", "push", "--task", "simple1_bca"), "one.npz", "one.npz"),
     ],
 )

@@ -55,6 +55,7 @@ def test_an_episode_is_that_of_its_anatomy_alone_in_both_paths(options):
     assert {0, 2} <= set(drawn)
 
 
+@pytest.mark.slow
 def test_conditions_of_an_evaluation_name_the_anatomy(options, tmp_path):
     named = {"anatomy": ["simple1", str(options["anatomy"][1])], "goal": "bca"}
     kwargs = {**named, "max_steps": 2}

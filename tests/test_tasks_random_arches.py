@@ -306,7 +306,9 @@ def test_an_arch_that_no_sheath_fits_before_is_named(monkeypatch):
         suite.load_arches(pool=1)
 
 
-@pytest.mark.parametrize("task", ["arch_any", "arch_any_pair"])
+@pytest.mark.parametrize(
+    "task", ["arch_any", pytest.param("arch_any_pair", marks=pytest.mark.slow)]
+)
 def test_an_arch_entered_from_the_other_side_has_its_own_sheath(task):
     """Its mouth is at another distance from the end of the device, as is the stroke."""
     options = {"observation": "force", "randomisation": {"start_radius": 0.0}}
