@@ -243,8 +243,8 @@ class Rollout(Restorable):
         self._way[indices] = 0.0
         shortest = path_distances(self.objectives, self.resting.head, indices)
         self._shortest[indices] = shortest[indices]
-        old = enumerate(self._errors)
-        self._errors = tuple(None if n in indices else error for n, error in old)
+        begun, old = set(indices.tolist()), enumerate(self._errors)
+        self._errors = tuple(None if n in begun else error for n, error in old)
         step = self._step(indices, begins=True)
         observations.check(step.observation, self._specs)
         self._open[indices] = False
