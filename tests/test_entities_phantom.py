@@ -7,6 +7,7 @@ from dm_control import mjcf
 
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY, AngiographyArena
+from cathsim_dmc.laws import sheath
 from cathsim_dmc.physics import held
 
 
@@ -40,7 +41,9 @@ def pressed(environment, reseed):
     for control in range(130):
         # The links that leave the sheath are free.
         insertion = data.qpos[environment.task.rollout.index.insertion_qpos]
-        device._held.write(hinges, device._free[0], insertion)
+        one, free = device._sheathed, sheath.Hinges._make(device._free[0])
+        out = np.empty_like(one.out[0])
+        sheath.hold(one.joints, one.depths[0], insertion, free, hinges, out)
         data.ctrl[:20] = shake[:20] * (-1) ** control
         for _ in range(task.substeps):
             mujoco.mj_step(model, data)

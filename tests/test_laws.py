@@ -212,14 +212,14 @@ def test_a_joint_in_the_sheath_keeps_its_relaxation_time_and_loses_its_shape():
     count = 4
     joints = sheath.Joints(
         *(np.arange(8).reshape(4, 2) for _ in range(3)),
-        place=np.array([0.05, 0.0, -2e-3, -0.05]),
         behind=np.full(count, 3e-3),
         ahead=np.full(count, 4e-3),
         distal=np.full(count, 0.7),
     )
     free = sheath.Hinges(*RNG.uniform(1.0, 2.0, (3, count, 2)))
     hinges, out = sheath.Hinges(*np.zeros((3, 2 * count))), np.empty(count)
-    sheath.hold(joints, 0.0, free, hinges, out)
+    places = np.array([0.05, 0.0, -2e-3, -0.05])
+    sheath.hold(joints, places, 0.0, free, hinges, out)
     np.testing.assert_allclose(out, [1.0, 0.7, 0.35, 0.0], atol=1e-12)
     kept = np.maximum(out, sheath.LEAST)[:, None]
     for found, one in zip(hinges[:2], free[:2], strict=True):

@@ -199,7 +199,7 @@ def signatures():
     state = named(drive.State, two, two, two)
     told = named(drive.Told, two, two)
     shape = named(springs.Springs, one, one)
-    guided = named(sheath.Joints, *[rows(BITS, 2)] * 3, *[one] * 4)
+    guided = named(sheath.Joints, *[rows(BITS, 2)] * 3, *[one] * 3)
     free, of_model = named(sheath.Hinges, *[two] * 3), named(sheath.Hinges, *[one] * 3)
     memory = named(springs.Scratch, one, bends, two)
     return {
@@ -229,7 +229,7 @@ def signatures():
             *(one, material, links, types.UniTuple(rule, 2), two, two),
         ),
         drive.slip: (servos, state, two),
-        sheath.hold: (guided, REAL, free, of_model, one),
+        sheath.hold: (guided, one, REAL, free, of_model, one),
         drive.follow: (servos, state, two, two, told, two),
     }
 

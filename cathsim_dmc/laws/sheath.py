@@ -37,7 +37,6 @@ class Joints(NamedTuple):
     Attributes:
         joint, dof, qpos: (J, 2), indices of the hinges about x and y in
             `jnt_stiffness`, `dof_damping` and `qpos_spring` of the model.
-        place: (J,), distance past the mouth of the sheath at insertion 0, m.
         behind, ahead: (J,), lengths of rod proximal and distal of the joint that it
             represents, m.
         distal: (J,), fraction of the joint's compliance that belongs to the rod distal
@@ -47,7 +46,6 @@ class Joints(NamedTuple):
     joint: Any
     dof: Any
     qpos: Any
-    place: Any
     behind: Any
     ahead: Any
     distal: Any
@@ -59,11 +57,13 @@ def held_stiffness(stiffness, out):
 
 
 @compiled
-def hold(joints, insertion, free, hinges, out):
+def hold(joints, places, insertion, free, hinges, out):
     """Writes the hinges of a chain that is partly in the sheath.
 
     Args:
         joints: `Joints`.
+        places: (J,), distance of each joint past the mouth of the sheath at insertion
+            0, m.
         insertion: Insertion of the chain, m.
         free: `Hinges` of the joints without a sheath.
         hinges: `Hinges` of the model, which are written.
@@ -71,7 +71,7 @@ def hold(joints, insertion, free, hinges, out):
             written.
     """
     for j in range(len(out)):
-        place, ahead = joints.place[j] + insertion, joints.ahead[j]
+        place, ahead = places[j] + insertion, joints.ahead[j]
         before = min(max(place / joints.behind[j], 0.0), 1.0)
         beyond = min(max((place + ahead) / ahead, 0.0), 1.0)
         out[j] = joints.distal[j] * beyond + (1 - joints.distal[j]) * before

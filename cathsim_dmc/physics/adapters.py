@@ -49,7 +49,7 @@ from cathsim_dmc.laws.motion import (
     wall_velocity,
     warp,
 )
-from cathsim_dmc.laws.sheath import Hinges, Joints, hold
+from cathsim_dmc.laws.sheath import Hinges, hold
 from cathsim_dmc.laws.springs import Scratch, Springs, shape_torques
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.chain_fields import Fields
@@ -200,17 +200,8 @@ def hold_links(sheathed, first, stop):
         if stiffness != 0:
             own = Hinges(free[0], free[1], free[2])
             model = Hinges(numbers(stiffness), numbers(damping), numbers(rest))
-            chain, place = sheathed.joints, sheathed.place[i]
-            joints = Joints(
-                chain.joint,
-                chain.dof,
-                chain.qpos,
-                place,
-                chain.behind,
-                chain.ahead,
-                chain.distal,
-            )
-            hold(joints, sheathed.insertion[i], own, model, sheathed.out[i])
+            depths, insertion = sheathed.depths[i], sheathed.insertion[i]
+            hold(sheathed.joints, depths, insertion, own, model, sheathed.out[i])
 
 
 @compiled

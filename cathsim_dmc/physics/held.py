@@ -35,7 +35,6 @@ class Held:
         model: mujoco.MjModel,
         chain: Chain,
         bends_qpos: np.ndarray,
-        start_depth: float,
     ):
         """Finds the hinges in a model with the values of hinges without a sheath.
 
@@ -43,7 +42,6 @@ class Held:
             model: Model with the values without a sheath.
             chain: The entity.
             bends_qpos: (J, 2), see `readings.ModelIndex`.
-            start_depth: Distance of the chain's end past the mouth at insertion 0, m.
         """
         lengths = chain.link_lengths
         self.ends = np.cumsum(lengths)[:-1] - np.sum(lengths)
@@ -53,7 +51,6 @@ class Held:
             joint=joint,
             dof=dofs,
             qpos=qpos.astype(np.int64),
-            place=self.ends + start_depth,
             behind=lengths[:-1] / 2,
             ahead=lengths[1:] / 2,
             distal=chain.distal_shares,
@@ -66,17 +63,18 @@ class Held:
         pairs = zip(fields, self.joints[:3], strict=True)
         return np.array([field[places] for field, places in pairs])
 
-    def write(self, fields: sheath.Hinges, free: np.ndarray, insertion: float) -> None:
-        """Writes hinges at an insertion, m; `free` (3, J, 2) is without a sheath."""
-        values = sheath.Hinges._make(free)
-        sheath.hold(self.joints, float(insertion), values, fields, self.out)
-
     @contextlib.contextmanager
-    def at(self, model: mujoco.MjModel, insertion: float) -> Iterator[None]:
-        """Holds the links in a model at an insertion, m, within a `with` block."""
+    def at(
+        self, model: mujoco.MjModel, start_depth: float, insertion: float
+    ) -> Iterator[None]:
+        """Holds the links in a model at an insertion, m, within a `with` block.
+
+        The chain's end is `start_depth`, m, past the mouth at insertion 0.
+        """
         fields = fields_of(lambda name: getattr(model, name))
         before = [field.copy() for field in fields]
-        self.write(fields, self.nominal, insertion)
+        free, places = sheath.Hinges._make(self.nominal), self.ends + start_depth
+        sheath.hold(self.joints, places, float(insertion), free, fields, self.out)
         try:
             yield
         finally:
@@ -116,8 +114,8 @@ class Sheathed(NamedTuple):
     """Hinges of N simulations in a sheath.
 
     Attributes:
-        joints: `laws.sheath.Joints`, whose `place` is not used.
-        place: (N, J), distance of each joint past the mouth at insertion 0, m.
+        joints: `laws.sheath.Joints`.
+        depths: (N, J), distance of each joint past the mouth at insertion 0, m.
         insertion: (N,), m.
         free: (N, 3, J, 2), stiffness, damping and rest angles without a sheath.
         places: (N, 3) int64, see `addresses`; 0 before the first episode.
@@ -125,7 +123,7 @@ class Sheathed(NamedTuple):
     """
 
     joints: Any
-    place: Any
+    depths: Any
     insertion: Any
     free: Any
     places: Any

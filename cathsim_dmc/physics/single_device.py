@@ -71,10 +71,10 @@ class SingleDevice(Effect):
         # The shape lies in the plane of x and z.
         rest = model.qpos_spring[places[:, 1]]
         self._springs = Springs(rest, 1 / model.jnt_stiffness[hinges_x])
-        self._held = held.Held(model, world.chain, places, world.start_depth[0])
+        self._held = held.Held(model, world.chain, places)
         self._sheathed = held.Sheathed(
             joints=self._held.joints,
-            place=self._held.ends + world.start_depth[:, None],
+            depths=self._held.ends + world.start_depth[:, None],
             insertion=world.arrays.qpos[:, world.index.insertion_qpos],
             free=np.stack([self._held.nominal] * world.num_simulations),
             places=np.zeros((world.num_simulations, len(held.FIELDS)), np.int64),
@@ -88,8 +88,8 @@ class SingleDevice(Effect):
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Takes the place of the sheath's mouth in the anatomy of one simulation."""
-        place = self._held.ends + self.world.start_depth[index]
-        self._sheathed.place[index] = place
+        depths = self._held.ends + self.world.start_depth[index]
+        self._sheathed.depths[index] = depths
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:
         """Holds the base of one simulation in place, and its links in the sheath."""

@@ -309,8 +309,8 @@ def _settle(
     depth = scene.placement.start_depth
     with contextlib.ExitStack() as stack:
         if not scene.sheath.touches:
-            held = Held(model, scene.catheter, index.bends_qpos, depth)
-            stack.enter_context(held.at(model, at))
+            held = Held(model, scene.catheter, index.bends_qpos)
+            stack.enter_context(held.at(model, depth, at))
         for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
             mujoco.mj_step(model, data)
     _refuse_outside(scene, model, index, data)
