@@ -63,18 +63,23 @@ class Held:
         pairs = zip(fields, self.joints[:3], strict=True)
         return np.array([field[places] for field, places in pairs])
 
-    @contextlib.contextmanager
-    def at(
-        self, model: mujoco.MjModel, start_depth: float, insertion: float
-    ) -> Iterator[None]:
-        """Holds the links in a model at an insertion, m, within a `with` block.
+    def hold(self, model: mujoco.MjModel, start_depth: float, insertion: float) -> None:
+        """Holds the links in a model at an insertion, m.
 
         The chain's end is `start_depth`, m, past the mouth at insertion 0.
         """
         fields = fields_of(lambda name: getattr(model, name))
-        before = [field.copy() for field in fields]
         free, places = sheath.Hinges._make(self.nominal), self.ends + start_depth
         sheath.hold(self.joints, places, float(insertion), free, fields, self.out)
+
+    @contextlib.contextmanager
+    def at(
+        self, model: mujoco.MjModel, start_depth: float, insertion: float
+    ) -> Iterator[None]:
+        """Holds the links, see `hold`, within a `with` block."""
+        fields = fields_of(lambda name: getattr(model, name))
+        before = [field.copy() for field in fields]
+        self.hold(model, start_depth, insertion)
         try:
             yield
         finally:

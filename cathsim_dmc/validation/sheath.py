@@ -9,7 +9,7 @@ from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.posture import joints_along
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.physics.drives import hold
-from cathsim_dmc.physics.held import Held, fields_of
+from cathsim_dmc.physics.held import Held
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check
@@ -39,7 +39,7 @@ class _Guided:
         rig.compile()
         bends = ids(rig.model, rig.catheter.bends)
         places = rig.model.jnt_qposadr[bends].reshape(-1, 2)
-        self._held, self._line = Held(rig.model, rig.catheter, places, 0.0), line
+        self._held, self._line = Held(rig.model, rig.catheter, places), line
 
     def put(self, insertion: float) -> None:
         """Places the device along the line at an insertion, m."""
@@ -56,8 +56,7 @@ class _Guided:
     def hold(self) -> None:
         """Holds the links that are in the sheath."""
         if self._line is None:
-            fields = fields_of(lambda name: getattr(self.rig.model, name))
-            self._held.write(fields, self._held.nominal, self.rig.qpos("insertion"))
+            self._held.hold(self.rig.model, 0.0, self.rig.qpos("insertion"))
 
 
 def deflection(free: float, bore: np.ndarray | None = None) -> tuple[float, float]:
