@@ -19,7 +19,6 @@ from cathsim_dmc.entities.coaxial import carried_mass
 from cathsim_dmc.entities.posture import joints_along
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
-from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check
@@ -174,15 +173,13 @@ def spin(
     rig.arena.attach(Sheath(line[:-1], rig.device.outer_radius, rig.lengths.max()))
     rig.compile()
     rig.bend(joints_along(rig.lengths, line))
-    drives = hold(rig.model, rig.data)
+    rig.hold(0.0)
     twist_hinges = ids(rig.model, rig.catheter.hinges[len(rig.catheter.bends) :])
     places = rig.model.jnt_qposadr[twist_hinges]
-    command = np.array([[0.0, speed / MAX_ROTATION_SPEED]])
     twists, steps = [], round(2 * np.pi / speed / CONTROL_TIMESTEP)
     settling = max(round(2.0 / CONTROL_TIMESTEP), steps // 4)
     for _ in range(settling + steps):
-        drives.follow(command)
-        rig.data.ctrl[-2:] = command[0]
+        rig.drive([0.0, speed / MAX_ROTATION_SPEED])
         rig.run(CONTROL_TIMESTEP)
         twists.append(rig.data.qpos[places].sum())
     hinges = np.sort(ids(rig.model, rig.catheter.bends))

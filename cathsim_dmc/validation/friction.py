@@ -9,7 +9,6 @@ from cathsim_dmc.anatomy.field import EDGE
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.contact import FRICTION
-from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.pair import PAIR
 from cathsim_dmc.validation.rig import Rig
@@ -83,8 +82,7 @@ def _on_wall(device: Any, load: float, lumen: Lumen | None) -> tuple[Rig, np.nda
         low, high = np.array([-radius, -radius, -0.5]), (radius, radius, 0.5)
         rig.add_wall(depth, low - (*lumen.place, 0.0), high)
     rig.compile()
-    rig.data.joint(f"{rig.name}/insertion").qpos = 0.09
-    hold(rig.model, rig.data)
+    rig.hold(0.09)
     beyond = np.cumsum(rig.lengths[::-1])[::-1] - rig.lengths
     pressed = np.where(beyond < _PRESSED - 1e-9, rig.lengths, 0.0)
     loads, last = np.zeros(rig.model.nbody), rig.tip_body + 1
@@ -234,8 +232,7 @@ def _pulled(
     rig.compile()
     middles = np.cumsum(rig.lengths) - rig.lengths / 2
     heading = np.clip((middles - _LEAD) / _AXIS, 0.0, wrap)
-    rig.data.joint(f"{rig.name}/insertion").qpos = _PULL
-    hold(rig.model, rig.data)
+    rig.hold(_PULL)
     rig.bend(np.stack([0 * heading[1:], np.diff(heading)], axis=-1))
     load = TENSION * np.array([np.sin(wrap), 0.0, np.cos(wrap)])
     rig.run(_SETTLING, load)

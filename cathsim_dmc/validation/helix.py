@@ -1,14 +1,12 @@
 """Axial force on a device that has buckled into a helix in a straight tube."""
 
-import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
 
-from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.validation.checks import Check
-from cathsim_dmc.validation.rig import in_tube
+from cathsim_dmc.validation.rig import in_tube, uniform
 
 TUBE = 0.3, 4e-3  # m, length and radius
 LINK = 5e-3  # m, in the check; links of the tasks give a finding without bound
@@ -33,14 +31,8 @@ def helix(link: float, force: float = FORCE) -> tuple[float, float, float]:
     Raises:
         RuntimeError: if the push force is not reached.
     """
-    shaft = devices.STEERABLE_5F.shaft
-    uniform = dataclasses.replace(
-        devices.STEERABLE_5F,
-        tip=shaft,
-        tip_links=round(devices.STEERABLE_5F.tip_length / link),
-        steering_angle=0.0,
-    )
-    environment = in_tube(TUBE, device=uniform, shaft_link=link, friction=0.0)
+    device = uniform(link)
+    environment = in_tube(TUBE, device=device, shaft_link=link, friction=0.0)
     task, action = environment.task, np.array([0.5])
     for _ in range(_MOST):
         environment.step(action)
@@ -52,7 +44,7 @@ def helix(link: float, force: float = FORCE) -> tuple[float, float, float]:
         environment.step(0.0 * action)
     push, line = float(task.readings.push_force), task.readings.centreline
     environment.close()
-    return push, *borne(one_hand(line), shaft.bending_stiffness)
+    return push, *borne(one_hand(line), device.shaft.bending_stiffness)
 
 
 def borne(line: np.ndarray, bending: float) -> tuple[float, float]:

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from cathsim_dmc.entities import chain
-from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import Rig
@@ -42,8 +41,7 @@ def ride(joint: str, load: float = 0.0) -> Ride:
     """
     rig = Rig(stroke=2 * _MIDDLE, rotation=True)
     rig.compile()
-    rig.data.joint(f"{rig.name}/insertion").qpos = _MIDDLE
-    drives = hold(rig.model, rig.data)
+    rig.hold(_MIDDLE)
     base = rig.model.body(f"{rig.name}/link_0").id
     rig.data.xfrc_applied[base, 2] = -load
     which = ("insertion", "rotation").index(joint)
@@ -51,11 +49,10 @@ def ride(joint: str, load: float = 0.0) -> Ride:
 
     def run(value: float) -> np.ndarray:
         """Positions and speeds (2, T) at the physics steps of a command."""
-        rows, command = [], np.zeros((1, 2))
-        command[0, which] = value
+        rows, command = [], [0.0, 0.0]
+        command[which] = value
         for _ in range(round(_WHILE / CONTROL_TIMESTEP)):
-            drives.follow(command)
-            rig.data.ctrl[-2:] = command[0]
+            rig.drive(command)
             for _ in range(round(CONTROL_TIMESTEP / rig.model.opt.timestep)):
                 rig.step()
                 rows.append((rig.qpos(joint), rig.data.qvel[dof]))

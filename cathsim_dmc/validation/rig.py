@@ -23,6 +23,7 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.blood import StillBlood
+from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.effects import Draw, Layout, World, userdata_size
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
@@ -30,6 +31,13 @@ from cathsim_dmc.validation import theory
 
 RESTING_TIME = 0.4  # s, over which motion at rest is measured
 STRICT = 1e-8  # solver tolerance with which devices at rest do not move
+
+
+def uniform(link: float) -> devices.Device:
+    """A device with the shaft of steerable_5f to its end, in links of a length, m."""
+    one = devices.STEERABLE_5F
+    links = round(one.tip_length / link)
+    return dataclasses.replace(one, tip=one.shaft, tip_links=links, steering_angle=0.0)
 
 
 def half_circle(radius: float, start: float, pieces: int) -> np.ndarray:
@@ -249,6 +257,16 @@ class Rig:
         """Steps for a time (s), under a dead load if one is given."""
         for _ in range(round(duration / self.model.opt.timestep)):
             self.step(force)
+
+    def hold(self, insertion: float) -> None:
+        """Places the base at an insertion, m, and holds it by its drives."""
+        self.data.joint(f"{self.name}/insertion").qpos = insertion
+        self.drives = hold(self.model, self.data)
+
+    def drive(self, command: Sequence[float]) -> None:
+        """Commands the D drives, (D,) in [-1, 1], for the control step to come."""
+        self.drives.follow(np.array([command]))
+        self.data.ctrl[-len(command) :] = command
 
     def bend(self, angles: np.ndarray) -> None:
         """Sets the hinges to angles (n - 1, 2), rad, about x and y."""

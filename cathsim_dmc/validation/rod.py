@@ -8,7 +8,6 @@ import numpy as np
 from scipy.signal import lfilter
 
 from cathsim_dmc.entities import chain, devices
-from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation import damping, helix, modes, platforms, sheath, theory
 from cathsim_dmc.validation.checks import Check, Report
@@ -253,16 +252,14 @@ class Driven:
         self.rig = rig = Rig(stroke=2 * _MIDDLE)
         rig.compile()
         self._base = rig.model.body(f"{rig.name}/link_0").id
-        self._motor = rig.data.actuator(f"{rig.name}/insertion")
-        rig.data.joint(f"{rig.name}/insertion").qpos = _MIDDLE
-        self.drives = hold(rig.model, rig.data)
+        rig.hold(_MIDDLE)
+        self.drives = rig.drives
 
     def move(self, duration: float, command: float, force: float) -> float:
         """Moves the base for a time (s) against a force (N); returns its travel, m."""
         start = self.rig.qpos("insertion")
         for _ in range(round(duration / CONTROL_TIMESTEP)):
-            self.drives.follow(np.array([[command]]))
-            self._motor.ctrl[0] = command
+            self.rig.drive([command])
             self.rig.data.xfrc_applied[self._base, 2] = -force
             self.rig.run(CONTROL_TIMESTEP)
         return self.rig.qpos("insertion") - start

@@ -3,7 +3,6 @@
 The reference is an independent elastica in the same tube with sliding contacts.
 """
 
-import dataclasses
 import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -14,12 +13,11 @@ from scipy.optimize import root
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import SOLVER_TOLERANCE
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
-from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.forces import Contacts
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.validation.checks import Check
-from cathsim_dmc.validation.rig import STRICT, Rig
+from cathsim_dmc.validation.rig import STRICT, Rig, uniform
 
 SPEEDS, FRICTIONS = (0.01, 0.04), (0.037, 0.1)  # m/s; Coulomb
 STOPPED_BOUND = 5.0  # % of the push force
@@ -103,15 +101,10 @@ def stopped(
         link: Length of the links, m.
         travel: Travel of the base before the stop, m.
     """
-    uniform = dataclasses.replace(
-        devices.STEERABLE_5F,
-        tip=devices.STEERABLE_5F.shaft,
-        tip_links=round(devices.STEERABLE_5F.tip_length / link),
-        steering_angle=0.0,
-    )
-    length = _BEHIND + travel + uniform.tip_length
+    device = uniform(link)
+    length = _BEHIND + travel + device.tip_length
     fine = devices.Discretisation(length, link)
-    rig = Rig(uniform, fine, stroke=travel + 0.01, friction=friction)
+    rig = Rig(device, fine, stroke=travel + 0.01, friction=friction)
     rig.arena.mjcf_model.option.tolerance = tolerance
     line = _Line(_BEFORE)
 
@@ -123,15 +116,13 @@ def stopped(
     low, high = (-TUBE, -TUBE, -length), (0.05, TUBE, 0.1)
     rig.add_wall(depth, low, high, friction)
     rig.compile()
-    drives = hold(rig.model, rig.data)
-    motor = rig.data.actuator(f"{rig.name}/insertion")
+    rig.hold(0.0)
 
     def push(command: float, duration: float) -> float:
         """Push force, N, in the last control step; at rest its mean over `_READ`."""
         found = [0.0]
         for _ in range(round(duration / CONTROL_TIMESTEP)):
-            drives.follow(np.array([[command]]))
-            motor.ctrl[0] = command
+            rig.drive([command])
             rig.run(CONTROL_TIMESTEP)
             found.append(float(rig.sensor(f"{rig.name}/push_force")[2]))
         last = 1 if command else round(_READ / CONTROL_TIMESTEP)

@@ -8,7 +8,6 @@ from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.posture import joints_along
 from cathsim_dmc.entities.sheath import Sheath
-from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.held import Held
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
@@ -50,7 +49,7 @@ class _Guided:
             ahead *= 2 * _STROKE / np.linalg.norm(ahead)
             line = np.vstack([self._line, self._line[-1] + ahead])
             self.rig.bend(joints_along(self.rig.lengths, line, insertion))
-        self.drives = hold(self.rig.model, self.rig.data)
+        self.rig.hold(insertion)
         self.hold()
 
     def hold(self) -> None:
@@ -96,10 +95,8 @@ def base_force(speed: float, bore: np.ndarray | None = None) -> float:
     force = PULL * axis + ASIDE * np.cross([0.0, 1.0, 0.0], axis)
     duration = _WAY / speed if speed else _RESTING
     for step in range(-25, round(duration / CONTROL_TIMESTEP)):
-        command = speed / MAX_PUSH_SPEED if step >= 0 else 0.0
-        guided.drives.follow(np.array([[command]]))
+        rig.drive([speed / MAX_PUSH_SPEED if step >= 0 else 0.0])
         guided.hold()
-        rig.data.ctrl[-1] = command
         for _ in range(round(CONTROL_TIMESTEP / rig.model.opt.timestep)):
             rig.step(force)
             if step >= 5:
