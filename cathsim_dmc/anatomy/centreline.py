@@ -49,6 +49,26 @@ def interpolate(at: float | np.ndarray, arc: np.ndarray, points: np.ndarray) -> 
     return np.stack([np.interp(at, arc, axis) for axis in points.T], axis=-1)
 
 
+def distinct(points: Array) -> Array:
+    """Points (n, k), m, of a polyline without those that repeat the one before."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return points[np.append(True, steps > _GAP)]
+
+
+def tangents(points: np.ndarray) -> np.ndarray:
+    """Unit vectors (n, 3) along a polyline (n, 3)."""
+    step = np.gradient(points, axis=0)
+    return step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-12)
+
+
+def across(points: np.ndarray) -> np.ndarray:
+    """Two unit vectors (n, 2, 3) across a polyline (n, 3), at right angles."""
+    tangent = tangents(points)
+    u = np.cross(tangent, np.eye(3)[np.abs(tangent).argmin(axis=1)])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return np.stack([u, np.cross(tangent, u)], axis=1)
+
+
 class CentrelinePoint(NamedTuple):
     """A place on a centreline: position (..., 3), radius (...), tangent (..., 3)."""
 

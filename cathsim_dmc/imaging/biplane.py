@@ -12,8 +12,10 @@ from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_filter1d
+from scipy.special import ndtr
 
-from cathsim_dmc.anatomy.centreline import arc_lengths, interpolate
+from cathsim_dmc.anatomy.centreline import across, arc_lengths, interpolate
 from cathsim_dmc.anatomy.geodesic import nearest_cell, search
 from cathsim_dmc.imaging import biplane_loops as loops
 from cathsim_dmc.imaging import materials
@@ -142,8 +144,6 @@ class Biplane:
 
     def radii(self, line: np.ndarray) -> np.ndarray:
         """Radii (P,) of the lumen along a route (P, 3), m."""
-        from scipy.ndimage import gaussian_filter1d
-
         depths, least = self._depths(line), _LEAST_LUMEN[self._errors.any]
         if self._errors.any:
             width = _POOLED_LUMEN / ROUTE_SPACING
@@ -167,20 +167,17 @@ class Biplane:
     @cached_property
     def _walls(self) -> np.ndarray:
         """Signed distances of pixels from the outlines, px, (P, rows, columns)."""
-        from scipy.ndimage import distance_transform_edt as distances
-
         walls = []
         for plane in self._roadmaps:
             inside = plane.vessel_mask
-            out, within = _EDGE - distances(~inside), distances(inside) - _EDGE
+            out = _EDGE - distance_transform_edt(~inside)
+            within = distance_transform_edt(inside) - _EDGE
             wall = np.where(inside, within, out)
             walls.append(self._spoiled(wall).astype(np.float32))
         return np.stack(walls)
 
     def _spoiled(self, wall: np.ndarray) -> np.ndarray:
         """Adds the errors of a roadmap to signed distances (rows, columns), px."""
-        from scipy.ndimage import gaussian_filter
-
         errors, random = self._errors, self._random
         if not errors.any:
             return wall
@@ -233,17 +230,8 @@ class Biplane:
         The weight of a place is the probability that it is in the vessel, times its
         depth.
         """
-        from scipy.ndimage import gaussian_filter1d
-        from scipy.special import ndtr
-
-        ways = np.gradient(line, axis=0)
-        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-        across = np.eye(3)[np.abs(ways).argmin(axis=1)]
-        across = np.cross(ways, across)
-        across /= np.linalg.norm(across, axis=1, keepdims=True)
-        disc = np.stack([across, np.cross(ways, across)], axis=1)
         wide = np.clip(_DISC_RADII * self.depth(line) + 1e-3, _DISC[0], _DISC[1])
-        shifts = wide[:, None, None] * (_disc() @ disc)
+        shifts = wide[:, None, None] * (_disc() @ across(line))
         depths, error = self._depths(line[:, None] + shifts), self._error
         weights = ndtr(depths / error).prod(axis=0)
         weights *= np.maximum(depths.min(axis=0) + error, 0.1 * error)
@@ -278,8 +266,6 @@ class Biplane:
 
 def _smoothed(line: np.ndarray, width: float) -> np.ndarray:
     """A line (n, 3) smoothed over a width, m, in steps of `ROUTE_SPACING`."""
-    from scipy.ndimage import gaussian_filter1d
-
     way = arc_lengths(line)
     number = max(round(way[-1] / ROUTE_SPACING), 1) + 1
     line = interpolate(np.linspace(0.0, way[-1], number), way, line)
@@ -292,9 +278,9 @@ def _smoothed(line: np.ndarray, width: float) -> np.ndarray:
 
 
 @cache
-def _disc(across: int = 9) -> np.ndarray:
+def _disc() -> np.ndarray:
     """Points (n, 2) in the unit disc."""
-    number = np.linspace(-1.0, 1.0, across)
+    number = np.linspace(-1.0, 1.0, 9)
     points = np.stack(np.meshgrid(number, number), axis=-1).reshape(-1, 2)
     return points[np.linalg.norm(points, axis=1) < 1.01]
 

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.centreline import VesselTree, arc_lengths
-from cathsim_dmc.anatomy.scan.centring import resample, tangents
+from cathsim_dmc.anatomy.centreline import VesselTree, arc_lengths, tangents
+from cathsim_dmc.anatomy.scan.centring import resample
 from cathsim_dmc.anatomy.scan.ends import FreeEnd
 from cathsim_dmc.anatomy.scan.units import mm, shown
 from cathsim_dmc.anatomy.scan.ways import Ways

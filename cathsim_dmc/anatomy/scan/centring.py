@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from cathsim_dmc.anatomy.centreline import arc_lengths, interpolate
+from cathsim_dmc.anatomy.centreline import across, arc_lengths, distinct, interpolate
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 STEP = 1e-3  # m, spacing of the centrelines that result
@@ -19,8 +19,7 @@ SLIT = 1.25  # largest radius of a section, in radii of the ball
 
 def resample(points: np.ndarray) -> np.ndarray:
     """Points of a polyline (n, 3) m at equal distances of about `STEP`."""
-    apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-9
-    points = points[np.concatenate([[True], apart])]
+    points = distinct(points)
     s = arc_lengths(points)
     t = np.linspace(0.0, s[-1], max(2, int(round(s[-1] / STEP)) + 1))
     return interpolate(t, s, points)
@@ -37,7 +36,7 @@ def centred(
     points = curve.copy()
     for turn in range(ROUNDS):
         share = 1.0 - turn / ROUNDS
-        sides = _across(points)
+        sides = across(points)
         offsets = REACH * np.concatenate([sides, -sides], axis=1)
         around = field(points[:, None] + offsets) / (2.0 * REACH)
         uphill = np.einsum("ns,nsd->nd", around[:, :2] - around[:, 2:], sides)
@@ -53,20 +52,6 @@ def centred(
     return resample(_smoothed(points, field(points)))
 
 
-def tangents(points: np.ndarray) -> np.ndarray:
-    """Unit vectors (n, 3) along a curve (n, 3)."""
-    step = np.gradient(points, axis=0)
-    return step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-12)
-
-
-def _across(points: np.ndarray) -> np.ndarray:
-    """Two unit vectors (n, 2, 3) across a curve (n, 3)."""
-    tangent = tangents(points)
-    u = np.cross(tangent, np.eye(3)[np.abs(tangent).argmin(axis=1)])
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return np.stack([u, np.cross(tangent, u)], axis=1)
-
-
 def section_radii(field: SurfaceDepth, points: np.ndarray) -> np.ndarray:
     """Radii (n,) m of the lumen along a curve (n, 3) in its middle.
 
@@ -77,7 +62,7 @@ def section_radii(field: SurfaceDepth, points: np.ndarray) -> np.ndarray:
     ball = field(points)
     angle = 2.0 * np.pi * np.arange(RAYS) / RAYS
     turn = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    rays = np.einsum("rs,nsd->nrd", turn, _across(points))
+    rays = np.einsum("rs,nsd->nrd", turn, across(points))
     reach = np.repeat(ball[:, None], RAYS, axis=1)
     # A ball with the radius of the depth holds no wall. SLIT bounds rays into ostia.
     for _ in range(4):

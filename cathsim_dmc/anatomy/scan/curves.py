@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cathsim_dmc import bounds
+from cathsim_dmc.anatomy.centreline import distinct
 from cathsim_dmc.anatomy.scan import vtk_files
 from cathsim_dmc.anatomy.scan.mesh import parsed
 from cathsim_dmc.anatomy.scan.naming import ROOT, TRUNK
@@ -97,14 +98,13 @@ def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> np.nd
 
 def _distinct(path: Path, points: np.ndarray) -> np.ndarray:
     """Points (n, 3) without consecutive repetitions; ValueError if no curve is left."""
-    apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-9
-    keep = np.concatenate([[True], apart])
-    if keep.sum() < 2 or not np.isfinite(points).all():
+    kept = distinct(points)
+    if len(kept) < 2 or not np.isfinite(points).all():
         raise ValueError(
-            f"{path} holds {keep.sum()} distinct points; a centreline needs at least "
+            f"{path} holds {len(kept)} distinct points; a centreline needs at least "
             "2, all finite."
         )
-    return points[keep]
+    return kept
 
 
 def vessel_name(path: str | Path) -> str:
