@@ -11,6 +11,8 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter
+from scipy.special import ndtri
 
 from cathsim_dmc.compiled import compiled
 
@@ -37,8 +39,6 @@ _QUANTILES = 1 << 16
 @cache
 def _normal_quantiles() -> tuple[np.ndarray, np.ndarray]:
     """Normal deviates z and (z² - 1) / 6, both of mean 0, (_QUANTILES,) float32."""
-    from scipy.special import ndtri
-
     z = ndtri((np.arange(_QUANTILES) + 0.5) / _QUANTILES)
     z = z / z.std()
     return z.astype(np.float32), ((z * z - 1.0) / 6.0).astype(np.float32)
@@ -96,8 +96,6 @@ def blurred(signal: ArrayLike, sigma: float) -> np.ndarray:
     out = np.asarray(signal, dtype=np.float32)
     if sigma < 0.2:
         return out
-    from scipy.ndimage import gaussian_filter
-
     reach = math.ceil(3.0 * sigma)
     return gaussian_filter(out, sigma, mode="nearest", radius=reach, axes=(-2, -1))
 

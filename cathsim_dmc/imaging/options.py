@@ -119,7 +119,7 @@ class FluoroscopyOptions:
 
     def __post_init__(self) -> None:
         errors = bounds.made("roadmap_errors", self.roadmap_errors, RoadmapErrors)
-        object.__setattr__(self, "roadmap_errors", errors)
+        vars(self)["roadmap_errors"] = errors
         if is_best(self.view) != is_best(self.biplane):
             raise ValueError(
                 f"view is {self.view!r} and biplane {self.biplane!r}; give {BEST!r} "
@@ -137,7 +137,7 @@ class FluoroscopyOptions:
             self.carms(np.zeros((1, 3)), names=names)
         for name in ("view", "biplane", "third", "size", "centre"):
             if isinstance(given := getattr(self, name), list | np.ndarray):
-                object.__setattr__(self, name, tuple(given))  # hashable
+                vars(self)[name] = tuple(given)  # hashable
 
     @property
     def iodine(self) -> float:
