@@ -159,10 +159,8 @@ class Anatomy:
         """Raises ValueError if a position (3,), m, LPS, is outside the lumen."""
         depth = float(self.lumen(position))
         if not depth > 0.0:
-            (low, high), unit = (
-                self._box_of_file(),
-                self.file.unit if self.file else "m",
-            )
+            low, high = self._box_of_file()
+            unit = "m" if self.file is None else self.file.unit
             raise ValueError(
                 f"{what} lies {-depth * 1e3:.1f} mm outside the lumen of "
                 f"{self.name!r}, which reaches from {low} to {high} {unit}; give a "

@@ -63,16 +63,13 @@ class Motion:
         low, high = box
         heart, breath = _along_aorta(blood, tree)
         shape = np.ceil((high - low) / _STEP).astype(int) + 1
-        i, j, k = (np.arange(count) for count in shape)
-        lattice = np.stack(np.meshgrid(i, j, k, indexing="ij"), -1)
-        points = (low + _STEP * lattice).reshape(-1, 3)
-        values = np.concatenate(
-            [
-                _values(part, ends, blood, heart, breath)
-                for part in np.array_split(points, 32)
-            ]
-        )
-        return cls(np.concatenate([low, [_STEP], shape, values.ravel()]))
+        points = low + _STEP * np.argwhere(np.ones(shape, bool))
+        parts = [
+            _values(part, ends, blood, heart, breath)
+            for part in np.array_split(points, 32)
+        ]
+        values = np.concatenate(parts).ravel()
+        return cls(np.concatenate([low, [_STEP], shape, values]))
 
     def check(self, name: str, heart: float, breathing: float) -> None:
         """ValueError if the amplitudes of heart (m) and breathing fold space."""

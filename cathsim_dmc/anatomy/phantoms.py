@@ -12,7 +12,7 @@ from cathsim_dmc.anatomy.tree_file import read_tree
 _DATA = Path(__file__).parent / "data"
 MEASURED = ("type1", "type2")  # the published silicone phantoms; docs/anatomies.md
 # Those that come as a file of centrelines, `data/<name>.json`.
-TREES = (*MEASURED,)
+TREES = MEASURED
 PHANTOMS = (*TREES, *arch.ARCHES)
 
 

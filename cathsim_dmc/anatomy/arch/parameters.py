@@ -71,10 +71,11 @@ class BranchParameters:
 
     def __post_init__(self) -> None:
         bounds.fields(self, _OF_BRANCH, "branch ")
-        for name in ("bend_radius", "second_bend_radius"):
-            if getattr(self, name) is not None or name == "bend_radius":
-                least = 3.0 * self.radius
-                bounds.number(f"branch {name}", getattr(self, name), least, 10.0, "m")
+        least = 3.0 * self.radius
+        bounds.number("branch bend_radius", self.bend_radius, least, 10.0, "m")
+        if self.second_bend_radius is not None:
+            name = "branch second_bend_radius"
+            bounds.number(name, self.second_bend_radius, least, 10.0, "m")
 
 
 @dataclass(frozen=True)
@@ -143,9 +144,10 @@ class ArchParameters:
     neck: tuple[Course, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("bca", "lcca", "lsa", "aberrant"):
-            if getattr(self, name) is not None or name != "aberrant":
-                bounds.instance(name, getattr(self, name), BranchParameters)
+        for name in ("bca", "lcca", "lsa"):
+            bounds.instance(name, getattr(self, name), BranchParameters)
+        if self.aberrant is not None:
+            bounds.instance("aberrant", self.aberrant, BranchParameters)
         bounds.switch("bovine", self.bovine)
         bounds.fields(self, _OF_ARCH)
         self._check_bends()

@@ -1,7 +1,6 @@
 """Random aortic arches from anatomical distributions."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +15,6 @@ from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.centreline import VesselTree
 
 # Range of the BCA drop in LCCA diameters for each type of arch.
-DROP_RANGES: Mapping[str, tuple[float, float]]
 DROP_RANGES = {"I": (0.0, 1.0), "II": (1.0, 2.0), "III": (2.0, 3.0)}
 # How the branches leave the arch. Bovine: a common trunk of BCA and LCCA (78 %), or
 # the LCCA off the BCA further on (22 %). Aberrant: the right subclavian artery leaves
