@@ -30,11 +30,8 @@ class AngiographyArena(composer.Arena):
                 its buoyancy in blood.
             tolerance: tolerance of the contact solver.
         """
-        for name, value in (
-            ("device_density", device_density),
-            ("tolerance", tolerance),
-        ):
-            bounds.number(name, value, positive=True)
+        bounds.number("device_density", device_density, positive=True)
+        bounds.number("tolerance", tolerance, positive=True)
         super()._build(name="arena")
         root = self._mjcf_root
         # composer.Arena bounds masses and inertias from below and sets no-slip

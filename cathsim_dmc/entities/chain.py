@@ -160,7 +160,7 @@ class Chain(composer.ModelWrapperEntity):
         root.compiler.angle = "radian"
         super()._build(root)
         bodies = [self._add_base(links, rotation)]
-        bends, twists = [], []
+        bends, twists, joints = [], [], root.find_all("joint")
         for index in range(1, len(links.lengths)):
             place = (0, 0, links.lengths[index - 1])
             bodies.append(bodies[-1].add("body", name=f"link_{index}", pos=place))
@@ -170,7 +170,10 @@ class Chain(composer.ModelWrapperEntity):
                     bodies[-1], name, (0, 0, 1), twist, armature=TORSION_ARMATURE
                 )
                 twists.append(hinge)
-            bends += self._add_bends(bodies[-1], index, links)
+                joints.append(hinge)
+            pair = self._add_bends(bodies[-1], index, links)
+            bends += pair
+            joints += pair
         self.links, self.bends = tuple(bodies), tuple(bends)
         self.link_geoms = tuple(
             _add_capsule(body, index, links, surface)
@@ -178,11 +181,7 @@ class Chain(composer.ModelWrapperEntity):
         )
         self._add_shaft(links)
         self.hinges = (*bends, *twists)
-        straight, mine = iter(bends), set(bends)
-        self.joints = tuple(
-            next(straight) if joint in mine else joint
-            for joint in root.find_all("joint")
-        )
+        self.joints = tuple(joints)
         self.head = bodies[-1].add(
             "site",
             name="head",
