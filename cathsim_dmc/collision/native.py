@@ -317,6 +317,17 @@ def call_callback(_, address, model, data):
 
 
 @_intrinsic
+def call_law(_, address, model, data, layout, start):
+    """Calls an adapter at an address, see `physics.adapters`."""
+
+    def generate(context, builder, signature, values):
+        _call(builder, values, ir.VoidType())
+        return context.get_dummy_value()
+
+    return types.void(*[types.int64] * 5), generate
+
+
+@_intrinsic
 def call_error(_, address, text, number):
     """Calls `mju_error` with the text at an address, and an int32 for its %d."""
 

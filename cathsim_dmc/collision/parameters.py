@@ -2,26 +2,10 @@
 
 from typing import Any
 
-from llvmlite import ir
 from numba.core import types
-from numba.extending import intrinsic, overload
+from numba.extending import overload
 
 from cathsim_dmc.laws.parameters import Array
-
-# Compiled code calls intrinsics without their first argument.
-_intrinsic: Any = intrinsic
-
-
-@_intrinsic
-def call_law(_, address, model, data, layout, start):
-    """Calls an adapter at an address, see `physics.adapters`."""
-
-    def generate(context, builder, signature, values):
-        kind = ir.FunctionType(ir.VoidType(), [value.type for value in values[1:]])
-        builder.call(builder.inttoptr(values[0], kind.as_pointer()), values[1:])
-        return context.get_dummy_value()
-
-    return types.void(*[types.int64] * 5), generate
 
 
 def unpacked(kind, row, links, joints):

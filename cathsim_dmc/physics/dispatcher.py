@@ -21,7 +21,6 @@ from cathsim_dmc import bounds
 from cathsim_dmc.collision import native, own
 from cathsim_dmc.collision.native import address_of, call_before, data_field, word
 from cathsim_dmc.collision.own import CONTROL, PASSIVE, layout_of
-from cathsim_dmc.collision.parameters import call_law
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.physics import adapters
 from cathsim_dmc.physics.readings import ModelIndex
@@ -39,7 +38,7 @@ def _run(laws, model, data, layout):
     """Calls the adapters of a list, see `own.PASSIVE`."""
     for n in range(word(laws)):
         entry = laws + 8 + 16 * n
-        call_law(word(entry), model, data, layout, word(entry + 8))
+        native.call_law(word(entry), model, data, layout, word(entry + 8))
 
 
 @_callback
