@@ -16,7 +16,7 @@ from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End, Inlet, Surface
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
 from cathsim_dmc.anatomy.scan.places import cut_open
-from cathsim_dmc.anatomy.scan.topology import merged
+from cathsim_dmc.anatomy.scan.topology import merged, used
 from cathsim_dmc.recording.geometry import along
 
 MESH, WIRES = "phantom.stl", "wires.json"
@@ -180,8 +180,8 @@ def _opened(
             points, shell, cap = cut_open(vertices, faces, at)
         except ValueError:
             continue
-        used, numbers = np.unique(np.concatenate([shell, cap]), return_inverse=True)
-        surface = Surface(points[used], numbers.reshape(-1, 3))
+        corners, triangles = used(points, np.concatenate([shell, cap]))
+        surface = Surface(corners, triangles)
         if surface.volume > 0.5 * volume:
             return surface, place
     raise ValueError(

@@ -205,16 +205,15 @@ def trunk(
     whole curve without such a fork.
     """
     main, others = curves[0], list(curves[1:])
-    depth = ways.depth[[ways.node(point) for point in main]]
-    s = arc_lengths(main)
+    depth, s = ways.depths(main), arc_lengths(main)
     forks = []
     for other in others:
         at = common(main, other) - 1
         radius = float(np.median(depth[max(at - 3, 0) : at + 1]))
-        beside = ways.depth[[ways.node(point) for point in other]]
+        past = arc_lengths(other)
         wide = [
             _width(s - s[at], depth, radius),
-            _width(arc_lengths(other) - arc_lengths(other)[at], beside, radius),
+            _width(past - past[at], ways.depths(other), radius),
         ]
         least = max(TRUNK_LENGTH * radius, INLET_CUT * radius + _ahead_of_inlet(radius))
         if s[at] > least and min(wide) > EVEN * max(wide):
@@ -251,10 +250,7 @@ def continued(
     added: dict[str, float] = {}
     out = dict(curves)
     # Of two curves that end in each other the wider one is continued.
-    order = sorted(
-        curves, key=lambda key: -ways.depth[[ways.node(p) for p in curves[key]]].sum()
-    )
-    for name in order:
+    for name in sorted(curves, key=lambda key: -ways.depths(curves[key]).sum()):
         last = ways.node(curves[name][-1])
         here, depth = ways.points[last], float(ways.depth[last])
         # A curve may end in a continued vessel, as one vertebral artery in the other.

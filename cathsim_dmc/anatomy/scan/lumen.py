@@ -12,7 +12,7 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan import labels as label_maps
 from cathsim_dmc.anatomy.scan import mesh
 from cathsim_dmc.anatomy.scan.repair import mend
-from cathsim_dmc.anatomy.scan.topology import areas, merged
+from cathsim_dmc.anatomy.scan.topology import areas, merged, neighbour_means
 from cathsim_dmc.anatomy.scan.units import UNITS, file_frame, to_lps, upright
 from cathsim_dmc.anatomy.surface import sampled
 
@@ -303,11 +303,8 @@ def _enclosed(away: np.ndarray) -> bool:
 
 def _smoothed(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Smooths noise, which would shrink balls; a finer mesh takes more passes."""
-    import igl
-
     vertices, faces = merged(vertices, faces)
-    beside = igl.adjacency_matrix(faces)
-    beside = beside.multiply(1.0 / beside.sum(axis=1)).tocsr()
+    beside = neighbour_means(faces)
     for _ in range(min(len(faces) // _SMOOTH, _MOST)):
         vertices = 0.5 * (vertices + beside @ vertices)
     return vertices, faces

@@ -101,7 +101,6 @@ def offshoots(
     ways: Ways, bend: Bend, depth: np.ndarray, curves: Sequence[np.ndarray]
 ) -> list[Offshoot]:
     """Branches of an aorta with depths (n,) m, which curves (m_i, 3) m leave."""
-    aorta = cKDTree(bend.line)
     groups_: list[tuple[list[int], list[np.ndarray], float]] = []
     for number, row, s in departures(bend, depth, curves):
         for members, rows, _ in groups_:
@@ -125,7 +124,7 @@ def offshoots(
             place, radius = rows[0][0], _calibre(ways, rows[0], fork)
             found.append(Offshoot(place, s, radius, tuple(members), fork, tuple(rows)))
     places = np.array([one.s for one in found])
-    for stub in _stubs(ways, bend, depth, curves, aorta):
+    for stub in _stubs(ways, bend, depth, curves):
         if len(places) and abs(places - stub.s).min() < STUB_APART:
             found.append(stub)
     found = [f for f in found if abs(f.s - 1e-3 * bend.apex) < NEAR]
@@ -169,7 +168,7 @@ def third_limb(
 
 def depth_of(ways: Ways, line: np.ndarray) -> np.ndarray:
     """Radius (n,) m of the lumen at nodes (n, 3) of the lattice."""
-    return ways.depth[[ways.node(point) for point in line]] + CELL
+    return ways.depths(line) + CELL
 
 
 def _calibre(ways: Ways, row: np.ndarray, fork: float | None) -> float:
@@ -180,9 +179,10 @@ def _calibre(ways: Ways, row: np.ndarray, fork: float | None) -> float:
     return float(np.median(depth_of(ways, part if len(part) else row)))
 
 
-def _stubs(ways, bend, depth, curves, aorta) -> Iterator[Offshoot]:
+def _stubs(ways, bend, depth, curves) -> Iterator[Offshoot]:
     """Branches that were cut short: lumen that rises from the aorta's wall."""
     nodes = ways.nodes
+    aorta = cKDTree(bend.line)
     distance, near = aorta.query(ways.points[nodes], distance_upper_bound=60e-3)
     there = np.isfinite(distance)
     nodes, distance, near = nodes[there], distance[there], near[there]

@@ -7,7 +7,7 @@ import numpy as np
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
-from cathsim_dmc.anatomy.scan.topology import adjacent, groups
+from cathsim_dmc.anatomy.scan.topology import adjacent, groups, used
 from cathsim_dmc.anatomy.scan.units import shown
 from cathsim_dmc.anatomy.scan.ways import DEVICE_RADIUS
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
@@ -240,8 +240,8 @@ def opened_at_inlet(
             if last:
                 raise
             continue
-        used, numbers = np.unique(np.concatenate([shell, cap]), return_inverse=True)
-        cut = Surface(points[used], numbers.reshape(-1, 3))
+        vertices, faces = used(points, np.concatenate([shell, cap]))
+        cut = Surface(vertices, faces)
         tips = [vessel.centreline.points[-1] for vessel in opened.vessels.values()]
         begun = [v.centreline.points[0] for v in opened.vessels.values() if v.parent]
         depths = SurfaceDepth(cut)(np.array([*tips, *begun]))

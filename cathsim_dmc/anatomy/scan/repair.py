@@ -89,12 +89,11 @@ class _Work:
         label, share, large = found
         inner = None
         if len(large) == 2 and not quiet:
-            shells = [self.faces[label == k] for k in large]
-            inner = topology.inner_shell(self.vertices, shells)
+            inner = topology.inner_shell(self.vertices, self.faces, label, large)
         if inner is not None:
             self.notes.append("thick wall: the inner of two surfaces taken")
             self.walled = True
-            large = large[[inner]]
+            large = [inner]
         elif len(large) > 1:
             raise bodies.refusal(self.name, self.vertices, self.faces, found)
         elif len(share) > 1 and not quiet:
@@ -337,11 +336,8 @@ class _Work:
 
         `limit` is the largest movement, m.
         """
-        import igl
-
         vertices, count = self.vertices, 0
-        beside = igl.adjacency_matrix(self.faces)
-        beside = beside.multiply(1.0 / beside.sum(axis=1)).tocsr()
+        beside = topology.neighbour_means(self.faces)
         for _ in range(2 * ROUNDS):
             pierced, _, tangled = self._crossings(vertices)
             if not pierced:
@@ -366,5 +362,4 @@ class _Work:
         self._keep(~chosen)
 
     def _keep(self, chosen: np.ndarray) -> None:
-        used, numbers = np.unique(self.faces[chosen], return_inverse=True)
-        self.vertices, self.faces = self.vertices[used], numbers.reshape(-1, 3)
+        self.vertices, self.faces = topology.used(self.vertices, self.faces[chosen])

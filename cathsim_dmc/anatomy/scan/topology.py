@@ -1,10 +1,10 @@
 """Topology of triangle meshes: parts, borders, orientation, walls."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -31,9 +31,13 @@ def merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    faces = faces[np.sort(once)]
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return vertices[first][used], renumbered.reshape(-1, 3)
+    return used(vertices[first], faces[np.sort(once)])
+
+
+def used(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Surface without the vertices of no triangle."""
+    kept, numbers = np.unique(faces, return_inverse=True)
+    return vertices[kept], numbers.reshape(-1, 3)
 
 
 def joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -101,6 +105,14 @@ def handles(faces: np.ndarray) -> int:
     import igl
 
     return 1 - igl.euler_characteristic(np.ascontiguousarray(faces)) // 2
+
+
+def neighbour_means(faces: np.ndarray) -> csr_matrix:
+    """Matrix (V, V) that takes values at vertices to the means of their neighbours."""
+    import igl
+
+    beside = igl.adjacency_matrix(faces)
+    return beside.multiply(1.0 / beside.sum(axis=1)).tocsr()
 
 
 def parts(faces: np.ndarray, by_edges: bool = False) -> np.ndarray:
@@ -247,18 +259,19 @@ def without_slivers(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     return faces, removed
 
 
-def inner_shell(vertices: np.ndarray, shells: Sequence[np.ndarray]) -> int | None:
-    """Index of the inner of two surfaces, faces (n, 3); None if neither is inside."""
-    import igl
+def inner_shell(
+    vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, shells: np.ndarray
+) -> int | None:
+    """The part, of two `shells` (2,), that is inside the other; None if neither is.
 
-    share = []
-    for own, other in (shells, shells[::-1]):
-        middles = vertices[own].mean(axis=1)
-        winding = igl.fast_winding_number(vertices, other, middles)
-        share.append(float((np.abs(winding) > 0.5).mean()))
-    if max(share) < 0.9 or min(share) > 0.5:
+    Faces (F, 3) are labelled (F,) by their parts.
+    """
+    one, other = shells.tolist()
+    first = inside(vertices, faces, label, other)[one]
+    second = inside(vertices, faces, label, one)[other]
+    if max(first, second) < 0.9 or min(first, second) > 0.5:
         return None
-    return int(share[1] > share[0])
+    return other if second > first else one
 
 
 def overlap(

@@ -81,6 +81,10 @@ class Ways:
         """Node nearest to ``position`` (3,) m in the largest component."""
         return int(self.nodes[self._lookup.query(position)[1]])
 
+    def depths(self, curve: np.ndarray) -> np.ndarray:
+        """Depths (n,) m at the nodes nearest to the points (n, 3) m of a curve."""
+        return self.depth[self.nodes[self._lookup.query(curve)[1]]]
+
     def walled(self, first: np.ndarray, last: np.ndarray) -> np.ndarray:
         """Mask (n,) of pairs of places (n, 3) m in the lumen with a wall in between."""
         share = np.linspace(0.0, 1.0, 7)[1:-1, None, None]
