@@ -10,6 +10,7 @@ import pytest
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import Anatomy, Goal, phantoms
+from cathsim_dmc.anatomy.arch.arch import build_arch
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +37,28 @@ def forged(saved, tmp_path):
         np.savez(tmp_path / "anatomy.npz", **arrays)
 
     return write
+
+
+@pytest.mark.parametrize(
+    ("tree", "options", "words"),
+    [
+        ("type1", {}, "^tree is 'type1'; it must be a Mapping"),
+        ("lines", {}, "^vessel 'aorta' is .*; it must be a Curve"),
+        (None, {"inlet": "bca"}, "^inlet is 'bca'; it must be a VesselPlace"),
+        (None, {"goals": ["bca"]}, r"^goals is \['bca'\]; it must be a Mapping"),
+        (None, {"goals": {"x": 3}}, "^goal 'x' is 3; it must be a VesselPlace"),
+    ],
+)
+def test_parts_of_a_tree_of_another_class_are_refused(anatomy, tree, options, words):
+    lines = {name: one.centreline for name, one in anatomy.tree.vessels.items()}
+    given = {None: anatomy.tree, "lines": lines}.get(tree, tree)
+    with pytest.raises(ValueError, match=words):
+        Anatomy.from_tree(given, **options)
+
+
+def test_an_arch_is_built_from_parameters_alone():
+    with pytest.raises(ValueError, match="^params is 'simple1'; it must be an Arch"):
+        build_arch("simple1")
 
 
 # Changes of the header and the arrays, and what the error says.

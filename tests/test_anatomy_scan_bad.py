@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from synthetic_scans import marched, write_obj, y_tree
 
+from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.validation.checks import Report
 
 
@@ -31,6 +32,20 @@ def scans(vertices, faces):
     yield "wrong unit", "scan.obj", good, ["--units", "m"], "pass units='mm'"
     yield "no curve", "scan.obj", good, drawn, "no centreline file bca.mrk.json"
     yield "half a curve", "scan.obj", good, drawn, "is no 3D Slicer markup"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"labels": 1}, "^labels is .*; it must be an array of integers"),
+        ({"labels": (1.5,)}, "^labels is .*; it must be an array of integers"),
+        ({"labels": "1"}, "^labels is .*; it must be an array of integers"),
+        ({"device": "wire_035_glide"}, "^device is 'wire_035_glide'; it must be a dev"),
+    ],
+)
+def test_options_of_another_kind_are_refused_before_the_scan_is_read(options, words):
+    with pytest.raises(ValueError, match=words):
+        import_scan("missing.nii", **options)
 
 
 def test_bad_scans_are_told_apart_and_leave_nothing(tmp_path, monkeypatch, cathsim):

@@ -111,6 +111,24 @@ def test_an_angled_wire_has_its_best_turn_unless_an_operator_turned_it():
     assert beaten.passed and beaten.bound == "<= 7"
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "wires.json cannot be read as JSON in UTF-8: Expecting"),
+        ("[]", "wires.json is not as `bench_data.read` describes"),
+        (
+            '{"wires": [], "landmarks": {"entry": {"point_mm": [1, 2]}}}',
+            r"wires.json: point_mm is \[1, 2\]; it must be 3 numbers",
+        ),
+    ],
+)
+def test_a_damaged_file_of_wires_is_named(tmp_path, text, words):
+    trimesh.creation.icosphere(1, 10.0).export(tmp_path / MESH)
+    (tmp_path / WIRES).write_text(text)
+    with pytest.raises(ValueError, match=words):
+        bench_data.read(tmp_path)
+
+
 def test_wires_that_fold_back_are_told():
     angle = np.linspace(0.0, 1.2 * np.pi, 60)
     bow = 0.01 * np.stack([1 - np.cos(angle), np.sin(angle), 0 * angle], axis=1)

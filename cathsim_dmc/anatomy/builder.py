@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet
 
@@ -46,8 +47,11 @@ def placed(
 ) -> tuple[VesselTree, tuple[End, ...], Inlet, dict[str, Goal]]:
     """Tree cut at the inlet, flat ends, inlet and goals, for `Anatomy.from_tree`."""
     places = default_goals(tree) if goals is None else goals
+    for key, place in bounds.instance("goals", places, Mapping).items():
+        bounds.instance(f"goal {key!r}", place, VesselPlace)
     found = {key: _goal(key, place, tree) for key, place in places.items()}
-    inlet = inlet or VesselPlace(tree.root.name)
+    inlet = VesselPlace(tree.root.name) if inlet is None else inlet
+    bounds.instance("inlet", inlet, VesselPlace)
     tree, at_first = _cut_at(tree, inlet, found)
     if inlet.vessel == tree.root.name:
         # Arc lengths count from the new first point.

@@ -56,7 +56,8 @@ def smooth_tree(curves: Mapping[str, Curve]) -> VesselTree:
             intersect; names the vessel and the place.
     """
     vessels: dict[str, Vessel] = {}
-    for name, curve in curves.items():
+    for name, curve in bounds.instance("tree", curves, Mapping).items():
+        bounds.instance(f"vessel {name!r}", curve, Curve)
         if curve.parent is None:
             dense = _smooth(curve.points, _STEP)
             line = Centreline(dense, np.ones(len(dense)))

@@ -133,6 +133,12 @@ def read(folder: str | Path) -> Bench:
     vertices, faces = merged(vertices / 1e3, faces)
     try:
         found = json.loads((folder / WIRES).read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(
+            f"{folder / WIRES} cannot be read as JSON in UTF-8: {error}; write it "
+            "again, as `bench_data.read` describes"
+        ) from error
+    try:
         marks, rows = found["landmarks"], found["wires"]
         entry = marks["entry"]
         where, out = _vector(entry, "point_mm") / 1e3, _unit(entry, "outward_normal")
@@ -155,6 +161,8 @@ def read(folder: str | Path) -> Bench:
         raise ValueError(
             f"{folder / WIRES} is not as `bench_data.read` describes: {error!r}"
         ) from error
+    except ValueError as error:
+        raise ValueError(f"{folder / WIRES}: {error}") from error
     end = End("entry", where, out, 2.0 * radius, True)
     return Bench(surface, end, ends, branches, down, wires)
 

@@ -43,7 +43,7 @@ def build_arch(
         ValueError: if the parameters give no valid arch.
     """
     bounds.choice("access", access, ACCESSES)
-    tree = arch_tree(params)
+    tree = arch_tree(bounds.instance("params", params, ArchParameters))
     inlet = VesselPlace(tree.root.name, 0.0 if access == "ascending" else math.inf)
     goals = {
         branch: VesselPlace(branch, GOAL_DEPTH, past_ostium=True)

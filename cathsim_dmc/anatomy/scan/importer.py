@@ -143,6 +143,9 @@ def _checked(
     if not all(VESSEL_NAME.fullmatch(str(wanted)) for wanted in changes.values()):
         bounds.refuse("rename", rename, "names of small letters, digits and '_'")
     if device is not None:
+        if not (hasattr(device, "name") and hasattr(device, "outer_radius")):
+            wanted = "a device, such as one of entities.devices.DEVICES, or None"
+            bounds.refuse("device", device, wanted)
         bounds.number("device radius", device.outer_radius, positive=True)
     return given, changes
 

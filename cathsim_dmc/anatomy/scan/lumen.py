@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan import labels as label_maps
 from cathsim_dmc.anatomy.scan import mesh
@@ -80,6 +81,7 @@ def read_lumen(
     """
     # Checks the options before the file is read.
     to_lps("mm" if units is None else units, "LPS" if frame is None else frame, axes)
+    labels = bounds.array("labels", labels, "iu", shape=(-1,)).tolist()
     given, labelled = units, str(path).lower().endswith(mesh.LABEL_MAPS)
     if labelled:
         vertices, faces, notes, units = label_maps.label_surface(path, labels, units)
