@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cathsim_dmc.entities.coaxial import carried_mass
+from cathsim_dmc.entities.coaxial import moved_mass
 from cathsim_dmc.entities.device import Device
 
 # Largest rotor inertia of a hinge, kg·m²: the stiffness of the rigid wall is 1.2 to
@@ -33,7 +33,7 @@ def hinge_armatures(device: Device, lengths: np.ndarray) -> np.ndarray:
     # Rayleigh's quotient of the free end, with its deflection under its own weight.
     free = hinges > ends[-1] - FREE_END
     arms = np.maximum(middles - hinges[free, None], 0.0)
-    masses = (device.linear_density + carried_mass([device])) * lengths
+    masses = moved_mass([device]) * lengths
     bent = arms.T @ (compliances[free] * (arms @ masses))
     square = (masses @ bent) / (masses @ bent**2)
     return np.minimum(LARGEST, _SLOWED / (square * compliances))

@@ -6,10 +6,9 @@ import numpy as np
 
 from cathsim_dmc import bounds
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.armature import hinge_armatures
 from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
-from cathsim_dmc.entities.coaxial import carried_mass, weight_density
+from cathsim_dmc.entities.coaxial import effective_density, moved_mass
 from cathsim_dmc.entities.contact import device_contact
 
 
@@ -44,9 +43,7 @@ class Catheter(Chain):
         # A joint bends like two half links.
         half = _half_compliances(device, lengths, "bending_stiffness")
         compliances = half[:-1] + half[1:]
-        # Mass per length that moves with the device across its axis, kg/m.
-        moved = device.linear_density + carried_mass(self.devices)
-        self.density = BLOOD_DENSITY / (1 - weight_density(device) / moved)
+        self.density = effective_density(self.devices)
         # These torques bend free joints by the steering angle.
         torques = device.steering_angle / compliances
         steered = range(first, len(lengths) if device.steerable else first)
@@ -54,7 +51,7 @@ class Catheter(Chain):
             Links(
                 lengths,
                 device.outer_radius,
-                masses=(moved * lengths).tolist(),
+                masses=(moved_mass(self.devices) * lengths).tolist(),
                 compliances=compliances.tolist(),
                 armatures=hinge_armatures(device, lengths).tolist(),
                 rest_angles=_rest_angles(device, lengths),

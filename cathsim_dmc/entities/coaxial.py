@@ -98,6 +98,17 @@ def carried_mass(devices: Sequence[Device]) -> float:
     return _disc(devices[-1].outer_radius) + sum(lumens) - sum(filled)
 
 
+def moved_mass(devices: Sequence[Device]) -> float:
+    """Mass per length that coaxial devices move across their axis, kg/m."""
+    return sum(device.linear_density for device in devices) + carried_mass(devices)
+
+
+def effective_density(devices: Sequence[Device]) -> float:
+    """Density, kg/m³, that gives a chain the buoyancy of all its devices."""
+    weight = sum(weight_density(device) for device in devices)
+    return BLOOD_DENSITY / (1 - weight / moved_mass(devices))
+
+
 def weight_density(device: Device) -> float:
     """Mass per length less that of the displaced blood, kg/m; blood fills the lumen."""
     section = np.pi * (device.outer_radius**2 - device.inner_radius**2)

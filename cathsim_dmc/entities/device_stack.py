@@ -6,10 +6,9 @@ import numpy as np
 
 from cathsim_dmc import bounds
 from cathsim_dmc.entities import devices as library
-from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.armature import hinge_armatures
 from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
-from cathsim_dmc.entities.coaxial import Stack, carried_mass, weight_density
+from cathsim_dmc.entities.coaxial import Stack, effective_density
 from cathsim_dmc.entities.contact import FRICTION, MOST_FRICTION, device_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.torsion import rods_of
@@ -81,7 +80,7 @@ class DeviceStack(Chain):
         # Any device may lead, so each hinge has the least armature of all devices.
         alone = [hinge_armatures(one, self.stack.link_lengths) for one in self.devices]
         tip = self.stack.nodes <= self.devices[0].tip_length + 1e-9
-        self.density = _density(self.devices)
+        self.density = effective_density(self.devices)
         self._assemble(
             Links(
                 self.stack.link_lengths,
@@ -122,14 +121,6 @@ def _passive(given: Sequence[str | Device]) -> tuple[Device, ...]:
                 "single steerable device"
             )
     return devices
-
-
-def _density(devices: Sequence[Device]) -> float:
-    """Density, kg/m³, that gives the chain the buoyancy of all devices."""
-    weight = sum(weight_density(device) for device in devices)
-    mass = sum(device.linear_density for device in devices)
-    mass += carried_mass(devices)
-    return BLOOD_DENSITY / (1 - weight / mass)
 
 
 def _names(devices: Sequence[Device]) -> tuple[str, ...]:

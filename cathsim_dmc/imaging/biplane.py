@@ -250,18 +250,14 @@ class Biplane:
             margin = 0.4 * HULL_SPACING
             cost = (_WIDE / np.clip(depth, margin, _WIDE)) ** 2
             cost = np.where(depth > _OUTSIDE, cost, _DEAR * cost)
-            cost = np.where(depth > self._limit, cost, -1.0)
+            least = _THROUGH if self._errors.any else _OUTSIDE
+            cost = np.where(depth > least, cost, -1.0)
             end = nearest_cell(np.argwhere(cost > 0.0), (goal - low) / HULL_SPACING)
             self._graph, way = search(cost, end)
             self._goal = goal, np.argwhere(np.isfinite(way))
         begin = nearest_cell(self._goal[1], (start - low) / HULL_SPACING)
         path = np.array(self._graph.traceback(begin))[::-1]
         return low + path * HULL_SPACING
-
-    @property
-    def _limit(self) -> float:
-        """Least depth of the places of a path, m."""
-        return _THROUGH if self._errors.any else _OUTSIDE
 
 
 def _smoothed(line: np.ndarray, width: float) -> np.ndarray:

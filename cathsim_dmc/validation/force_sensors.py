@@ -149,11 +149,11 @@ def _checks(pushed: dict[str, list[DeadEnd]]) -> Iterator[Check]:
         yield Check.at_least(name, usual, USUAL_SHARE, "%", note)
 
 
-def expert_cannulation(seed: int = 0) -> Episode:
+def expert_cannulation() -> Episode:
     """Episode of the scripted expert on type1_bca."""
-    environment = suite.load(suite.DOMAIN, "type1_bca", {"random": seed})
-    act = policies.in_environment(policies.make_policy("expert", seed), environment)
-    episode = EpisodeRecorder(environment, "type1_bca").record_episode(act, seed)
+    environment = suite.load(suite.DOMAIN, "type1_bca", {"random": 0})
+    act = policies.in_environment(policies.make_policy("expert", 0), environment)
+    episode = EpisodeRecorder(environment, "type1_bca").record_episode(act, 0)
     environment.close()
     return episode
 

@@ -18,12 +18,11 @@ _LEAST = 0.9  # of the largest distance from the axis, where the helix begins
 _MARGIN = 0.15  # of the helix, left out at both ends
 
 
-def helix(link: float, force: float = FORCE) -> tuple[float, float, float]:
+def helix(link: float) -> tuple[float, float, float]:
     """Pushes a uniform device against the end of a frictionless tube.
 
     Args:
         link: Length of the links, m.
-        force: Push force at which the base stops, N.
 
     Returns:
         Push force of the simulation and of `borne`, N; angle of the helix, rad.
@@ -36,10 +35,10 @@ def helix(link: float, force: float = FORCE) -> tuple[float, float, float]:
     task, action = environment.task, np.array([0.5])
     for _ in range(_MOST):
         environment.step(action)
-        if task.readings.push_force >= force:
+        if task.readings.push_force >= FORCE:
             break
     else:
-        raise RuntimeError(f"the push force stays below {force} N")
+        raise RuntimeError(f"the push force stays below {FORCE} N")
     for _ in range(_REST):
         environment.step(0.0 * action)
     push, line = float(task.readings.push_force), task.readings.centreline

@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 from scipy.linalg import eigh
 
-from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.coaxial import carried_mass
+from cathsim_dmc.entities.coaxial import moved_mass
 from cathsim_dmc.entities.devices import DEVICES, Discretisation
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import Rig
@@ -63,8 +62,7 @@ def frequencies(device: str) -> tuple[float, float]:
     rig = Rig(device, Discretisation(working_length=FREE), straight=True)
     rig.compile()
     lengths, bending, _ = rig.sections
-    one = devices.get(device)
-    mass = one.linear_density + carried_mass([one])
+    mass = moved_mass(rig.catheter.devices)
     return chain_frequency(rig), beam_frequency(lengths, bending, mass)
 
 

@@ -34,6 +34,7 @@ BARS = {"push": (150.0, 280.0), "random": (420.0, 850.0), "curl": (220.0, 280.0)
 MOST_OVERHEAD = 1.25  # time of a suite step divided by that of its mj_step calls
 NEVER = 1e-6  # m, goal radius that no policy reaches
 _WARM_STEPS = 1000  # of the humanoid, 5 s, after which it lies on the floor
+_TIMED_STEPS = 2000  # of the humanoid
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -131,11 +132,11 @@ def pace(
     return Pace(np.array(insertion), np.array(seconds), np.array(contacts))
 
 
-def suite_overhead(policy: str, steps: int = STEPS) -> list[float]:
+def suite_overhead(policy: str) -> list[float]:
     """Overheads (RATIOS,): CPU time of suite steps divided by that of `mj_step`."""
     environment = load()
     pairs = [
-        against_bare_steps(environment, policy, steps, run) for run in range(RATIOS + 1)
+        against_bare_steps(environment, policy, STEPS, run) for run in range(RATIOS + 1)
     ]
     return [ours / bare for ours, bare in pairs[1:]]
 
@@ -208,22 +209,19 @@ def bare_steps(
     return seconds, after
 
 
-def humanoid_step(steps: int = 2000) -> float:
+def humanoid_step() -> float:
     """CPU time of one `mj_step` of dm_control's humanoid, µs, a measure of the machine.
 
     The humanoid of `stand` falls without controls from its standing pose; the first
     steps warm it up and are not timed.
-
-    Args:
-        steps: Number of timed physics steps.
     """
     model, start = _humanoid()
     data = mujoco.MjData(model)
     mujoco.mj_copyData(data, model, start)
     mujoco.mj_step(model, data, nstep=_WARM_STEPS)
     begin = time.process_time()
-    mujoco.mj_step(model, data, nstep=steps)
-    return 1e6 * (time.process_time() - begin) / steps
+    mujoco.mj_step(model, data, nstep=_TIMED_STEPS)
+    return 1e6 * (time.process_time() - begin) / _TIMED_STEPS
 
 
 @functools.cache

@@ -43,13 +43,13 @@ def field_error(anatomy: Anatomy, places: Places | None = None) -> np.ndarray:
     return np.abs(found - exact)[found < FREE]
 
 
-def without_wall(anatomy: Anatomy, places: Places | None = None) -> int:
+def without_wall(anatomy: Anatomy, places: Places) -> int:
     """Number of points near the wall, away from the inlet, with a wrong wall.
 
     There the clearance of the simulation, with a cap that has a hole for the sheath,
     differs from the depth of the lumen or is steeper than a distance.
     """
-    points, exact = _near_wall(anatomy) if places is None else places
+    points, exact = places
     looked_at = exact > _DEEPEST
     for end in anatomy.ends:
         if end.open:

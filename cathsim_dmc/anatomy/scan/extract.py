@@ -215,17 +215,14 @@ def trunk(
             _width(s - s[at], depth, radius),
             _width(past - past[at], ways.depths(other), radius),
         ]
-        least = max(TRUNK_LENGTH * radius, INLET_CUT * radius + _ahead_of_inlet(radius))
+        # The cut at the inlet, and the least distance of an ostium ahead of it.
+        ahead = min(OSTIUM_AHEAD * enlargement(), AHEAD_RADII * radius)
+        least = max(TRUNK_LENGTH * radius, INLET_CUT * radius + ahead)
         if s[at] > least and min(wide) > EVEN * max(wide):
             forks.append(at)
     if not forks:
         return main[-1], others
     return main[min(forks)], list(curves)
-
-
-def _ahead_of_inlet(radius: float) -> float:
-    """Least distance (m) of an ostium from the inlet of a trunk with a radius (m)."""
-    return min(OSTIUM_AHEAD * enlargement(), AHEAD_RADII * radius)
 
 
 def _width(past: np.ndarray, depth: np.ndarray, radius: float) -> float:

@@ -31,7 +31,7 @@ def passable_length(vessel: Vessel, device: float = DEVICE_RADIUS) -> float:
 
 
 def place_inlet(
-    tree: VesselTree, at_end: bool, share: float = 1.0
+    tree: VesselTree, at_end: bool, share: float
 ) -> tuple[VesselTree, Inlet]:
     """Start the root where the lumen has its width, or at a share of that length."""
     name, line = tree.root.name, tree.root.centreline
