@@ -115,7 +115,7 @@ def scratch() -> Array:
 
 def course_of(parameters: Array, time: float) -> Course:
     """Motion at a time, s, from parameters (PARAMETERS,)."""
-    return course_at(MotionParameters(*parameters[1:9].tolist()), time)
+    return course_at(MotionParameters._make(parameters[1:9].tolist()), time)
 
 
 def distensibility(radius: Array) -> Array:

@@ -144,7 +144,8 @@ class Experiment:
 def _result(wire: Wire, shapes: Sequence[np.ndarray]) -> Result:
     found = [1e3 * bench_data.distances(wire.points, shape) for shape in shapes]
     rows = [(np.sqrt((each**2).mean()), each.max()) for each in found]
-    return Result(*np.array(rows or [(np.nan, np.nan)]).T)
+    rms, largest = np.array(rows or [(np.nan, np.nan)]).T
+    return Result(rms, largest)
 
 
 def halves(wires: Iterable[Wire]) -> dict[str, str]:

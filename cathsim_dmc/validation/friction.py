@@ -265,15 +265,15 @@ def checks(pulled: list[Capstan]) -> Iterator[Check]:
     for what, device in (("steerable_5f", "steerable_5f"), ("pair", PAIR)):
         for load in LOADS:
             found = [slid(device, load, speed) for speed in SPEEDS]
-            acting, ripples = zip(*found, strict=True)
-            worst = acting[np.argmax(np.abs(np.subtract(acting, FRICTION)))]
+            acting, ripples = np.transpose(found)
+            worst = acting[np.abs(acting - FRICTION).argmax()]
             name = f"{what} sliding under {load:g} N"
             each = zip(acting, SPEEDS, strict=True)
             note = ", ".join(f"{one:.4f} at {1e3 * v:g} mm/s" for one, v in each)
             acts = f"{name}: friction that acts"
             yield Check.deviation(acts, worst, FRICTION, ACTING_BOUND, "", note)
             name += ": ripple of the pull"
-            yield Check.at_most(name, 100 * float(np.max(ripples)), RIPPLE_BOUND, "%")
+            yield Check.at_most(name, 100 * ripples.max(), RIPPLE_BOUND, "%")
         name = f"{what} under {CREEP_LOAD:g} N, pulled sideways at half the limit: "
         yield Check.at_most(f"{name}creep", 1e3 * creep(device), CREEP_BOUND, "mm/s")
     name = f"device drawn round an arch under {TENSION:g} N: ripple of the force"

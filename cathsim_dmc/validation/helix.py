@@ -69,7 +69,8 @@ def one_hand(line: np.ndarray) -> np.ndarray:
     """
     distance = np.linalg.norm(line[:, :2], axis=1)
     first = int(np.argmax(distance > _LEAST * distance.max()))
-    turn = np.unwrap(np.arctan2(*line[first:, 1::-1].T))
+    x, y = line[first:, :2].T
+    turn = np.unwrap(np.arctan2(y, x))
     back = np.diff(turn) * (turn[1] - turn[0]) <= 0
     count = int(np.argmax(back)) if back.any() else len(back)
     low, high = (first + round(count * share) for share in (_MARGIN, 1 - _MARGIN))

@@ -86,11 +86,11 @@ def jam(pair: tuple[str, str]) -> tuple[float, float, float, float]:
 
 def checks(pair: tuple[str, str]) -> Iterator[Check]:
     """Checks of a pressed mass and of a jammed pair, guidewire and catheter by name."""
-    depths, ripples = zip(*map(pressed, LOADS), strict=True)
+    depths, ripples = np.transpose([pressed(load) for load in LOADS])
     name = f"device pressed on a wall by {LOADS[0]:g} to {LOADS[-1]:g} N: "
     name += "ripple of the depth"
     note = f"depth {1e3 * depths[0]:.2f} to {1e3 * depths[-1]:.2f} mm"
-    yield Check.at_most(name, 1e3 * float(np.max(ripples)), RIPPLE, "mm", note)
+    yield Check.at_most(name, 1e3 * ripples.max(), RIPPLE, "mm", note)
     push, deep, least, largest = jam(pair)
     name = "pair jammed in a dead end: 99th percentile of the penetration"
     note = f"pushed with {push:.1f} N, largest contact {least:.2f} to {largest:.2f} N"

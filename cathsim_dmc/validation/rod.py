@@ -294,14 +294,10 @@ def _checks(data: dict[str, Any]) -> Iterator[Check]:
         note = f"{angle:.4f} rad under {1e6 * torque:.3g} µN·m"
         yield Check.deviation(name, angle, TWIST, TWIST_BOUND, "rad", note)
     data["lag"] = lag = twist_lag()
-    name = "lag of the tip behind the turning base"
-    yield Check.deviation(name, *lag.lags, TWIST_BOUND, "rad")
-    yield Check.deviation(
-        "rise time of the lag of the tip behind the turning base",
-        *lag.rises,
-        TWIST_BOUND,
-        "s",
-    )
+    name, (found, expected) = "lag of the tip behind the turning base", lag.lags
+    yield Check.deviation(name, found, expected, TWIST_BOUND, "rad")
+    name, (found, expected) = f"rise time of the {name}", lag.rises
+    yield Check.deviation(name, found, expected, TWIST_BOUND, "s")
     driven = Driven()
     driven.move(0.4, 0.0, 0.0)
     held = 1e3 * abs(driven.move(10.0, 0.0, JAM))

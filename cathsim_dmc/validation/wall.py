@@ -1,6 +1,7 @@
 """`cathsim validate wall`: field against lumen, acting friction, convergence."""
 
 import itertools
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -80,8 +81,40 @@ def _near_wall(anatomy: Anatomy) -> Places:
 
 def lumen_checks(anatomy: Anatomy) -> list[Check]:
     """Checks of surface, field, passage and goals of an anatomy."""
+    surface, field = _surface_checks(anatomy), _field_checks(anatomy)
+    return [*surface, *field, *_passage_checks(anatomy)]
+
+
+def _surface_checks(anatomy: Anatomy) -> Iterator[Check]:
+    faces = anatomy.surface.faces.astype(np.int64)
+    if not anatomy.scan:  # scans have rings of vessels, which are handles
+        name = f"{anatomy.name}: handles of the surface"
+        note = "tubes that touch beyond the place where they part"
+        yield Check.at_most(name, topology.handles(faces), 0, "", note)
+    loose = int((topology.edge_counts(faces)[1] != 2).sum())
+    name = f"{anatomy.name}: edges of the surface without two triangles"
+    note = f"{len(faces)} triangles, {1e6 * anatomy.surface.volume:.0f} ml"
+    yield Check.at_most(name, loose, 0, "", note)
+    parts = int(topology.parts(faces).max()) + 1
+    yield Check.at_most(f"{anatomy.name}: separate parts of the surface", parts, 1)
+
+
+def _field_checks(anatomy: Anatomy) -> Iterator[Check]:
     places = _near_wall(anatomy)
-    error, other = 1e3 * field_error(anatomy, places), without_wall(anatomy, places)
+    error = 1e3 * field_error(anatomy, places)
+    worst = float(np.percentile(error, 99))
+    bound = ERROR_SURFACE if anatomy.scan else ERROR_TREE
+    name = f"{anatomy.name}: error of the field, 99th percentile"
+    note = f"mean {error.mean():.4f} mm, at most {error.max():.3f} mm, at "
+    note += f"{len(error)} places within {1e3 * _NEAR_WALL:g} mm of the wall"
+    yield Check.at_most(name, worst, bound, "mm", note)
+    name = f"{anatomy.name}: places at the wall where a device meets another"
+    yield Check.at_most(name, without_wall(anatomy, places), 0)
+    name, size = f"{anatomy.name}: memory of the field", anatomy.lumen.nbytes / 1e6
+    yield Check.at_most(name, size, LARGEST_FIELD, "MB")
+
+
+def _passage_checks(anatomy: Anatomy) -> Iterator[Check]:
     radius = devices.get("steerable_5f").outer_radius
     # Number of points, 0.5 mm apart, on the route to each goal that are too narrow.
     narrow, astray = {}, []
@@ -93,34 +126,16 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
         own = float(anatomy.tree.depths(goal.position)[goal.vessel])
         if not min(float(anatomy.lumen(goal.position)), own) > radius:
             astray.append(goal.name)
-    faces = anatomy.surface.faces.astype(np.int64)
-    loose = int((topology.edge_counts(faces)[1] != 2).sum())
-    made = f"{len(faces)} triangles, {1e6 * anatomy.surface.volume:.0f} ml"
-    parts = int(topology.parts(faces).max()) + 1
-    bound = ERROR_SURFACE if anatomy.scan else ERROR_TREE
-    exact = f"mean {error.mean():.4f} mm, at most {error.max():.3f} mm, at "
-    exact += f"{len(error)} places within {1e3 * _NEAR_WALL:g} mm of the wall"
-    worst = float(np.percentile(error, 99))
-    blocked = ", ".join(one for one, count in narrow.items() if count)
-    passed = f"radius {1e3 * radius:.2f} mm" + (blocked and f", blocked: {blocked}")
-    lost = ", ".join(astray)
-    goals = f"of {', '.join(anatomy.goals) or 'none'}" + (lost and f", astray: {lost}")
-    touch = "tubes that touch beyond the place where they part"
-    unpassed = "places of the centrelines that the device does not pass"
-    unreached = "goals that the device cannot reach in their vessel"
-    rows = [
-        ("handles of the surface", topology.handles(faces), 0, "", touch),
-        ("edges of the surface without two triangles", loose, 0, "", made),
-        ("separate parts of the surface", parts, 1),
-        ("error of the field, 99th percentile", worst, bound, "mm", exact),
-        ("places at the wall where a device meets another", other, 0),
-        ("memory of the field", anatomy.lumen.nbytes / 1e6, LARGEST_FIELD, "MB"),
-        (unpassed, sum(narrow.values()), 0, "", passed),
-        (unreached, len(astray), 0, "", goals),
-    ]
-    # Scans have rings of vessels, which are handles.
-    rows = rows[bool(anatomy.scan) :]
-    return [Check.at_most(f"{anatomy.name}: {what}", *row) for what, *row in rows]
+    name = f"{anatomy.name}: places of the centrelines that the device does not pass"
+    note = f"radius {1e3 * radius:.2f} mm"
+    if blocked := ", ".join(one for one, count in narrow.items() if count):
+        note += f", blocked: {blocked}"
+    yield Check.at_most(name, sum(narrow.values()), 0, "", note)
+    name = f"{anatomy.name}: goals that the device cannot reach in their vessel"
+    note = f"of {', '.join(anatomy.goals) or 'none'}"
+    if astray:
+        note += f", astray: {', '.join(astray)}"
+    yield Check.at_most(name, len(astray), 0, "", note)
 
 
 def validate_anatomy(anatomy: Anatomy) -> Report:
