@@ -1,6 +1,7 @@
 """Random aortic arches from anatomical distributions."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -168,19 +169,7 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
             lean=math.radians(source.uniform(35.0, 60.0)),
         )
     radii = {name: branch.radius for name, branch in branches.items()}
-    spacings: dict[str, Any] = {
-        "bca_lcca_spacing": max(SPACINGS[0], radii["bca"] + radii["lcca"] + _WALL),
-        "lcca_lsa_spacing": max(SPACINGS[1], radii["lcca"] + radii["lsa"] + _WALL),
-    }
-    if variant.startswith("bovine"):
-        # The LSA keeps its place. The LCCA leaves just above the ostium of a common
-        # trunk, or 10 to 18 mm up the BCA (both lengths are assumptions).
-        least = radii["lcca"] + 2.2e-3
-        along = least + source.uniform(0.0, 2e-3)
-        if variant == "bovine_branch":
-            along = max(source.uniform(10e-3, 18e-3), least)
-        both = sum(spacings.values())
-        spacings = {"bca_lcca_spacing": along, "lcca_lsa_spacing": both}
+    first, second = _spacings(source, radii, variant)
     arch_radius = normal(source, _ARCH_RADIUS)
     last = aberrant.radius if aberrant else 0.0
     return ArchParameters(
@@ -192,6 +181,8 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
         arch_height=arch_radius * uniform(source, _ARCH_ASPECT),
         plane_rotation=math.radians(normal(source, PLANE_ROTATION)),
         bca_drop=drop,
+        bca_lcca_spacing=first,
+        lcca_lsa_spacing=second,
         bovine=variant.startswith("bovine"),
         ascending_bend=max(0.0, math.radians(normal(source, ASCENDING_BEND))),
         descending_bend=math.radians(normal(source, _DESCENDING_BEND)),
@@ -200,8 +191,24 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
         sway=normal(source, _SWAY),
         aberrant=aberrant,
         lsa_aberrant_spacing=radii["lsa"] + last + source.uniform(2e-3, 6e-3),
-        **spacings,
     )
+
+
+def _spacings(
+    source: Random, radii: Mapping[str, float], variant: str
+) -> tuple[float, float]:
+    """Spacings of the ostia BCA-LCCA and LCCA-LSA, m, of branches with radii, m."""
+    first = max(SPACINGS[0], radii["bca"] + radii["lcca"] + _WALL)
+    second = max(SPACINGS[1], radii["lcca"] + radii["lsa"] + _WALL)
+    if not variant.startswith("bovine"):
+        return first, second
+    # The LSA keeps its place. The LCCA leaves just above the ostium of a common trunk,
+    # or 10 to 18 mm up the BCA (both lengths are assumptions).
+    least = radii["lcca"] + 2.2e-3
+    along = least + source.uniform(0.0, 2e-3)
+    if variant == "bovine_branch":
+        along = max(source.uniform(10e-3, 18e-3), least)
+    return along, first + second
 
 
 def _branch(source: Random, name: str) -> BranchParameters:

@@ -312,10 +312,8 @@ def _nrrd(path: Path) -> _Voxels:
     return _Voxels(voxels, to @ rows.T, to @ origin, names, unit, frame)
 
 
-def _meta(path: Path) -> _Voxels:
-    from vtkmodules import vtkCommonCore, vtkIOImage
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
+def _meta_header(path: Path) -> dict[str, list[str]]:
+    """Entries of a MetaImage's header; ValueError if VTK would not read it whole."""
     entries: dict[str, list[str]] = {}
     with path.open("rb") as stream:
         while "ElementDataFile" not in entries and stream.tell() < _HEADER:
@@ -344,6 +342,14 @@ def _meta(path: Path) -> _Voxels:
             _require_whole(path, start, 8 * count)
         else:
             raise ValueError("its header does not say CompressedDataSize")
+    return entries
+
+
+def _meta(path: Path) -> _Voxels:
+    from vtkmodules import vtkCommonCore, vtkIOImage
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    entries = _meta_header(path)
 
     def numbers(names: str, default: np.ndarray) -> np.ndarray:
         given = [entries[name] for name in names.split() if name in entries]

@@ -1,6 +1,6 @@
 """Lumen surface of an import: read, scaled, turned and mended."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -201,14 +201,12 @@ def guess_units(
         for unit, x in scaled.items()
         if _within(x, NO_WIDTH)
     }
-    total = max(sum(odds.values()), 1e-30)
-    likely = [unit for unit in odds if odds[unit] > UNLIKELY * total]
     makes = {
         unit: f"the widest lumen {2e3 * radius:.3g} mm wide and the scan "
         f"{1e3 * size:.4g} mm across"
         for unit, (radius, size) in scaled.items()
     }
-    best = max(odds, key=lambda unit: odds[unit], default="")
+    likely = _likely(odds)
     fits = [unit for unit in usual if unit in likely] or usual or likely
     better = (
         f"pass units={' or '.join(map(repr, fits))} (--units)"
@@ -228,6 +226,17 @@ def guess_units(
         if not NO_WIDTH[0] <= scaled[units][0] <= NO_WIDTH[1]:
             raise ValueError(f"{name}: {why}.")
         return units, why, float(scaled[units][0])
+    best, said = _likeliest(name, odds, makes)
+    return best, said, float(scaled[best][0])
+
+
+def _likeliest(
+    name: str, odds: Mapping[str, float], makes: Mapping[str, str]
+) -> tuple[str, str]:
+    """The likeliest unit, and a line that says so; ValueError if none is sure.
+
+    `odds` are relative, `makes` says what each unit makes of the scan.
+    """
     if not odds:
         listed = "; ".join(f"{unit} makes {text}" for unit, text in makes.items())
         raise ValueError(
@@ -235,6 +244,9 @@ def guess_units(
             f"lumen must be {2e3 * NO_WIDTH[0]:g} to {2e3 * NO_WIDTH[1]:g} mm wide and "
             f"the scan {1e3 * SIZE[0]:g} mm to {SIZE[1]:g} m across: scale it."
         )
+    total = max(sum(odds.values()), 1e-30)
+    likely = _likely(odds)
+    best = max(odds, key=odds.__getitem__)
     sure = odds[best] / total
     listed = "; ".join(f"{unit} makes {makes[unit]}" for unit in likely)
     ask = " or ".join(map(repr, likely))
@@ -252,7 +264,13 @@ def guess_units(
     doubt = (
         f" ({sure:.0%} sure; else pass units={others}, --units)" if sure < 0.995 else ""
     )
-    return best, said + doubt, float(scaled[best][0])
+    return best, said + doubt
+
+
+def _likely(odds: Mapping[str, float]) -> list[str]:
+    """Units that are not unlikely, of those with relative odds."""
+    total = max(sum(odds.values()), 1e-30)
+    return [unit for unit in odds if odds[unit] > UNLIKELY * total]
 
 
 def _within(seen: np.ndarray, width: tuple[float, float]) -> bool:

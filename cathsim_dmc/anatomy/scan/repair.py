@@ -175,9 +175,8 @@ class _Work:
             total = 0.5 * np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0)
             area = float(np.linalg.norm(total))
             axis = total / max(area, 1e-30)
-            hole = min(HOLE * enlargement(), WIDE_HOLE)
             cut = bool(self._cut & set(map(tuple, points)))
-            widest = CUT if cut else hole
+            widest = CUT if cut else min(HOLE * enlargement(), WIDE_HOLE)
             end = len(loop) > 3 and area > END_AREA
             if end and self._is_end(loop, axis, wide > widest and not cut):
                 self._ends += 1
@@ -194,12 +193,7 @@ class _Work:
                 )
             else:
                 filled.append((wide, shown(middle)))
-            fan = loop[None, ::-1]
-            if len(loop) > 3:
-                centre = np.full(len(loop), len(self.vertices))
-                self.vertices = np.concatenate([self.vertices, middle[None]])
-                fan = np.stack([np.roll(loop, -1), loop, centre], axis=1)
-            self.faces = np.concatenate([self.faces, fan])
+            self._fan(loop, middle)
         if filled:
             wide, where = max(filled)
             self.notes.append(
@@ -210,6 +204,18 @@ class _Work:
             if self._ragged:
                 note += f", ragged rims cut back by up to {mm(self._ragged):.1f} mm"
             self.notes.append(note)
+        self._require_closed()
+
+    def _fan(self, loop: np.ndarray, middle: np.ndarray) -> None:
+        """Closes a border (n,) by triangles around its middle (3,), m."""
+        fan = loop[None, ::-1]
+        if len(loop) > 3:
+            centre = np.full(len(loop), len(self.vertices))
+            self.vertices = np.concatenate([self.vertices, middle[None]])
+            fan = np.stack([np.roll(loop, -1), loop, centre], axis=1)
+        self.faces = np.concatenate([self.faces, fan])
+
+    def _require_closed(self) -> None:
         edges, times = topology.edge_counts(self.faces)
         if (times != 2).any():
             where = shown(self.vertices[edges[times != 2][0, 0]])
