@@ -152,14 +152,11 @@ def compared(
     """
     rows = []
     for anatomy in anatomies:
-        usual, fine = (
-            watch(
-                pushed(options, anatomy, depths, physics_timestep=step),
-                SETTLING,
-                WATCHED,
-            )
+        pushes = (
+            pushed(options, anatomy, depths, physics_timestep=step)
             for step in (PHYSICS_TIMESTEP, PHYSICS_TIMESTEP / FINER)
         )
+        usual, fine = (watch(each, SETTLING, WATCHED) for each in pushes)
         force, exact = usual.force.mean(axis=0), fine.force.mean(axis=0)
         away = 100 * np.abs(force - exact) / np.maximum(exact, LEAST_FORCE)
         moved = 1e3 * np.linalg.norm(

@@ -165,10 +165,8 @@ class ArchSeed:
 
     def parameters(self) -> ArchParameters:
         """Parameters of the arch; the same at every call."""
-        random_state = np.random.RandomState(self.seed)
-        return sample(
-            random_state, self.arch_type, variant=self.variant, neck=self.neck
-        )
+        source = np.random.RandomState(self.seed)
+        return sample(source, self.arch_type, variant=self.variant, neck=self.neck)
 
 
 _FIRST_SEEDS = {
