@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+import trimesh
 from test_imaging_device import RADIUS
 
-from cathsim_dmc.anatomy import phantoms
-from cathsim_dmc.imaging import biplane
+from cathsim_dmc.anatomy import Surface, phantoms
+from cathsim_dmc.imaging import biplane, views
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.biplane import TRACE_SPACING, Biplane
+from cathsim_dmc.imaging.carm import CArm
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.options import FluoroscopyOptions, RoadmapErrors
 
@@ -144,6 +146,17 @@ def test_roadmaps_have_the_errors_that_are_asked_for(planes, machine):
             assert 0.0 < np.abs(np.rad2deg(angles)).max() <= 2.0
     with pytest.raises(ValueError, match="roadmap_errors: calibration is -1"):
         FluoroscopyOptions(roadmap_errors={"calibration": -1.0})
+
+
+def test_places_on_both_sides_of_an_outline_are_as_far_from_it():
+    box = trimesh.creation.box((0.06, 0.06, 0.06))
+    arm = CArm()
+    # One place in each column of pixels, across the right side of the shadow.
+    x = np.arange(0.02, 0.04, arm.pitch * arm.source_isocentre / arm.source_detector)
+    places = np.stack([x, 0 * x, 0 * x], axis=1)
+    found = views._depths(Surface(box.vertices, box.faces), arm, places)
+    inside, outside = found[found > 0.0], found[found < 0.0]
+    assert inside.min() == pytest.approx(-outside.max(), rel=1e-6)
 
 
 def test_the_anatomy_chooses_the_views(anatomy):

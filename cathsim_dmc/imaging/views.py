@@ -75,7 +75,7 @@ def settled(surface: Surface, options: FluoroscopyOptions) -> FluoroscopyOptions
 def _depths(surface: Surface, arm: CArm, places: np.ndarray) -> np.ndarray:
     """Signed distances (n,) of places (n, 3) from an outline, + inside, m."""
     inside = surface_thickness(arm, surface, 1) > 0.0
-    wall = np.where(inside, distances(inside), 0.5 - distances(~inside))
+    wall = np.where(inside, distances(inside) - 0.5, 0.5 - distances(~inside))
     pixels, depth = arm.project(places)
     column, row = np.nan_to_num(pixels, nan=-1.0).round().astype(int).T
     rows, columns = arm.resolution

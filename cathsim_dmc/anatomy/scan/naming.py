@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from itertools import combinations
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -204,22 +204,22 @@ def _labellings(
             yield pattern, ("other",) * count, _unlisted(seen, frequency, scale)
             continue
         for kept in range(min(count, len(pattern)) + 1):
-            for whole in combinations(range(len(pattern)), kept):
-                for at in combinations(range(count), kept):
-                    labels = ["extra"] * count
-                    for place, which in zip(at, whole, strict=True):
-                        labels[place] = pattern[which]
-                    weight = np.log(frequency)
-                    weight += np.log(CUT) * (len(pattern) - kept)
-                    weight += sum(
-                        _fit(one, label, scale, side, head)
-                        for one, label, side in zip(seen, labels, right, strict=True)
-                    )
-                    weight += _spacings(seen, pattern, whole, at, scale)
-                    weight += np.log(BETWEEN) * _between(seen, labels)
-                    if "lva" in labels and "lsa" not in labels:
-                        weight += np.log(ALONE)
-                    yield pattern, tuple(labels), float(weight)
+            wholes = combinations(range(len(pattern)), kept)
+            for whole, at in product(wholes, combinations(range(count), kept)):
+                labels = ["extra"] * count
+                for place, which in zip(at, whole, strict=True):
+                    labels[place] = pattern[which]
+                weight = np.log(frequency)
+                weight += np.log(CUT) * (len(pattern) - kept)
+                weight += sum(
+                    _fit(one, label, scale, side, head)
+                    for one, label, side in zip(seen, labels, right, strict=True)
+                )
+                weight += _spacings(seen, pattern, whole, at, scale)
+                weight += np.log(BETWEEN) * _between(seen, labels)
+                if "lva" in labels and "lsa" not in labels:
+                    weight += np.log(ALONE)
+                yield pattern, tuple(labels), float(weight)
 
 
 def _unlisted(seen: Sequence[Offshoot], frequency: float, scale: float) -> float:
