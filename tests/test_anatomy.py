@@ -47,6 +47,7 @@ def forged(saved, tmp_path):
         (None, {"inlet": "bca"}, "^inlet is 'bca'; it must be a VesselPlace"),
         (None, {"goals": ["bca"]}, r"^goals is \['bca'\]; it must be a Mapping"),
         (None, {"goals": {"x": 3}}, "^goal 'x' is 3; it must be a VesselPlace"),
+        (None, {"name": 3}, "^name is 3; it must be a text"),
     ],
 )
 def test_parts_of_a_tree_of_another_class_are_refused(anatomy, tree, options, words):

@@ -40,6 +40,7 @@ def scans(vertices, faces):
         ({"labels": 1}, "^labels is .*; it must be an array of integers"),
         ({"labels": (1.5,)}, "^labels is .*; it must be an array of integers"),
         ({"labels": "1"}, "^labels is .*; it must be an array of integers"),
+        ({"name": 3}, "^name is 3; it must be a text"),
         ({"device": "wire_035_glide"}, "^device is 'wire_035_glide'; it must be a dev"),
     ],
 )

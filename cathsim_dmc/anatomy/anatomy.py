@@ -50,6 +50,7 @@ class Anatomy:
     file: FileFrame | None = None
 
     def __post_init__(self) -> None:
+        bounds.text("name", self.name)
         for key, goal in self.goals.items():
             if key != goal.name:
                 raise ValueError(f"goal {goal.name!r} is filed under {key!r}.")

@@ -109,6 +109,7 @@ class Rig:
         arena: arena, to which a test adds its fixtures before `compile`.
         catheter: entity of the device, with `origin` at the middle of link 0.
         gaps: (K,) m, from the ends of the devices to that of the chain, at rest.
+        drives: Drives of the base, from `hold` on.
     """
 
     def __init__(

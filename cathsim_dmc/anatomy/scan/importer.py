@@ -90,6 +90,7 @@ def import_scan(
     started = time.monotonic()
     told = _Told([] if notes is None else notes, progress or (lambda text: None))
     given, changes = _checked(inlet, heart, rename, device)
+    name = bounds.text("name", name or stem(mesh_path))
     # Invalid curves are refused before the long steps, and read again with the unit.
     first = "LPS" if mesh_frame is None else mesh_frame
     read_curves(centreline_paths, units or "mm", first, axes)
@@ -99,7 +100,7 @@ def import_scan(
     curves = read_curves(centreline_paths, lumen.units, lumen.frame, axes)
     wishes = Wishes(given, curves, changes, device, axes)
     parts, bore = _grown(lumen, frame, wishes, told)
-    anatomy = _anatomy(name or stem(mesh_path), parts, bore, told)
+    anatomy = _anatomy(name, parts, bore, told)
     goals = ", ".join(anatomy.goals) or "none"
     told.say(f"done in {time.monotonic() - started:.0f} s, goals {goals}")
     return anatomy
