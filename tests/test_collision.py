@@ -484,6 +484,24 @@ def test_threads_that_register_first_at_once_share_one_table():
     assert done.returncode == 0, done.stderr
 
 
+def test_a_wall_moves_if_an_interrupt_ended_the_first_compilation(tube, monkeypatch):
+    lattice = np.r_[np.zeros(3), 0.1, 2, 2, 2, np.full(64, 2e-3)]
+    collide_by, modules = fields._Table._collide_by, []
+
+    def interrupted(self, module):
+        modules.append(module)
+        if len(modules) == 1:
+            raise KeyboardInterrupt
+        collide_by(self, module)
+
+    monkeypatch.setattr(fields._Table, "_collide_by", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fields.register(tube, lattice)
+    user = fields.register(tube, lattice)
+    assert len(modules) == 2
+    np.testing.assert_array_equal(fields.registered(user).lattice, lattice)
+
+
 def test_equal_walls_that_move_otherwise_have_entries_of_their_own(tube):
     lattices = [np.r_[np.zeros(3), 0.1, 2, 2, 2, np.full(64, v)] for v in (0.0, 1e-3)]
     users = [fields.carrier(tube, lattice)["user"] for lattice in lattices]

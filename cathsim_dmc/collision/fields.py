@@ -126,17 +126,19 @@ class _Table:
         """Adds a motion lattice to an entry, for simulations of a moving vessel."""
         if key in self._lattices:
             return
+        from cathsim_dmc.collision import moving
+
+        # Before the lattice is kept: an interrupt may end this compilation.
+        self._collide_by(moving)
         self._lattices[key] = lattice
         row = self._rows[np.flatnonzero(self._rows[:, 0] == key)[0]]
         row[self._motion] = lattice.ctypes.data
-        from cathsim_dmc.collision import moving
-
-        self._collide_by(moving)
 
     def _collide_by(self, module: types.ModuleType) -> None:
         # The function of `moving` handles walls at rest, too.
+        address = module.of_link.address
         for kind in (_CAPSULE, _SPHERE):
-            self._functions[kind * _TYPES + _BOX] = module.of_link.address
+            self._functions[kind * _TYPES + _BOX] = address
 
 
 _made_table = functools.cache(_Table)

@@ -253,8 +253,8 @@ class Biplane:
             least = _THROUGH if self._errors.any else _OUTSIDE
             cost = np.where(depth > least, cost, -1.0)
             end = nearest_cell(np.argwhere(cost > 0.0), (goal - low) / HULL_SPACING)
-            self._graph, way = search(cost, end)
-            self._goal = goal, np.argwhere(np.isfinite(way))
+            graph, way = search(cost, end)
+            self._graph, self._goal = graph, (goal, np.argwhere(np.isfinite(way)))
         begin = nearest_cell(self._goal[1], (start - low) / HULL_SPACING)
         path = np.array(self._graph.traceback(begin))[::-1]
         return low + path * HULL_SPACING
