@@ -320,6 +320,21 @@ def test_a_header_names_no_file_elsewhere(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("voxels", "words"),
+    [
+        (np.zeros((0, 4, 4), "u1"), r"has the shape \(0, 4, 4\); give one label map"),
+        (np.where(np.eye(4), np.inf, np.ones((4, 4, 4))), "numbers that are not whol"),
+    ],
+)
+def test_voxels_that_are_none_or_infinite_are_no_labels(tmp_path, voxels, words):
+    nibabel = pytest.importorskip("nibabel")
+    image = nibabel.Nifti1Image(voxels.astype("f4"), np.eye(4))
+    nibabel.save(image, tmp_path / "map.nii")
+    with pytest.raises(ValueError, match=words):
+        label_surface(tmp_path / "map.nii")
+
+
+@pytest.mark.parametrize(
     ("image", "words"),
     [
         (lambda noise: (40 * noise).astype("i2"), "negative numbers"),

@@ -189,7 +189,7 @@ def change(path, value):
         (change(["version"], 2), "version is 2"),
         (change(["frame"], "LAS"), "one of LPS, RAS"),
         (change(["colour"], "red"), "some of format, version"),
-        (change(["vessels"], {}), "first of vessels"),
+        (change(["vessels"], {}), "at least one vessel"),
         (change(["vessels", "trunk"], {"parent": None}), "lacks points_mm, radii_mm"),
         (change(["vessels", "trunk", "radii_mm", 3], -1.0), "radii from -1"),
         (change(["vessels", "trunk", "radii_mm", 3], float("nan")), r"\[3\] is \[nan"),

@@ -71,8 +71,9 @@ def parse_tree(content: Any) -> TreeFile:
     curves: dict[str, Curve] = {}
     for key, entry in _parts(content, "vessels"):
         curves[key] = _curve(f"vessel {key!r}", entry, list(curves))
-    root = next(iter(curves), "")
-    bounds.choice("the first of vessels", root, curves)
+    if not curves:
+        bounds.refuse("vessels", {}, "a mapping with at least one vessel")
+    root = next(iter(curves))
     inlets, goals = (
         {
             key: _place(f"{kind[:-1]} {key!r}", entry, ways, curves)

@@ -126,7 +126,7 @@ def label_surface(
 
 def _counted(path: Path, voxels: np.ndarray) -> dict[int, int]:
     """Number of voxels of each label but 0; ValueError if it is no label map."""
-    if voxels.ndim != 3:
+    if voxels.ndim != 3 or not voxels.size:
         raise ValueError(
             f"{path} has the shape {voxels.shape}; give one label map in three "
             "dimensions (3D Slicer: export the segmentation as a label map)."
@@ -221,7 +221,7 @@ def _grey(voxels: np.ndarray, values: np.ndarray) -> str:
     """Evidence that voxels are grey values of an image; empty for labels."""
     if voxels.dtype.kind not in "biuf":
         return f"voxels of several numbers (type {voxels.dtype})"
-    if not np.array_equal(np.rint(values), values):
+    if not (np.isfinite(values).all() and np.array_equal(np.rint(values), values)):
         return "numbers that are not whole"
     if values[0] < 0:
         return f"negative numbers (from {values[0]:g} on)"
