@@ -27,8 +27,8 @@ class Tubes:
         )
         self._tree = cKDTree(self.points)
 
-    def node(self, point):
-        return int(self._tree.query(point)[1])
+    def depths(self, curve):
+        return self.depth[self._tree.query(curve)[1]]
 
 
 def line(*corners, step=1e-3):
