@@ -8,8 +8,6 @@ termination, positions, velocities and wall force must be bitwise equal in every
 step.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from typing import Any

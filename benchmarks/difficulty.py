@@ -10,8 +10,6 @@ be unsolvable. Push and curls are cut off when the device is stuck (2 s without 
 of insertion), and like random actions after 500 control steps.
 """
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """Scans with ground truth for the import: arches, remeshed, cut and rotated."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

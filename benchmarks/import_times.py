@@ -8,8 +8,6 @@ the lumen and the picture; no field comes from a cache. The time is the median o
 to be measured with nothing else running.
 """
 
-from __future__ import annotations
-
 import os
 import statistics
 import subprocess

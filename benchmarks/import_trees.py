@@ -1,7 +1,5 @@
 """Vessel trees that are no arches: what an import finds, leaves out and calls."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import sys

@@ -1,7 +1,5 @@
 """Imports of scans with known truth: names right, asked or wrong, entry, radii."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

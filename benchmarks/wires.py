@@ -3,8 +3,6 @@
 python benchmarks/wires.py DIRECTORY > REPORT.json
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

@@ -173,9 +173,8 @@ def crossed(before: int, after: int, interval: int) -> bool:
 def _episode_means(window: Iterable[Sequence[float | None]]) -> dict[str, float | None]:
     """Return the means over the last finished episodes; None where unknown."""
     means: dict[str, float | None] = dict.fromkeys(_FIGURES)
-    rows = list(window)
-    for column, name in enumerate(_FIGURES if rows else ()):
-        values = (row[column] for row in rows)
-        known = [value for value in values if value is not None]
+    # An empty window has no columns.
+    for name, column in zip(_FIGURES, zip(*window, strict=True), strict=False):
+        known = [value for value in column if value is not None]
         means[name] = float(np.mean(known)) if known else None
     return means

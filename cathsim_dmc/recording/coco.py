@@ -1,7 +1,5 @@
 """Labels of fluoroscopy in the COCO format, with run-length encoded masks."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 from typing import Any

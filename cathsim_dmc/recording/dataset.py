@@ -15,6 +15,7 @@ from cathsim_dmc import bounds, extras, suite
 from cathsim_dmc.files import (
     atomic_directory,
     fill,
+    refused,
     require_folder,
     require_room,
 )
@@ -147,7 +148,12 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
     import minari
 
     data = metadata_of(path)
-    try:
+    # Errors that a damaged file causes.
+    wrong = (
+        AssertionError, AttributeError, LookupError, OSError, RuntimeError, TypeError,
+        ValueError,
+    )  # fmt: skip
+    with refused(DatasetError, f"{data.parent} cannot be used", wrong):
         # Without the spaces Minari would make the environment that the file names.
         named = json.loads(data.read_text())
         if not {"observation_space", "action_space"} <= set(named):
@@ -160,11 +166,6 @@ def read_episodes(path: str | os.PathLike[str], **options: Any) -> Iterator[Any]
         for number, episode in enumerate(minari.MinariDataset(data.parent)):
             _check_episode(episode, number)
             yield episode
-    # Errors that a damaged file causes.
-    except (AssertionError, AttributeError, LookupError, OSError, RuntimeError,
-            TypeError, ValueError) as error:  # fmt: skip
-        line = " ".join(str(error).split()) or type(error).__name__
-        raise DatasetError(f"{data.parent} cannot be used: {line}") from error
 
 
 def check_stored(path: Path) -> None:
@@ -283,20 +284,18 @@ def repeat_episodes(
             repeat.
     """
     environment, made = None, None
+    wrong = ValueError, TypeError, LookupError, AttributeError
     for file in recordings_in(path):
-        try:
+        with refused(DatasetError, f"{file} is no demonstration", wrong):
             episode = Episode.load(file)
             task, own = _common([episode])
             _require_options({"task": task, **own}, options)
             wanted = task, {**own, "observation": observation}
-            if environment is None or made != wanted:
+            if made != wanted:
                 environment = suite.load(suite.DOMAIN, task, wanted[1])
                 made = wanted
             columns = _repeated(environment, episode, np.dtype("float32"))
             yield types.SimpleNamespace(**columns)
-        except (ValueError, TypeError, LookupError, AttributeError) as error:
-            line = " ".join(str(error).split())
-            raise DatasetError(f"{file} is no demonstration: {line}") from error
 
 
 def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:

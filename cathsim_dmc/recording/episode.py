@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc import bounds
-from cathsim_dmc.files import atomic_path, read_arrays, require_source
+from cathsim_dmc.files import atomic_path, read_arrays, refused, require_source
 
 FORMAT = "cathsim-episode"
 FORMAT_VERSION = 1
@@ -176,7 +176,9 @@ class Episode:
         """
         way = "a .npz file of `cathsim record`, `cathsim play` or Episode.save"
         path = require_source(path, way)
-        try:
+        text = f"{path} is not an episode written by Episode.save"
+        wrong = KeyError, TypeError, ValueError, RecursionError
+        with refused(ValueError, text, wrong):
             arrays = read_arrays(path, ("header", *_AXES))
             header = json.loads(str(arrays.pop("header")))
             if header["format"] != FORMAT:
@@ -188,10 +190,6 @@ class Episode:
                     "cathsim_dmc that wrote it"
                 )
             return cls(header["task"], header["seed"], header["meta"], **arrays)
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
-            raise ValueError(
-                f"{path} is not an episode written by Episode.save: {error}"
-            ) from error
 
 
 def _plain(value: Any) -> Any:

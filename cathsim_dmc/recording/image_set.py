@@ -9,8 +9,6 @@ The file of an anatomy is complete or missing; an interrupted run continues with
 missing ones. The same options give the same files, byte by byte.
 """
 
-from __future__ import annotations
-
 import concurrent.futures
 import contextlib
 import dataclasses

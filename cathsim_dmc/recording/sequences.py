@@ -4,8 +4,6 @@ One HDF5 file holds the frames of an anatomy, sequence after sequence; a row of 
 array belongs to one frame.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

@@ -9,8 +9,6 @@ the scenes that `cathsim export` writes, with pictures and surfaces of their ves
 and recordings of policies that ship. None of these files is in the repository.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

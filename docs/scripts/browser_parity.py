@@ -8,8 +8,6 @@ docs/images/browser_parity.png and docs/data/browser_parity.json, and the table 
 docs/browser/index.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

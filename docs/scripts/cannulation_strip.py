@@ -5,8 +5,6 @@ at six times, above in AP with the vessel as a roadmap, below in LAO 45 with con
 the ring is the goal. Needs no OpenGL.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

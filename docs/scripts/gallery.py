@@ -7,8 +7,6 @@ the page; "cannulation" is the film at the top of the README,
 docs/images/cannulation.webp. Needs no OpenGL; the same seeds give the same clips.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 from pathlib import Path

@@ -7,8 +7,6 @@ episode on the phantom `type2`, entered in the descending aorta. The dashed line
 policy's route, with the errors of its roadmaps; the ring is the goal. Needs no OpenGL.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Writes docs/images/fluoroscopy_views.png: the four named views at 128 x 128, and
 below, contrast off, roadmap, segmentation, and a 512 x 512 image of the tip.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from pathlib import Path

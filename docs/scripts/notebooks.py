@@ -8,8 +8,6 @@ address of the public repository into the cells for Colab, with a badge that ope
 notebook there.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

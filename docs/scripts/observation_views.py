@@ -3,8 +3,6 @@
 Writes docs/images/observation_views.png and endoluminal.png.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 `python docs/scripts/observations.py` writes the page; the tests compare it.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 from pathlib import Path

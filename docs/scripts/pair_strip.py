@@ -8,8 +8,6 @@ the learnt policy enters the left vertebral artery. Needs no OpenGL; the same se
 the same pictures.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 from collections.abc import Sequence

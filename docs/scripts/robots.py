@@ -6,8 +6,6 @@ Serves a task in one process and drives it in another with a policy that ships, 
 time and with the commands of the user, and writes the table into the page.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

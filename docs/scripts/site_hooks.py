@@ -5,8 +5,6 @@ page with their code, notebooks pages with their outputs, formulas MathML. Links
 docs/ in the repository point to those pages on the site.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

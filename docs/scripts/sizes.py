@@ -7,8 +7,6 @@ PYTHONPATH; the table names packages that are installed in none of them. Writes 
 table between the markers of the page.
 """
 
-from __future__ import annotations
-
 import argparse
 import tomllib
 from importlib import metadata
