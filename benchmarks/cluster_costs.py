@@ -70,17 +70,17 @@ def measured(rounds):
     return found
 
 
-def source(folder, collector, processes, make_env=environments.make_env):
+def source(folder, collector, processes):
     """A collector of batches, and its learner."""
     config = make_config(
         "ppo", "tuned", **SETTINGS, num_threads=1, collector=collector,
         collectors=processes,
     )  # fmt: skip
-    env = make_env(TASK, num_envs=ENVS, num_threads=1)
+    env = environments.make_env(TASK, num_envs=ENVS, num_threads=1)
     shapes = NetworkShapes.of(env.observation_spec, env.action_spec)
     learner = LEARNERS["ppo"].learner(config, shapes, Path(folder))
     learner.attach(env)
-    return make_collector(config, learner, env, make_env, 0), learner
+    return make_collector(config, learner, env, environments.make_env, 0), learner
 
 
 def speeds(rounds, kept):

@@ -13,6 +13,7 @@ from pathlib import Path
 import import_cases
 import numpy as np
 import trimesh
+from scipy.interpolate import PchipInterpolator
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
@@ -103,8 +104,6 @@ class _Grower:
         corners = corners + moved
         t = np.linspace(0.0, 1.0, len(corners))
         fine = np.linspace(0.0, 1.0, 400)
-        from scipy.interpolate import PchipInterpolator
-
         points = PchipInterpolator(t, corners)(fine)
         along = np.linspace(0.0, 1.0, len(radii))
         width = np.interp(fine, along, np.array(radii))

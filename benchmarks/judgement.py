@@ -59,7 +59,7 @@ def judge(policy, task, task_kwargs, episodes=EPISODES, name=None, num_threads=N
     return found, force_map(*log.contacts(), low, high)
 
 
-def judge_each_arch(policy, task, task_kwargs, arches, name=None, numbers=None):
+def judge_each_arch(policy, task, task_kwargs, arches, name=None):
     """Evaluate a policy in every arch of a set, one episode each.
 
     Arches without room for a sheath at the inlet are left out.
@@ -70,15 +70,14 @@ def judge_each_arch(policy, task, task_kwargs, arches, name=None, numbers=None):
         task_kwargs: Options of the task.
         arches: Name of the set, such as "test".
         name: Name of the policy for the reports.
-        numbers: Indices of the arches in the set; None for all.
 
     Returns:
         The result, and the kind of arch of each episode.
     """
-    seeds, played, groups = arch_set(arches), [], []
+    played, groups = [], []
     options = {**task_kwargs, "arches": arches, "pool": 1}
-    for number in range(len(seeds)) if numbers is None else numbers:
-        anatomy = build_seed(seeds[number], access=suite.TASKS[task].access)
+    for number, seed in enumerate(arch_set(arches)):
+        anatomy = build_seed(seed, access=suite.TASKS[task].access)
         if sheath_direction(anatomy) is None:
             continue
         one = evaluation.evaluate(
@@ -91,7 +90,7 @@ def judge_each_arch(policy, task, task_kwargs, arches, name=None, numbers=None):
             num_threads=1,
         )
         played.append(one)
-        groups.append(f"type {seeds[number].arch_type}")
+        groups.append(f"type {seed.arch_type}")
     if not played:
         raise ValueError(f"no device can enter any of the arches {arches!r}")
     whole = dataclasses.replace(

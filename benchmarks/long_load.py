@@ -11,6 +11,7 @@ least 95 % of that of the fresh process; no MuJoCo warning, no NaN, no physics e
 """
 
 import argparse
+import dataclasses
 import gc
 import json
 import subprocess
@@ -22,6 +23,7 @@ import numpy as np
 
 from cathsim_dmc import files, suite
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.validation.checks import Check
 
 GROWTH = 20e6  # bytes
 SPEED = 0.95
@@ -33,17 +35,17 @@ HOLD = 10  # control steps between two draws of the actions
 class Load:
     """A batch under random actions with random resets."""
 
-    def __init__(self, task: str, simulations: int, threads: int, seed: int):
+    def __init__(self, given: argparse.Namespace):
         kwargs = {"randomisation": True, "max_steps": 10**9}
         self.batch = BatchSimulation(
-            suite.make_task(task, **kwargs),
-            simulations,
-            num_threads=threads,
-            seeds=seed,
+            suite.make_task(given.task, **kwargs),
+            given.simulations,
+            num_threads=given.threads,
+            seeds=given.seed,
         )
         self.batch.reset()
-        self.random = np.random.default_rng(seed)
-        self.action = np.zeros((simulations, self.batch.num_actions))
+        self.random = np.random.default_rng(given.seed)
+        self.action = np.zeros((given.simulations, self.batch.num_actions))
         self.resets = self.errors = self.not_finite = self.count = 0
 
     def run(self, calls: int) -> float:
@@ -119,9 +121,7 @@ def in_turns(
 
 
 def measure(arguments: argparse.Namespace) -> dict:
-    load = Load(
-        arguments.task, arguments.simulations, arguments.threads, arguments.seed
-    )
+    load = Load(arguments)
     calls = max(1, arguments.steps // arguments.simulations)
     warm = max(1, int(WARM_UP * calls))
     load.run(warm)
@@ -139,18 +139,15 @@ def measure(arguments: argparse.Namespace) -> dict:
     here, fresh = in_turns(load, arguments, max(1, min(stretch, 400)))
     ratio = float(np.median(np.divide(here, fresh)))
     checks = [
-        ("memory growth after warm-up", growth / 1e6, "MB", f"<= {GROWTH / 1e6:g}",
-         growth <= GROWTH),
-        ("speed over that of a fresh process", ratio, "", f">= {SPEED}",
-         ratio >= SPEED),
-        ("MuJoCo warnings", load.warnings, "", "<= 0", load.warnings == 0),
-        ("observations with NaN", load.not_finite, "", "<= 0", not load.not_finite),
-        ("physics errors", load.errors, "", "<= 0", not load.errors),
-    ]  # fmt: skip
-    keys = ("name", "value", "unit", "bound", "passed")
+        Check.at_most("memory growth after warm-up", growth / 1e6, GROWTH / 1e6, "MB"),
+        Check.at_least("speed over that of a fresh process", ratio, SPEED),
+        Check.at_most("MuJoCo warnings", load.warnings, 0),
+        Check.at_most("observations with NaN", load.not_finite, 0),
+        Check.at_most("physics errors", load.errors, 0),
+    ]
     return {
-        "checks": [dict(zip(keys, check, strict=True)) for check in checks],
-        "passed": all(check[-1] for check in checks),
+        "checks": [dataclasses.asdict(check) for check in checks],
+        "passed": all(check.passed for check in checks),
         "task": arguments.task,
         "steps": calls * arguments.simulations,
         "resets": load.resets,
@@ -171,10 +168,7 @@ def main() -> int:
     parser.add_argument("--serve", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.serve:
-        load = Load(
-            arguments.task, arguments.simulations, arguments.threads, arguments.seed
-        )
-        serve(load, arguments.serve)
+        serve(Load(arguments), arguments.serve)
         return 0
     try:
         if arguments.out is not None:

@@ -139,14 +139,14 @@ def narrowed(seed: arch.ArchSeed, branch: str, radius: float) -> Anatomy:
     return Anatomy.from_tree(tree, seed.name, inlet=inlet, goals={branch: goal})
 
 
-def narrow(pair=False, episodes=2, branch="lcca"):
+def narrow(pair=False, branch="lcca"):
     """Held-out arches with a branch that is too narrow, for each of `NARROW`."""
     for radius in NARROW:
         for seed in arch.arch_set("test")[:3]:
             where = {"arch": seed.name, "radius": f"{1e3 * radius:g}"}
             options = {"anatomy": narrowed(seed, branch, radius), "goal": branch}
             options |= {"give_up": True, **({"devices": PAIR} if pair else {})}
-            yield Cell("narrow", where, "navigate", options, episodes)
+            yield Cell("narrow", where, "navigate", options, 2)
 
 
 def changes(pair=False, episodes=20):

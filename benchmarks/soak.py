@@ -38,6 +38,7 @@ from scipy.stats import qmc
 from cathsim_dmc import files, suite
 from cathsim_dmc.physics import forces
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.validation.checks import Check
 
 # Both arches from both accesses; the goal does not affect these policies.
 TASKS = ("type1_lcca", "type2_lcca", "femoral_type1_lcca", "femoral_type2_lcca")
@@ -261,11 +262,6 @@ def read_rows(path: Path, steps: int) -> list[dict]:
     return rows
 
 
-def write_rows(path: Path, rows: list[dict]) -> None:
-    """Replaces the file atomically."""
-    files.write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
-
-
 def percentile(rows: list[dict], percent: float) -> float:
     """Percentile of the penetration over all rows, m (0 without contact)."""
     counts: dict[int, int] = {}
@@ -302,15 +298,6 @@ def report(rows: list[dict]) -> dict:
     """Checks and statistics in the format of all measuring commands."""
     total = summarise(rows)
 
-    def check(name, value, unit, bound):
-        return {
-            "name": name,
-            "value": value,
-            "unit": unit,
-            "bound": f"<= {bound:g}",
-            "passed": bool(value <= bound),
-        }
-
     def worst(key):
         row = max(rows, key=lambda row: row[f"{key}_max"])
         names = ("task", "policy", "seed", f"{key}_max", f"{key}_step")
@@ -326,24 +313,16 @@ def report(rows: list[dict]) -> dict:
         }
         for policy, task in sorted({(row["policy"], row["task"]) for row in rows})
     ]
+    depth, deepest = total["penetration_p99_mm"], total["penetration_max_mm"]
+    checks = [
+        Check.at_most("MuJoCo warnings", total["warnings"], 0),
+        Check.at_most("escapes", total["escapes"], 0),
+        Check.at_most("penetration p99", depth, 1e3 * PENETRATION_P99, "mm"),
+        Check.at_most("penetration max", deepest, 1e3 * PENETRATION_MAX, "mm"),
+        Check.at_most("largest wall force", total["force_max"], FORCE_MAX, "N"),
+    ]
     return {
-        "checks": [
-            check("MuJoCo warnings", total["warnings"], "", 0),
-            check("escapes", total["escapes"], "", 0),
-            check(
-                "penetration p99",
-                total["penetration_p99_mm"],
-                "mm",
-                PENETRATION_P99 * 1e3,
-            ),
-            check(
-                "penetration max",
-                total["penetration_max_mm"],
-                "mm",
-                PENETRATION_MAX * 1e3,
-            ),
-            check("largest wall force", total["force_max"], "N", FORCE_MAX),
-        ],
+        "checks": [dataclasses.asdict(check) for check in checks],
         "total": total,
         "worst": {
             key: worst(key) for key in ("penetration", "force", "excess", "tip_step")
@@ -404,13 +383,10 @@ def main() -> int:
         for first in range(0, len(missing), options.together):
             part = missing[first : first + options.together]
             start = time.perf_counter()
-            environment = suite.load(
-                suite.DOMAIN, task, task_kwargs={"goal_radius": TINY_GOAL}
-            )
-            simulation = BatchSimulation(
-                environment.task, len(part), num_threads=options.threads
-            )
-            write_rows(path, read_rows(path, steps) + run(simulation, part, steps))
+            made = suite.make_task(task, goal_radius=TINY_GOAL)
+            simulation = BatchSimulation(made, len(part), num_threads=options.threads)
+            rows = read_rows(path, steps) + run(simulation, part, steps)
+            files.write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
             print(
                 f"{task}: {len(part)} episodes in {time.perf_counter() - start:.0f} s",
                 file=sys.stderr,

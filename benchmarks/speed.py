@@ -182,11 +182,9 @@ def _mujoco_timers(data: mujoco.MjData) -> Iterator[Callable[[str], float]]:
         mujoco.set_mjcb_time(None)
 
 
-def _batch(threads: int, seed: int = 0, **options):
-    environment = load(**options)
-    return BatchSimulation(
-        environment.task, NUM_SIMULATIONS, num_threads=threads, seeds=seed
-    )
+def _batch(threads: int, **options):
+    task = load(**options).task
+    return BatchSimulation(task, NUM_SIMULATIONS, num_threads=threads, seeds=0)
 
 
 def thread_scaling(steps: int = 30) -> tuple[list[float], float, dict[str, float]]:

@@ -7,9 +7,8 @@ import argparse
 import json
 from pathlib import Path
 
-import figures
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from figures import grid, put
 from matplotlib.figure import Figure
 
 from cathsim_dmc import style
@@ -24,11 +23,6 @@ ROOT = Path(__file__).parents[1]
 PAGE, ARCHES, IMAGES = ROOT / "anatomies.md", ROOT / "arches.md", ROOT / "images"
 MEASUREMENTS = ROOT.parent / "tests/data/measured"
 MAIN = ("bca", "lcca", "lsa")
-
-
-def table(header, rows):
-    lines = [header, ["---"] * len(header), *rows]
-    return ["| " + " | ".join(map(str, line)) + " |" for line in lines]
 
 
 def per_branch(found, key, digits=0):
@@ -67,7 +61,7 @@ def shapes(anatomies):
     rows = [
         [line, *(show(one) for one in found.values())] for line, show in lines.items()
     ]
-    return table(["", *anatomies], rows)
+    return grid(["", *anatomies], rows)
 
 
 def fields(anatomies):
@@ -86,7 +80,7 @@ def fields(anatomies):
             ]
         )
     header = ["", "error of the field mean / p99 / max, mm", "memory, MB"]
-    return table([*header, "all checks pass"], rows)
+    return grid([*header, "all checks pass"], rows)
 
 
 def against_measured():
@@ -118,7 +112,7 @@ def against_measured():
             ]
         )  # fmt: skip
     header = ["", "centreline, mean / p95 / max, mm", "inscribed radius, the same"]
-    return table(header, rows)
+    return grid(header, rows)
 
 
 def distributions():
@@ -165,7 +159,7 @@ def distributions():
     row("branches out of the plane 40 mm on, mm", aside, nothing)
     bent = [branch["tortuosity"] for branch in branches]
     row("branches, length over chord", bent, nothing, 2)
-    return table(["", "table", "98 test arches", "range"], rows)
+    return grid(["", "table", "98 test arches", "range"], rows)
 
 
 def necks():
@@ -190,14 +184,13 @@ def necks():
         spans = zip(lows, highs, (1, 0, 0), strict=True)
         rows.append([name, *(f"{a:.{d}f} to {b:.{d}f}" for a, b, d in spans)])
     header = ["", "Ø 10 mm past the ostium, mm", "leaves its parent at, °"]
-    return table([*header, "route to its goal, mm"], rows)
+    return grid([*header, "route to its goal, mm"], rows)
 
 
 def gallery(seeds, name):
     """Writes a figure of front and left views of random arches, three in a row."""
     rows = -(-len(seeds) // 3)
     figure = Figure(figsize=(15, 2.625 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(rows, 6, squeeze=False)
     for place, seed in enumerate(seeds):
         anatomy = arch.build_seed(seed)
@@ -223,8 +216,8 @@ def main():
         "fields": fields(anatomies),
         "against measured": against_measured(),
     }
-    figures.put(PAGE, **blocks)
-    figures.put(ARCHES, distributions=distributions(), necks=necks())
+    put(PAGE, **blocks)
+    put(ARCHES, distributions=distributions(), necks=necks())
 
 
 if __name__ == "__main__":

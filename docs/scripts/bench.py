@@ -12,7 +12,6 @@ from pathlib import Path
 
 import figures
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cathsim_dmc import style
@@ -33,7 +32,7 @@ def main(report):
     figures.keep("validation_bench", measured.as_dict(), command)
     found = tables(measured).items()
     for (name, page), (title, rows) in zip(PAGES.items(), found, strict=True):
-        figures.put(page, **{name: f"{title}:\n\n{markdown(rows)}"})
+        figures.put(page, **{name: [f"{title}:", "", *figures.grid(rows[0], rows[1:])]})
     figures.main([])
     style.save(figure(measured.findings["frames"]), FIGURE)
 
@@ -61,16 +60,9 @@ def tables(report: Report) -> dict[str, list[list[str]]]:
     return found
 
 
-def markdown(rows):
-    header, *rest = rows
-    lines = [header, ["---"] * len(header), *rest]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 def figure(rows):
     """Figure of the RMS distance of every frame, by insertion history and baseline."""
     figure = Figure(figsize=(9.2, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
     rows = sorted(rows, key=lambda row: (row["folded"], row["wire"], row["frame"]))
     ax = figure.subplots()
     style.tidy(ax)

@@ -53,6 +53,7 @@ VENDOR = {
     "three": ("build/three.module.js", "build/three.core.js"),
 }
 # Files that Rerun's own server serves to a browser.
+PATIENCE = 30.0  # s
 VIEWER = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
 POLICY = (
     '<meta http-equiv="Content-Security-Policy" '
@@ -338,12 +339,12 @@ def write_viewer(out: Path, recordings: Path) -> None:
     (out / "index.html").write_text(page)
 
 
-def _fetched(address: str, patience: float = 30.0) -> bytes:
-    """Content of a file of a server that is starting; waits `patience`, s, for it."""
-    until = time.monotonic() + patience
+def _fetched(address: str) -> bytes:
+    """Content of a file of a server that is starting; waits `PATIENCE` for it."""
+    until = time.monotonic() + PATIENCE
     while True:
         try:
-            with urllib.request.urlopen(address, timeout=patience) as answer:
+            with urllib.request.urlopen(address, timeout=PATIENCE) as answer:
                 return answer.read()
         except urllib.error.HTTPError as error:
             raise SystemExit(f"Rerun's viewer has no {address}: {error}") from error

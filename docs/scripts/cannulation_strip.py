@@ -8,17 +8,16 @@ the ring is the goal. Needs no OpenGL.
 import argparse
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.imaging import angiograph as machines
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.simulation.episodes import play_alone
 
 OUTPUT = Path(__file__).parents[1] / "images" / "cannulation_strip.png"
 TASK, SEED, MOMENTS = "type1_lcca", 3, 6
@@ -34,9 +33,8 @@ def run() -> tuple[object, list[dict]]:
     """The task, and the state of the device at every control step."""
     env = suite.load("cathsim", TASK, task_kwargs={"random": SEED})
     act = policies.in_environment(policies.make_policy("expert"), env)
-    timestep, states = env.reset(), []
-    while True:
-        task = env.task
+    task, states = env.task, []
+    for _ in play_alone(env, act):
         states.append(
             {
                 "time": env.physics.time(),
@@ -45,9 +43,7 @@ def run() -> tuple[object, list[dict]]:
                 "force": float(task.wall_force.mean_max),
             }
         )
-        if timestep.last():
-            return env.task, states
-        timestep = env.step(act(timestep))
+    return task, states
 
 
 def main() -> None:
@@ -55,9 +51,8 @@ def main() -> None:
     task, states = run()
     surface, random = task.scene.anatomy.surface, np.random.RandomState(0)
     chosen = np.linspace(0, len(states) - 1, MOMENTS).round().astype(int)
-    figure, axes = plt.subplots(
-        len(ROWS), MOMENTS, figsize=(12, 4.5), layout="constrained"
-    )
+    figure = Figure(figsize=(12, 4.5), layout="constrained")
+    axes = figure.subplots(len(ROWS), MOMENTS)
     for number, (title, options) in enumerate(ROWS.items()):
         row = axes[number]
         planes = Angiograph(surface, options).planes()
@@ -71,7 +66,7 @@ def main() -> None:
             )
             image = machines.images([planes], [device], [random])[0]
             axis.imshow(image[..., 0], cmap="gray", vmin=0, vmax=255)
-            axis.add_patch(plt.Circle(goal, radius, fill=False, color="limegreen"))
+            axis.add_patch(Circle(goal, radius, fill=False, color="limegreen"))
             axis.set_axis_off()
             if number == 0:
                 axis.set_title(

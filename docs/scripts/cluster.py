@@ -33,10 +33,8 @@ def speed(costs):
     """Table of control steps per second, absolute and relative to one process."""
     rates = costs["control steps per second"]
     alone = rates["one process"]
-    lines = ["| | control steps/s | of one process |", "|---|---|---|"]
-    return lines + [
-        f"| {name} | {rate:,.0f} | {rate / alone:.0%} |" for name, rate in rates.items()
-    ]
+    rows = [(name, f"{x:,.0f}", f"{x / alone:.0%}") for name, x in rates.items()]
+    return figures.grid(("", "control steps/s", "of one process"), rows)
 
 
 def costs(found):
@@ -46,10 +44,8 @@ def costs(found):
     size = found["parts, ms"]["bytes a frame"]
     rows[f"parts of a batch ({size:,.0f} bytes a frame)"] = found["parts, ms"]
     counts = [key for key in found["parts, ms"] if key.isdigit()]
-    lines = [f"| ms, by number of collectors | {' | '.join(counts)} |"]
-    lines.append("|---" * (len(counts) + 1) + "|")
-    for name, row in rows.items():
-        lines.append(f"| {name} | {' | '.join(f'{row[key]:.1f}' for key in counts)} |")
+    shown = ([n, *(f"{one[key]:.1f}" for key in counts)] for n, one in rows.items())
+    lines = figures.grid(["ms, by number of collectors", *counts], shown)
     once = {
         "start of a cluster of two nodes, s": found["start of the cluster, s"],
         "first batch of one collector, s": found["start of collectors, s"]["one node"],
@@ -60,8 +56,8 @@ def costs(found):
         "lost process: its batch takes longer by, s": found["loss, s"]["process"],
         "lost node: its batch takes longer by, s": found["loss, s"]["node"],
     }
-    lines += ["", "| once | |", "|---|---|"]
-    return lines + [f"| {name} | {value:.3g} |" for name, value in once.items()]
+    shown = ((name, f"{value:.3g}") for name, value in once.items())
+    return [*lines, "", *figures.grid(("once", ""), shown)]
 
 
 def main():

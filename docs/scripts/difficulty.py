@@ -62,30 +62,23 @@ def merged(reports):
 
 def tables(report):
     """The tables as lines of Markdown."""
-    names = list(POLICIES)
+    header, found = ["task", *POLICIES.values()], report["findings"]["tasks"]
+    order = sorted(found, key=lambda name: (name.startswith("femoral"), name))
+
+    def shown(cell):
+        rows = ([f"`{n}`", *(cell(found[n].get(p)) for p in POLICIES)] for n in order)
+        return figures.grid(header, rows)
+
     lines = [
         "Success, % (95 % interval), and number of episodes:",
         "",
-        f"| task | {' | '.join(POLICIES.values())} |",
-        "|---" * (len(names) + 1) + "|",
-    ]
-    found = report["findings"]["tasks"]
-    order = sorted(found, key=lambda name: (name.startswith("femoral"), name))
-    everything = {name: found[name] for name in order}
-    for task, trials in everything.items():
-        cells = [_success(trials.get(policy)) for policy in names]
-        lines.append(f"| `{task}` | {' | '.join(cells)} |")
-    lines += [
+        *shown(_success),
         "",
         "Mean force on the wall (sum over all contacts, mean over the steps) / largest "
         "contact of an episode (mean over the episodes), mN; control steps:",
         "",
-        f"| task | {' | '.join(POLICIES.values())} |",
-        "|---" * (len(names) + 1) + "|",
+        *shown(_force),
     ]
-    for task, trials in everything.items():
-        cells = [_force(trials.get(policy)) for policy in names]
-        lines.append(f"| `{task}` | {' | '.join(cells)} |")
     missed = [check for check in report["checks"] if not check["passed"]]
     end = ":" if missed else "."
     lines += ["", f"{len(report['checks'])} bounds, {len(missed)} missed{end}", ""]

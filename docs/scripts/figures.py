@@ -21,6 +21,7 @@ import re
 import statistics
 import subprocess
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -56,6 +57,12 @@ def put(page: Path, **blocks: str | list[str]) -> None:
         lines = content if isinstance(content, str) else "\n".join(content)
         text = between(text, name.replace("_", " "), lines)
     page.write_text(text, encoding="utf-8")
+
+
+def grid(header: Sequence[str], rows: Iterable[Sequence]) -> list[str]:
+    """A table as lines of Markdown."""
+    first, *rest = (f"| {' | '.join(map(str, cells))} |" for cells in (header, *rows))
+    return [first, "|---" * len(header) + "|", *rest]
 
 
 def git(*arguments: str) -> subprocess.CompletedProcess:

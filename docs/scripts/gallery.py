@@ -13,6 +13,7 @@ from pathlib import Path
 
 from cathsim_dmc.agents import load_policy  # must be imported before dm_control
 
+import figures  # isort: skip
 import cathsim_dmc  # isort: skip
 from cathsim_dmc.agents.policies import task_and_options  # isort: skip
 from cathsim_dmc import suite  # isort: skip
@@ -167,17 +168,12 @@ def main() -> None:
 
 def grid(folder: str) -> list[str]:
     """The clips as a table of Markdown, with pictures under a folder."""
-    lines = []
+    rows = []
     for first in range(0, len(CLIPS), COLUMNS):
         row = CLIPS[first : first + COLUMNS]
-        cells = [f"![{clip.caption}]({folder}/{clip.name}.webp)" for clip in row]
-        words = [f"{clip.caption}<br>`{clip.command}`" for clip in row]
-        if not first:
-            lines += ["| " + " | ".join(cells) + " |", "|---" * COLUMNS + "|"]
-        else:
-            lines.append("| " + " | ".join(cells) + " |")
-        lines.append("| " + " | ".join(words) + " |")
-    return lines
+        rows.append([f"![{clip.caption}]({folder}/{clip.name}.webp)" for clip in row])
+        rows.append([f"{clip.caption}<br>`{clip.command}`" for clip in row])
+    return figures.grid(rows[0], rows[1:])
 
 
 if __name__ == "__main__":

@@ -10,15 +10,14 @@ policy's route, with the errors of its roadmaps; the ring is the goal. Needs no 
 import argparse
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 from cathsim_dmc.agents.policies import load_policy  # isort: skip
 from cathsim_dmc import policies, suite
 from cathsim_dmc.agents import protocols
+from cathsim_dmc.simulation.episodes import play_alone
 
 OUTPUT = Path(__file__).parents[1] / "images" / "image_strip.png"
 POLICY, SEED, MOMENTS = "pretrained:navigator_image", 12, 6
@@ -35,21 +34,18 @@ def main() -> None:
         "randomisation": protocols.VARIED_RANGES, "random": SEED,
     }  # fmt: skip
     env = suite.load("cathsim", "navigate", task_kwargs=options)
-    act, timestep, frames = policies.in_environment(policy, env), env.reset(), []
-    while True:
-        task = env.task
+    task, frames = env.task, []
+    for _, timestep in play_alone(env, policies.in_environment(policy, env)):
         insertion, force = 1e3 * task.readings.insertion, task.wall_force.mean_sum
         memory = task.rollout.memory
         state = "withdraws" if memory.retracting[0] else "advances"
         title = f"{env.physics.time():.1f} s, {float(insertion):.0f} mm in, {state}\n"
         title += f"{1e3 * float(force):.0f} mN, {int(memory.attempts[0])} retries"
         frames.append((title, np.array(timestep.observation["image"])))
-        if timestep.last():
-            break
-        timestep = env.step(act(timestep))
     sensors = task.rollout._sensors
     route = sensors.sight._routes[0].points
-    figure, axes = plt.subplots(2, MOMENTS, figsize=(12, 4.6), layout="constrained")
+    figure = Figure(figsize=(12, 4.6), layout="constrained")
+    axes = figure.subplots(2, MOMENTS)
     chosen = np.linspace(0, len(frames) - 1, MOMENTS).round().astype(int)
     for plane, (row, fluoroscope) in enumerate(
         zip(axes, sensors.planes[0], strict=True)
@@ -63,7 +59,7 @@ def main() -> None:
             title, image = frames[index]
             axis.imshow(image[..., plane], cmap="gray", vmin=0, vmax=255)
             axis.plot(*line.T, "--", color="tab:orange", linewidth=0.8)
-            axis.add_patch(plt.Circle(goal, radius, fill=False, color="limegreen"))
+            axis.add_patch(Circle(goal, radius, fill=False, color="limegreen"))
             axis.set(xlim=middle[0] + [-half, half], ylim=middle[1] + [half, -half])
             axis.set_axis_off()
             if plane == 0:

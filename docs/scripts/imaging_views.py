@@ -8,11 +8,8 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter1d
 
 from cathsim_dmc.anatomy.arch.arch import ARCHES, arch_tree
@@ -27,9 +24,9 @@ CATHETER_RADIUS = 0.84e-3  # 5F
 LINK_LENGTH = 7e-3
 
 
-def catheter(tree, goal: str = "lcca", depth: float = 0.03) -> np.ndarray:
+def catheter(tree) -> np.ndarray:
     """Joints (n, 3), m, of a catheter along the middle of the vessels, base to tip."""
-    route = tree.route("aorta", goal, depth).resampled(0.5e-3)
+    route = tree.route("aorta", "lcca", 0.03).resampled(0.5e-3)
     # The catheter is straight before the inlet; the filter models its stiffness.
     first = route.points[1] - route.points[0]
     first /= np.linalg.norm(first)
@@ -73,7 +70,8 @@ def main() -> None:
     """Draw the figure."""
     tree = arch_tree(ARCHES["simple1"])
     images = views(tree, lumen_surface(tree))
-    figure, axes = plt.subplots(2, 4, figsize=(9.6, 5.1), layout="constrained")
+    figure = Figure(figsize=(9.6, 5.1), layout="constrained")
+    axes = figure.subplots(2, 4)
     for axis, (title, image) in zip(axes.flat, images.items(), strict=True):
         axis.imshow(image.squeeze(), cmap="gray", vmin=0, vmax=255)
         axis.set_title(title, fontsize=9)

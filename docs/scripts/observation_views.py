@@ -6,11 +6,8 @@ Writes docs/images/observation_views.png and endoluminal.png.
 import argparse
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
@@ -58,7 +55,8 @@ def drive(env):
 
 
 def fluoroscopy() -> Path:
-    figure, axes = plt.subplots(4, 4, figsize=(9.6, 10.2), layout="constrained")
+    figure = Figure(figsize=(9.6, 10.2), layout="constrained")
+    axes = figure.subplots(4, 4)
     for axis, (title, (options, name)) in zip(axes.flat, PANELS.items(), strict=True):
         names = [name, "image"] if name == "tracking_2d" else name
         seen = drive(load(observation=names, fluoroscopy=options))
@@ -82,7 +80,8 @@ def endoluminal() -> Path:
     """Draws endoluminal views along the route to the LCCA of `type3`, looking ahead."""
     anatomy = phantoms.load("type3")
     way = anatomy.route("lcca")
-    figure, axes = plt.subplots(2, 4, figsize=(10, 5.2), layout="constrained")
+    figure = Figure(figsize=(10, 5.2), layout="constrained")
+    axes = figure.subplots(2, 4)
     for column, share in zip(axes.T, (0.1, 0.3, 0.5, 0.65), strict=True):
         place = way.at(share * way.length)
         forward = place.tangent

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import grid
 
 from cathsim_dmc import suite
+from cathsim_dmc.cli.task_options import field_helps
 from cathsim_dmc.imaging.carm import VIEWS
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.randomisation import DEFAULT_RANGES, Randomisation
@@ -179,10 +181,6 @@ def _range(entry: Entry) -> str:
     return f"{bound(entry.low)} to {bound(entry.high)}"
 
 
-def _row(*cells: str) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
 # Observations of other tasks.
 _OTHERS = (
     observation_kind.COAXIAL,
@@ -194,12 +192,12 @@ _OTHERS = (
 def other_table(task: str, *names: str, **options: Any) -> str:
     """Table of the entries of observations of other tasks, from the specs."""
     specs = suite.make_task(task, observation=names, **options).observation_specs
-    rows = [_row("entry", "shape", "unit", "meaning"), _row(*["---"] * 4)]
+    rows = []
     known = observations.entries(["route"])
     for entry in (one for one in observations.entries(names) if one not in known):
         shape = _shape(specs[entry.key].shape)
-        rows.append(_row(f"`{entry.key}`", shape, entry.unit, entry.meaning))
-    return "\n".join(rows)
+        rows.append((f"`{entry.key}`", shape, entry.unit, entry.meaning))
+    return "\n".join(grid(("entry", "shape", "unit", "meaning"), rows))
 
 
 def entries_table() -> str:
@@ -207,12 +205,8 @@ def entries_table() -> str:
     kinds = {
         n: k for n, k in observations.OBSERVATIONS.items() if k.needs not in _OTHERS
     }
-    single = [
-        name for name, kind in kinds.items() if kind.needs != observation_kind.BIPLANE
-    ]
-    double = [
-        name for name, kind in kinds.items() if kind.needs == observation_kind.BIPLANE
-    ]
+    double = [n for n, k in kinds.items() if k.needs == observation_kind.BIPLANE]
+    single = [name for name in kinds if name not in double]
     planes = {"view": [60, 0], "biplane": [-30, 0]}
     specs = {
         **suite.make_task(TASK, observation=single).observation_specs,
@@ -220,45 +214,21 @@ def entries_table() -> str:
             TASK, observation=double, fluoroscopy=planes
         ).observation_specs,
     }
-    rows = [
-        _row("observation", "entry", "shape", "type", "range", "unit", "meaning"),
-        _row(*["---"] * 7),
-    ]
+    header = "observation", "entry", "shape", "type", "range", "unit", "meaning"
+    rows = []
     for name, kind in kinds.items():
         for entry in kind.entries:
             spec = specs[entry.key]
-            rows.append(
-                _row(
-                    f"`{name}`",
-                    f"`{entry.key}`",
-                    _shape(spec.shape),
-                    str(spec.dtype),
-                    _range(entry),
-                    entry.unit,
-                    entry.meaning,
-                )
-            )
-    return "\n".join(rows)
-
-
-def _attributes(kind: type) -> dict[str, str]:
-    """Meanings of the attributes of a class from its docstring."""
-    meanings: dict[str, str] = {}
-    name = None
-    for line in kind.__doc__.split("Attributes:")[1].splitlines():
-        word, colon, rest = line.strip().partition(":")
-        if colon and word in kind.__dataclass_fields__:
-            name = word
-            meanings[name] = rest.strip()
-        elif name and line.strip():
-            meanings[name] += " " + line.strip()
-    return meanings
+            kind_of_array = _shape(spec.shape), str(spec.dtype), _range(entry)
+            names = f"`{name}`", f"`{entry.key}`"
+            rows.append((*names, *kind_of_array, entry.unit, entry.meaning))
+    return "\n".join(grid(header, rows))
 
 
 def options_table(kind: type, values: object, title: str) -> str:
     """Table of the fields of a dataclass of options, with values and meanings."""
-    rows = [_row("option", title, "meaning"), _row("---", "---", "---")]
-    for name, meaning in _attributes(kind).items():
+    rows = []
+    for name, meaning in field_helps(kind).items():
         value = getattr(values, name)
         if isinstance(value, tuple):
             value = ", ".join(
@@ -266,8 +236,8 @@ def options_table(kind: type, values: object, title: str) -> str:
             )
         elif isinstance(value, float):
             value = f"{value:.4g}"
-        rows.append(_row(f"`{name}`", str(value), meaning))
-    return "\n".join(rows)
+        rows.append((f"`{name}`", value, meaning))
+    return "\n".join(grid(("option", title, "meaning"), rows))
 
 
 def page() -> str:
@@ -285,7 +255,7 @@ def page() -> str:
     parts.append(CAMERAS.replace("{table}", table))
     table = options_table(Randomisation, DEFAULT_RANGES, "default range")
     parts.append(RANDOMISATION.replace("{table}", table))
-    assert len(_attributes(Randomisation)) == len(dataclasses.fields(Randomisation))
+    assert len(field_helps(Randomisation)) == len(dataclasses.fields(Randomisation))
     return "\n".join(part.strip("\n") + "\n" for part in parts)
 
 

@@ -22,6 +22,7 @@ from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.pictures.anatomies import Picture, background
 from cathsim_dmc.pictures.figure import DEVICES, draw_scene
 from cathsim_dmc.pictures.moment import Moment
+from cathsim_dmc.simulation.episodes import play_alone
 
 IMAGES = Path(__file__).parents[1] / "images"
 DPI, HEIGHT = 130, 3.2
@@ -38,12 +39,13 @@ def simmons() -> list[Moment]:
     )
     env.reset()
     seen = []
-    for push, steps in (((0.6, 0.6), 75), ((-0.6, 0.0), 25), ((-0.6, 0.0), 20)) + (
-        ((-0.6, 0.0), 20),
-        ((-0.6, 0.0), 45),
-    ):
+    # Both advance, then the wire alone is withdrawn.
+    for wire, catheter, steps in (
+        (0.6, 0.6, 75), (-0.6, 0.0, 25), (-0.6, 0.0, 20), (-0.6, 0.0, 20),
+        (-0.6, 0.0, 45),
+    ):  # fmt: skip
         for _ in range(steps):
-            env.step(np.array([push[0], 0.0, push[1], 0.0]))
+            env.step(np.array([wire, 0.0, catheter, 0.0]))
         back = np.diff(env.task.devices.insertion)[0]
         where = "ahead" if back < 0 else "behind"
         seen.append(_titled(env, f"wire {1e3 * abs(back):.0f} mm {where}"))
@@ -59,14 +61,11 @@ def cannulation(
     options = {"random": 0, "observation": player.observation, **options}
     env = suite.load("cathsim", task, options)
     act = policies.in_environment(player, env)
-    timestep, seen = env.reset(), []
-    while True:
+    seen = []
+    for _ in play_alone(env, act):
         wire, catheter = 1e3 * env.task.devices.insertion
         words = f"{env.physics.time():.0f} s: {wire:.0f} and {catheter:.0f} mm"
         seen.append(_titled(env, words))
-        if timestep.last():
-            break
-        timestep = env.step(act(timestep))
     print(f"{task}: {env.task.termination} after {len(seen) - 1} steps")
     env.close()
     return seen

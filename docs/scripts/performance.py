@@ -63,31 +63,30 @@ def depths(report):
         {key for row in table.values() for key in row},
         key=lambda name: float(re.match(r"\d+", name)[0]),
     )
-    lines = [f"| policy | {' | '.join(bins)} |", "|---" * (len(bins) + 1) + "|"]
-    for policy, row in table.items():
-        cells = [
-            f"{row[key]['real_time_factor']:.0f} ({row[key]['contacts']:.0f})"
-            if key in row
-            else "–"
-            for key in bins
-        ]
-        lines.append(f"| {policy} | {' | '.join(cells)} |")
-    return lines
+    shown = {
+        policy: {
+            key: f"{one['real_time_factor']:.0f} ({one['contacts']:.0f})"
+            for key, one in row.items()
+        }
+        for policy, row in table.items()
+    }
+    rows = ([policy, *(row.get(k, "–") for k in bins)] for policy, row in shown.items())
+    return figures.grid(["policy", *bins], rows)
 
 
 def stages(report):
     table = report["findings"]["microseconds_in_a_control_step"]
-    lines = [f"| | {' | '.join(table)} |", "|---" * (len(table) + 1) + "|"]
-    for stage in next(iter(table.values())):
-        cells = [f"{column[stage]:.0f}" for column in table.values()]
-        lines.append(f"| {stage} | {' | '.join(cells)} |")
-    return lines
+    rows = [
+        [stage, *(f"{column[stage]:.0f}" for column in table.values())]
+        for stage in next(iter(table.values()))
+    ]
+    return figures.grid(["", *table], rows)
 
 
 def batches(report):
     rates = report["findings"]["batched_steps_per_second"]
-    lines = ["| 16 simulations | control steps per second |", "|---|---|"]
-    return lines + [f"| {row} | {rates[key]:.0f} |" for row, key in BATCHED.items()]
+    rows = [(row, f"{rates[key]:.0f}") for row, key in BATCHED.items()]
+    return figures.grid(("16 simulations", "control steps per second"), rows)
 
 
 def main():

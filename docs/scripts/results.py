@@ -23,7 +23,8 @@ from cathsim_dmc import files
 from cathsim_dmc.analysis.intervals import success_interval
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-import results_figures as figures
+import results_figures as drawings
+from figures import grid
 from trainings import HERE, read_grid, read_result
 
 DOCS = Path(__file__).parents[1]
@@ -35,6 +36,8 @@ PUBLISHED_TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
 # Task of the comparison with and without demonstrations; algorithms that need them.
 DEMONSTRATED, TAUGHT = "type1_lcca", ("bc", "dagger")
 NAMES = {"internal": "Internal", "image": "Image", "sequential": "Sequential"}
+
+RESAMPLES = 10_000  # of the bootstrap over seeds
 
 BEFORE = """\
 † marks figures of trainings before version 0.3. The drive, the sheath, the armature,
@@ -101,10 +104,7 @@ the worst seed; episodes in their own arches have Wilson's 95 % interval.
 Forces are in mN, ± deviation over episodes: see [results](results.md#force).
 """
 
-HEADER = (
-    "| agent | seeds | success | worst | reward | steps | mean | contact | largest |",
-    "|---|---|---|---|---|---|---|---|---|",
-)
+HEADER = "agent seeds success worst reward steps mean contact largest".split()
 # Indices of the columns of `HEADER` on the page of results.
 FORCE_COLUMNS = (0, 5, 6, 7, 8)
 
@@ -224,36 +224,35 @@ def published_agents():
 
 def failures(table):
     """Section on failures: missed goals, and forces above the published ones."""
-    rows, louder = [], []
+    rows, louder, published = [], [], published_agents()
     for task, label, found in ((t, a, r) for t in table for a, r in table[t].items()):
         rate, count = rate_of(found)
         name = f"{marked(label, found)} ({len(found)})"
         if rate < 1:
             worst = percent(min(result.success for result in found))
             missed = f"{count - round(rate * count)} of {count}"
-            rows.append((rate, f"| `{task}` | {name} | {missed} | {worst} |"))
-        theirs = published_agents().get(label, {}).get(task)
-        ours = mean_of(found, "max_force")
-        if theirs and ours is not None and ours > theirs["max_force"][0]:
-            values = f"{1e3 * ours:.0f} / {1e3 * theirs['max_force'][0]:.0f}"
-            louder.append(f"| `{task}` | {name} | {values} |")
+            rows.append((rate, f"`{task}`", name, missed, worst))
+        theirs = published.get(label, {}).get(task)
+        ours = values_of(found, "max_force")
+        if theirs and ours and np.mean(ours) > theirs["max_force"][0]:
+            values = f"{1e3 * np.mean(ours):.0f} / {1e3 * theirs['max_force'][0]:.0f}"
+            louder.append((f"`{task}`", name, values))
     lines = [FAILURES]
     if rows:
         lines += [
             "Policies that miss the goal in some episodes, worst first (seeds):",
             "",
-            "| task | agent | missed | success of the worst seed |",
-            "|---|---|---|---|",
-            *(line for _, line in sorted(rows)),
+            *grid(
+                ("task", "agent", "missed", "success of the worst seed"),
+                (cells for _, *cells in sorted(rows)),
+            ),
             "",
         ]
     if louder:
         lines += [
             "Policies whose largest contact is above the published one, means:",
             "",
-            "| task | agent | mN, ours / published |",
-            "|---|---|---|",
-            *louder,
+            *grid(("task", "agent", "mN, ours / published"), louder),
             "",
         ]
     return "\n".join(lines)
@@ -263,7 +262,7 @@ def successes(table):
     """Section on success on the published tasks, with a row for each agent."""
     published, repeated = published_agents(), set()
     header = ["agent", "seeds", *(f"`{task}`" for task in PUBLISHED_TASKS), "mean"]
-    lines = [SUCCESS, f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
+    rows = []
     labels = dict.fromkeys(label for t in PUBLISHED_TASKS for label in table.get(t, {}))
     for label in labels:
         of_task = {
@@ -272,15 +271,15 @@ def successes(table):
         repeated.add(label)
         seeds = sorted({len(one) for one in of_task.values()})
         count = "–".join(map(str, (seeds[0], seeds[-1]) if len(seeds) > 1 else seeds))
-        lines.append(success_row(label, count, of_task, published.get(label, {})))
+        rows.append(success_row(label, count, of_task, published.get(label, {})))
     for name, theirs in published.items():
         if name not in repeated:
-            lines.append(success_row(name, "–", {}, theirs))
-    return "\n".join(lines) + "\n"
+            rows.append(success_row(name, "–", {}, theirs))
+    return "\n".join([SUCCESS, *grid(header, rows), ""])
 
 
 def success_row(label, count, of_task, theirs):
-    """A line of `successes`."""
+    """Cells of a row of `successes`."""
     cells = [label, count]
     for task in PUBLISHED_TASKS:
         found = of_task.get(task)
@@ -291,7 +290,7 @@ def success_row(label, count, of_task, theirs):
         rates = [[result.success for result in one] for one in of_task.values()]
         middle, (low, high) = mean_over_seeds(rates)
         mean = f"{percent(middle)} ({100 * low:.0f}–{100 * high:.0f})"
-    return f"| {' | '.join([*cells, mean])} |"
+    return [*cells, mean]
 
 
 def force_tables(table):
@@ -300,18 +299,13 @@ def force_tables(table):
     for task in PUBLISHED_TASKS:
         if task not in table:
             continue
-        lines += [f"### {task}", "", *(line_of(header) for header in HEADER)]
+        rows = [HEADER]
         for label, found in table[task].items():
             theirs = published.get(label, {}).get(task)
-            lines.append(line_of(row(marked(label, found), found, theirs)))
-        lines.append("")
+            rows.append(row(marked(label, found), found, theirs))
+        header, *rows = ([cells[n] for n in FORCE_COLUMNS] for cells in rows)
+        lines += [f"### {task}", "", *grid(header, rows), ""]
     return "\n".join(lines)
-
-
-def line_of(line):
-    """A line of a full table with the columns of the page of results only."""
-    cells = line.strip("|").split("|")
-    return f"|{'|'.join(cells[place] for place in FORCE_COLUMNS)}|"
 
 
 def full_tables(table, cells):
@@ -319,24 +313,23 @@ def full_tables(table, cells):
     published, lines = published_agents(), []
     planned = in_grid(cells)
     for task in dict.fromkeys((*PUBLISHED_TASKS, *table)):
-        lines += [f"## {task}", "", *HEADER]
-        repeated = set()
+        rows, repeated = [], set()
         for label, found in table.get(task, {}).items():
             name = published_label(found[0])
             repeated.add(name)
             theirs = published.get(name, {}).get(task)
-            lines.append(row(marked(label, found), found, theirs))
+            rows.append(row(marked(label, found), found, theirs))
         for name, tasks in published.items():
             if name not in repeated and task in tasks:
                 why = "missing" if (name, task) in planned else "not trained"
-                lines.append(row(f"{name} ({why})", [], tasks[task]))
-        lines.append("")
+                rows.append(row(f"{name} ({why})", [], tasks[task]))
+        lines += [f"## {task}", "", *grid(HEADER, rows), ""]
     return "\n".join(lines)
 
 
 def other_tasks(table):
     """Section with a table of the unpublished tasks, with results of the expert."""
-    experts, lines = expert_rates(), []
+    experts, rows = expert_rates(), []
     for task, agents_ in table.items():
         if task in PUBLISHED_TASKS:
             continue
@@ -344,22 +337,12 @@ def other_tasks(table):
             _, success, _, _, steps, mean, _, largest = figures_of(found)
             expert = percent(experts[task]) if task in experts else "–"
             agent = marked(label, found)
-            cells = [f"`{task}`", agent, success, expert, steps, mean, largest]
-            lines.append(f"| {' | '.join(cells)} |")
-    if not lines:
+            rows.append([f"`{task}`", agent, success, expert, steps, mean, largest])
+    if not rows:
         return ""
-    return "\n".join(
-        [
-            "## Further tasks",
-            "",
-            "Forces as above, in mN.",
-            "",
-            "| task | agent | success (95 %) | expert | steps | mean | largest |",
-            "|---|---|---|---|---|---|---|",
-            *lines,
-            "",
-        ]
-    )
+    header = "task", "agent", "success (95 %)", "expert", "steps", "mean", "largest"
+    lines = ["## Further tasks", "", "Forces as above, in mN.", ""]
+    return "\n".join([*lines, *grid(header, rows), ""])
 
 
 def expert_rates():
@@ -380,12 +363,12 @@ def expert_rates():
 
 
 def row(label, found, theirs):
-    """A line of a table: our results and the published ones of the same agent."""
+    """Cells of a row: our results and the published ones of the same agent."""
     cells = [label, *(figures_of(found) if found else ["–"] * 8)]
     if theirs is not None:
         for place, text in published_figures(theirs).items():
             cells[place] += f" / {text}"
-    return f"| {' | '.join(cells)} |"
+    return cells
 
 
 def marked(text, found):
@@ -436,12 +419,6 @@ def values_of(found, name):
     return [v for r in found for v in r.evaluation["episodes"][name] if v is not None]
 
 
-def mean_of(found, name):
-    """Mean of a quantity over the episodes of all seeds; None without values."""
-    values = values_of(found, name)
-    return np.mean(values) if values else None
-
-
 def spread(found, name, scale, digits):
     """Text of mean ± deviation of a quantity over the episodes of all seeds."""
     values = values_of(found, name)
@@ -461,7 +438,7 @@ def clock(seconds):
     return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
 
 
-def mean_over_seeds(scores, resamples=10_000, seed=0):
+def mean_over_seeds(scores):
     """Mean over the runs of all tasks, with its 95 % interval over seeds.
 
     The runs of each task are resampled separately (stratified bootstrap, percentile
@@ -471,8 +448,6 @@ def mean_over_seeds(scores, resamples=10_000, seed=0):
 
     Args:
         scores: Scores of the runs (seeds) of each task; their numbers may differ.
-        resamples: Number of bootstrap samples.
-        seed: Seed of the bootstrap.
 
     Returns:
         The mean, with equal weights of the tasks, and its interval.
@@ -483,9 +458,9 @@ def mean_over_seeds(scores, resamples=10_000, seed=0):
     tasks = [np.asarray(runs, dtype=np.float64) for runs in scores]
     if not tasks or min(map(len, tasks)) < 2:
         raise ValueError(f"every task needs two runs or more; given are {scores!r}")
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     drawn = [
-        runs[random.integers(len(runs), size=(resamples, len(runs)))] for runs in tasks
+        runs[random.integers(len(runs), size=(RESAMPLES, len(runs)))] for runs in tasks
     ]
     means = np.mean([runs.mean(axis=1) for runs in drawn], axis=0)
     low, high = np.percentile(means, (2.5, 97.5))
@@ -501,9 +476,9 @@ def cost(table):
         "first had 90 % success. Times are wall times of shared machines; the files in "
         "`results/` have those of each seed with machine, load and commit.",
         "",
-        "| task | agent | seeds | frames | time | frames/s | frames to 90 % |",
-        "|---|---|---|---|---|---|---|",
     ]
+    header = "task", "agent", "seeds", "frames", "time", "frames/s", "frames to 90 %"
+    rows = []
     for task, agents_ in table.items():
         for label, found in agents_.items():
             trainings = [result.values["training"] for result in found]
@@ -517,8 +492,8 @@ def cost(table):
                 f"{np.mean([result.frames_per_second for result in found]):.0f}",
                 f"{np.mean(solved):,.0f}" if len(solved) == len(found) else "–",
             ]
-            lines.append(f"| {' | '.join(columns)} |")
-    return "\n".join(lines) + "\n"
+            rows.append(columns)
+    return "\n".join([*lines, *grid(header, rows), ""])
 
 
 def drawn(table, directory):
@@ -531,7 +506,7 @@ def drawn(table, directory):
             if task in theirs:
                 of_task[label] = theirs[task]["max_force"]
     images = directory / "images"
-    return figures.drawn(table, reference, demonstrated(table), images)
+    return drawings.drawn(table, reference, demonstrated(table), images)
 
 
 def demonstrated(table):

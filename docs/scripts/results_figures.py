@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 from judgement import map_from_values
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
@@ -265,7 +264,6 @@ def _panels(count, columns=2, width=PANEL[0], height=PANEL[1]):
     columns = min(columns, count)
     rows = math.ceil(count / columns)
     figure = Figure(figsize=(columns * width, rows * height), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for unused in panels[count:]:
         unused.remove()

@@ -13,7 +13,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from figures import origin, put, since
+from figures import grid, origin, put, since
 
 PAGE = Path(__file__).parents[1] / "robots.md"
 CATHSIM = [sys.executable, "-m", "cathsim_dmc.cli"]
@@ -67,9 +67,7 @@ def worst(episodes: list[dict], name: str) -> str:
 
 def main() -> None:
     rows = [measure(*case) for case in CASES.items()]
-    lines = ["| " + " | ".join(row) + " |" for row in (HEAD, *rows)]
-    lines.insert(1, "|---" * len(HEAD) + "|")
-    text = [since(origin("python docs/scripts/robots.py")), "", *lines]
+    text = [since(origin("python docs/scripts/robots.py")), "", *grid(HEAD, rows)]
     put(PAGE, measured=text)
     print(*text, sep="\n")
 

@@ -10,8 +10,9 @@ the same cells; without files, the tables are made from that file.
 
 import argparse
 import json
-import re
 from pathlib import Path
+
+from figures import grid, put
 
 from cathsim_dmc import files
 from cathsim_dmc.analysis.intervals import success_interval
@@ -19,7 +20,7 @@ from cathsim_dmc.analysis.intervals import success_interval
 DOCS = Path(__file__).parents[1]
 DATA = DOCS / "data" / "robust.jsonl"
 PAGES = DOCS / "robustness.md", DOCS / "robustness_pair.md"
-_FIGURES = "| safe, 0.5 N | steps | mean force, mN | largest sum, N |"
+_FIGURES = "safe, 0.5 N", "steps", "mean force, mN", "largest sum, N"
 _KEYS = ("policy", "part", "goal", "access", "anatomy", "change", "arch", "devices")
 _KEYS += ("radius",)
 _HELD_OUT = {"arches": "held-out arches", "neck": "held-out arches with a neck"}
@@ -47,11 +48,12 @@ def figures(rows):
         name: sum(row[name] * row["episodes"] for row in rows) / count
         for name in ("steps", "mean_force")
     }
-    return (
-        f"{100 * sum(row['safe'][0] for row in rows) / count:.0f} "
-        f"| {mean['steps']:.0f} | {1e3 * mean['mean_force']:.1f} "
-        f"| {max(row['largest_sum'] for row in rows):.2f} |"
-    )
+    return [
+        f"{100 * sum(row['safe'][0] for row in rows) / count:.0f}",
+        f"{mean['steps']:.0f}",
+        f"{1e3 * mean['mean_force']:.1f}",
+        f"{max(row['largest_sum'] for row in rows):.2f}",
+    ]
 
 
 def pooled(rows):
@@ -62,34 +64,28 @@ def pooled(rows):
 
 def arches(rows):
     """Table of held-out arches with a row for each policy, branch and access."""
-    lines = [
-        f"| policy | branch | access | success, % (95 %), arches {_FIGURES}",
-        "|---" * 8 + "|",
-    ]
+    header = ["policy", "branch", "access", "success, % (95 %), arches", *_FIGURES]
+    lines = []
     for policy in sorted({row["policy"] for row in rows}):
         own = [row for row in rows if row["policy"] == policy]
-        for row in own:
-            lines.append(
-                f"| `{policy}` | {row['goal'].upper()} | {row['access']} "
-                f"| {pooled([row])} | {figures([row])}"
-            )
-        lines.append(f"| `{policy}` | all | both | {pooled(own)} | {figures(own)}")
-    return lines
+        groups = [(row["goal"].upper(), row["access"], [row]) for row in own]
+        for goal, access, group in [*groups, ("all", "both", own)]:
+            cells = [f"`{policy}`", goal, access, pooled(group)]
+            lines.append([*cells, *figures(group)])
+    return grid(header, lines)
 
 
 def shares(rows, column, field, shown):
     """Table of success by the groups of `field` of the rows, for each policy."""
-    lines = [f"| policy | {column} | success, % (95 %), episodes |", "|---|---|---|"]
+    lines = []
     for policy in sorted({row["policy"] for row in rows}):
         counts = {}
         for row in (row for row in rows if row["policy"] == policy):
             for name, (good, episodes) in row.get(field, {}).items():
                 old = counts.get(name, (0, 0))
                 counts[name] = old[0] + good, old[1] + episodes
-        lines += [
-            f"| `{policy}` | {shown(n)} | {rate(*c)} |" for n, c in counts.items()
-        ]
-    return lines
+        lines += [(f"`{policy}`", shown(n), rate(*c)) for n, c in counts.items()]
+    return grid(("policy", column, "success, % (95 %), episodes"), lines)
 
 
 def devices(rows):
@@ -106,24 +102,19 @@ def kinds(rows):
 
 def anatomies(rows):
     """Table of phantoms and scans, with a row for each policy and anatomy."""
-    lines = [
-        f"| policy | anatomy | branches × accesses | success, % (95 %), episodes "
-        f"{_FIGURES}",
-        "|---" * 8 + "|",
-    ]
+    header = ["policy", "anatomy", "branches × accesses", "success, % (95 %), episodes"]
+    lines = []
     for policy, name in dict.fromkeys((row["policy"], row["anatomy"]) for row in rows):
         own = [r for r in rows if (r["policy"], r["anatomy"]) == (policy, name)]
-        lines.append(
-            f"| `{policy}` | {name} | {len(own)} | {pooled(own)} | {figures(own)}"
-        )
-    return lines
+        cells = [f"`{policy}`", name, len(own), pooled(own)]
+        lines.append([*cells, *figures(own)])
+    return grid([*header, *_FIGURES], lines)
 
 
 def weakest(rows):
     """Table of cells of the phantoms with success below 90 %."""
     cells = {(r["policy"], r["anatomy"], r["goal"], r["access"]): r for r in rows}
-    lines = ["| policy | anatomy | branch | access | success | `expert` |"]
-    lines.append("|---" * 6 + "|")
+    lines = []
     for (policy, *cell), row in cells.items():
         if row["success"] < 0.9 * row["episodes"]:
             beside = cells.get(("expert", *cell))
@@ -132,42 +123,36 @@ def weakest(rows):
                 for one in (row, beside)
             ]
             place = cell[0], cell[1].upper(), cell[2] or "inlet"
-            lines.append(f"| `{policy}` | {' | '.join((*place, *counts))} |")
-    return lines if len(lines) > 2 else ["None."]
+            lines.append([f"`{policy}`", *place, *counts])
+    header = "policy", "anatomy", "branch", "access", "success", "`expert`"
+    return grid(header, lines) if lines else ["None."]
 
 
 def pairs(rows):
     """Table of a guidewire in a catheter, with a row for each cell, worst first."""
-    lines = [
-        f"| policy | anatomy | branch | success, % (95 %), episodes {_FIGURES}",
-        "|---" * 8 + "|",
-    ]
+    header = ["policy", "anatomy", "branch", "success, % (95 %), episodes", *_FIGURES]
+    lines = []
     for row in sorted(
         rows, key=lambda r: (r["success"] / r["episodes"], r["safe"][0] / r["episodes"])
     ):
         place = row.get("anatomy") or _HELD_OUT[row["part"]]
-        lines.append(
-            f"| `{row['policy']}` | {place} | {row['goal'].upper()} "
-            f"| {pooled([row])} | {figures([row])}"
-        )
-    return lines
+        cells = [f"`{row['policy']}`", place, row["goal"].upper(), pooled([row])]
+        lines.append([*cells, *figures([row])])
+    return grid(header, lines)
 
 
 def changes(rows):
     """Table of the success of each policy with one change at a time."""
     names = list(dict.fromkeys(row["policy"] for row in rows))
-    lines = [
-        f"| change | {' | '.join(f'`{name}`' for name in names)} |",
-        "|---" * (1 + len(names)) + "|",
-    ]
+    lines = []
     for change in dict.fromkeys(row["change"] for row in rows):
         own = {row["policy"]: row for row in rows if row["change"] == change}
         cells = [
             f"{own[n]['success']} of {own[n]['episodes']}" if n in own else "–"
             for n in names
         ]
-        lines.append(f"| {change.replace('_', ' ')} | {' | '.join(cells)} |")
-    return lines
+        lines.append([change.replace("_", " "), *cells])
+    return grid(["change", *(f"`{name}`" for name in names)], lines)
 
 
 def narrow(rows):
@@ -219,11 +204,8 @@ def main():
     found["pair"] = pairs([row for row in coaxial if row["part"] in tabled])
     for page in PAGES:
         text = page.read_text()
-        for name, lines in found.items():
-            block = "\n".join([f"<!-- {name} -->", *lines, f"<!-- end of {name} -->"])
-            pattern = f"<!-- {name} -->.*<!-- end of {name} -->"
-            text = re.sub(pattern, lambda _, b=block: b, text, flags=re.S)
-        files.write_text(page, text)
+        own = {name: x for name, x in found.items() if f"<!-- {name} -->" in text}
+        put(page, **own)
 
 
 if __name__ == "__main__":

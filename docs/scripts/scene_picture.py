@@ -30,12 +30,12 @@ def draw(physics, target, distance, azimuth, elevation, width, fovy=30.0):
 
 def main():
     from cathsim_dmc import policies, suite
+    from cathsim_dmc.simulation.episodes import play_alone
 
     env = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 3})
     act = policies.in_environment(policies.make_policy("expert"), env)
-    timestep = env.reset()
-    while not timestep.last():
-        timestep = env.step(act(timestep))
+    for _ in play_alone(env, act):
+        pass
     physics = env.physics
     physics.model.vis.global_.offwidth = 1600
     physics.model.vis.global_.offheight = HEIGHT

@@ -12,13 +12,13 @@ import tomllib
 from importlib import metadata
 from pathlib import Path
 
-from figures import put
+from figures import grid, put
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
 OWN = "cathsim-dmc"
-HEAD = "| extra | brings | packages | MB | largest |", "|---" * 5 + "|"
+HEAD = "extra", "brings", "packages", "MB", "largest"
 
 
 def needed(requirements: list[str], found: dict[str, set[str]]) -> dict[str, set[str]]:
@@ -57,7 +57,7 @@ def size(name: str) -> float | None:
     return sum(one.stat().st_size for one in there if one.is_file()) / 1e6
 
 
-def row(label: str, brings: str, names: set[str]) -> str:
+def row(label: str, brings: str, names: set[str]) -> list[str]:
     """A row of the table for an extra and the packages that it adds."""
     sizes = {name: size(name) for name in names}
     known = {name: one for name, one in sizes.items() if one is not None}
@@ -66,14 +66,14 @@ def row(label: str, brings: str, names: set[str]) -> str:
     words = [f"{name} {known[name]:.0f}" for name in largest]
     words += [f"not measured: {', '.join(missing)}"] if missing else []
     total = f"{sum(known.values()):.0f}"
-    return f"| {label} | {brings} | {len(names)} | {total} | {', '.join(words)} |"
+    return [label, brings, str(len(names)), total, ", ".join(words)]
 
 
 def main() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     base = set(needed(project["dependencies"], {}))
-    lines = [*HEAD, row("none", "the base", base)]
+    rows = [row("none", "the base", base)]
     for name, texts in extras.items():
         own = [x for x in texts if not x.startswith(OWN)]
         inner = [x[len(OWN) + 1 : -1] for x in texts if x.startswith(OWN)]
@@ -81,7 +81,8 @@ def main() -> None:
         brought = [Requirement(x).name for x in texts if not x.startswith(OWN)]
         brings = ", ".join([*(f"`{x}`" for x in inner), *brought])
         more = set(needed(own, {})) - base
-        lines.append(row(f"`{name}`", brings, more))
+        rows.append(row(f"`{name}`", brings, more))
+    lines = grid(HEAD, rows)
     put(ROOT / "docs" / "install.md", sizes=lines)
     print(*lines, sep="\n")
 

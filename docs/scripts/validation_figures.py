@@ -1,7 +1,6 @@
 """Figures of the validation, one for each report; `validation.py` draws them."""
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cathsim_dmc import style
@@ -20,7 +19,6 @@ def draw(name, report, path):
 
 def canvas(rows, columns):
     figure = Figure(figsize=(4.6 * columns, 3.6 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False)
     for ax in axes.ravel():
         style.tidy(ax)

@@ -133,25 +133,23 @@ def judged(policy: str, task: str, case: str, episodes: int) -> dict:
         "case": case,
         "episodes": episodes,
         "successes": result.successes,
-        "safe": round((result.safe_success(SAFE) or 0.0) * episodes),
+        "safe": round(result.safe_success(SAFE) * episodes),
         "force": result.mean_sd("forces.largest_sum")[0],
         "steps": result.mean_sd("length")[0],
         "commit": figures.origin("")["commit"],
     }
 
 
-def table(data: dict) -> str:
-    """Table of all policies in all vessels, as Markdown."""
+def table(data: dict) -> list[str]:
+    """Table of all policies in all vessels, as lines of Markdown."""
     known = {(row["policy"], row["task"], row["case"]): row for row in data["policies"]}
-    rows = ["| policy | task | " + " | ".join(CASES) + " |"]
-    rows.append("|---" * (2 + len(CASES)) + "|")
+    rows = []
     for policy, tasks in TASKS.items():
         for task in tasks:
             found = [known.get((policy, task, case)) for case in CASES]
             if any(found):
-                cells = " | ".join(map(_cell, found))
-                rows.append(f"| `{policy}` | `{task}` | {cells} |")
-    return "\n".join(rows)
+                rows.append([f"`{policy}`", f"`{task}`", *map(_cell, found)])
+    return figures.grid(["policy", "task", *CASES], rows)
 
 
 def _cell(row: dict | None) -> str:
@@ -207,11 +205,11 @@ def main():
     draw(data)
     blocks: dict[str, str | list[str]] = {"policies": table(data)}
     if "cost" in data:
-        lines = ["| | random | push |", "|---|---|---|"]
-        for case, row in data["cost"].items():
-            cells = f"{row['random']:.2f} | {row['push']:.2f}"
-            lines.append(f"| {case} | {cells} |")
-        blocks["cost"] = lines
+        rows = [
+            (case, f"{row['random']:.2f}", f"{row['push']:.2f}")
+            for case, row in data["cost"].items()
+        ]
+        blocks["cost"] = figures.grid(("", "random", "push"), rows)
     if "soak" in data:
         blocks["soak"] = (
             "{episodes} episodes of {steps} steps: {warnings} warnings of MuJoCo, "
@@ -223,15 +221,14 @@ def main():
 def _keep(row: dict | None = None, **parts: dict) -> None:
     """Writes a row, in place of that of the same policy, task and vessel, or parts."""
     data: dict = json.loads(DATA.read_text())
-    for name, part in parts.items():
-        data[name] = {**part}
+    data |= parts
     if row is not None:
-        same = [
+        others = [
             one
             for one in data["policies"]
             if any(one[key] != row[key] for key in ("policy", "task", "case"))
         ]
-        data["policies"] = [*same, row]
+        data["policies"] = [*others, row]
     DATA.write_text(json.dumps(data, indent=1) + "\n")
 
 
