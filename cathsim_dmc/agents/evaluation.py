@@ -299,7 +299,7 @@ def _play_on_cluster(
     return outcomes
 
 
-def _play_apart(job: tuple[_Group, bool]) -> tuple[list[EpisodeOutcome], "ContactLog"]:
+def _play_apart(job: tuple[_Group, bool]) -> tuple[list[EpisodeOutcome], ContactLog]:
     """Plays a group; returns its episodes, and their contacts if these are wanted."""
     (group, wanted), contacts = job, ContactLog()
     torch.set_num_threads(group.torch_threads)

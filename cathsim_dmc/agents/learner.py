@@ -18,21 +18,22 @@ from cathsim_dmc.agents.networks import NetworkShapes, make_normalisers, make_po
 class Learner(abc.ABC):
     """An algorithm with its networks.
 
-    metrics: Names of the figures that `update` returns, columns of metrics.csv.
-    remote: Whether the policy needs nothing but observations, so that it can act in
-        another process.
-    imitates: Whether an update fits the whole policy to its targets. Otherwise a policy
-        that starts from another one keeps that one's observation statistics, the only
-        ones that fit its weights.
-    random_frames: Number of frames to collect with uniformly random actions first.
-    device: Torch device of the networks.
-    shapes: Sizes of the policy's observation and of the action.
-    network: The policy that is learnt: raw observation in, sampled action out.
-    policy: The policy to collect with; `network`, or one around it.
-    critic_normalisers: Normalisers of the observations that only the critic reads.
-    optimiser: Adam with the parameters of all networks, made by the subclass.
-    replay: `ReplayMemory` of the algorithm, if any; made by the subclass.
-    gradient_steps: Number of gradient steps so far.
+    Attributes:
+        metrics: Names of the figures that `update` returns, columns of metrics.csv.
+        remote: Whether the policy needs nothing but observations, so that it can act in
+            another process.
+        imitates: Whether an update fits the whole policy to its targets. Otherwise a
+            policy that starts from another one keeps that one's observation statistics,
+            the only ones that fit its weights.
+        random_frames: Number of frames to collect with uniformly random actions first.
+        device: Torch device of the networks.
+        shapes: Sizes of the policy's observation and of the action.
+        network: The policy that is learnt: raw observation in, sampled action out.
+        policy: The policy to collect with; `network`, or one around it.
+        critic_normalisers: Normalisers of the observations that only the critic reads.
+        optimiser: Adam with the parameters of all networks, made by the subclass.
+        replay: `ReplayMemory` of the algorithm, if any; made by the subclass.
+        gradient_steps: Number of gradient steps so far.
     """
 
     metrics: ClassVar[tuple[str, ...]]

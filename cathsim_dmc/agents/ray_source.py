@@ -181,7 +181,9 @@ class RaySource:
         return functools.partial(
             _make_worker_env,
             self._make_env,
-            (int(drawn[number]), config.torch_threads, modules),
+            int(drawn[number]),
+            config.torch_threads,
+            modules,
             config.task,
             observation=config.collected_observation,
             num_envs=share,
@@ -193,17 +195,18 @@ class RaySource:
 
 def _make_worker_env(
     make_env: Callable[..., EnvBase],
-    own: tuple[int, int, list[str]],
-    *args: Any,
-    **kw: Any,
+    torch_seed: int,
+    torch_threads: int,
+    modules: list[str],
+    task: str,
+    **options: Any,
 ) -> EnvBase:
     """Make the environment of a collector, in its process."""
-    seed, threads, modules = own
     for name in modules:
         importlib.import_module(name)
-    torch.manual_seed(seed)
-    torch.set_num_threads(threads)
-    return make_env(*args, **kw)
+    torch.manual_seed(torch_seed)
+    torch.set_num_threads(torch_threads)
+    return make_env(task, **options)
 
 
 def _placed(processors: int) -> dict[str, Any]:

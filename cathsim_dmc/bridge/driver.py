@@ -234,7 +234,7 @@ class Driver:
                 if options.overrun == "stop":
                     return self._ended(run, "overrun")
 
-    def _newest(self, message: dict[str, Any], run: "_Run") -> dict[str, Any]:
+    def _newest(self, message: dict[str, Any], run: _Run) -> dict[str, Any]:
         """Return the newest message received, or the one that ends the episode."""
         for _ in range(MOST_FRAMES):
             final = message["kind"] != "state" or message["end"] is not None
@@ -248,7 +248,7 @@ class Driver:
         raise BridgeError("flood", f"over {MOST_FRAMES} states at once")
 
     def _ended(
-        self, run: "_Run", end: str, told: bool = False, reason: str | None = None
+        self, run: _Run, end: str, told: bool = False, reason: str | None = None
     ) -> Driven:
         if not told:
             self._stop(end)

@@ -120,7 +120,13 @@ def evaluate(
         if written:
             files.write_json(written[0], values)
             contacts.draw(results["policy"], written[1])
-    _print(results, values, report, json)
+    if json:
+        # Figures of a policy have no bounds, so there are no checks.
+        print_json({"checks": [], **values})
+        return 0
+    print_results(list(results.values()))
+    if report:
+        print_episodes(results["policy"])
     return 0
 
 
@@ -143,21 +149,6 @@ def _observer(
             bar.update()
 
         yield observe
-
-
-def _print(
-    results: Mapping[str, EvaluationResult],
-    values: Mapping[str, Any],
-    report: bool,
-    json: bool,
-) -> None:
-    if json:
-        # Figures of a policy have no bounds, so there are no checks.
-        print_json({"checks": [], **values})
-        return
-    print_results(list(results.values()))
-    if report:
-        print_episodes(results["policy"])
 
 
 def submit(

@@ -23,6 +23,7 @@ from cathsim_dmc.cli.options import (
 )
 from cathsim_dmc.laws.capsule import nearest_places
 
+_OWN = "cathsim-dmc"
 # A context alone does not fail where there is no display.
 _OPENGL = (
     "import mujoco as m; "
@@ -45,7 +46,7 @@ def doctor(json: Json = False) -> int:
     advice = "" if threads == "1" else "set it to 1 where several processes run"
     findings = [
         Finding("Python", platform.python_version(), sys.version_info >= (3, 11)),
-        *_versions("cathsim-dmc"),
+        *_versions(),
         Finding("cores", str(os.cpu_count())),
         Finding("OMP_NUM_THREADS", threads, note=advice),
         _kernels(),
@@ -59,13 +60,13 @@ def doctor(json: Json = False) -> int:
     return 0 if all(one.passed for one in findings) else CHECK_FAILED
 
 
-def _versions(name: str) -> list[Finding]:
+def _versions() -> list[Finding]:
     try:
-        required, own = metadata.requires(name) or (), metadata.version(name)
+        required, own = metadata.requires(_OWN) or (), metadata.version(_OWN)
     except metadata.PackageNotFoundError:
         advice = "in its checkout: pip install -c constraints.txt -e ."
-        return [Finding(name, "not installed", False, advice)]
-    found = [Finding(name, own)]
+        return [Finding(_OWN, "not installed", False, advice)]
+    found = [Finding(_OWN, own)]
     for one in map(Requirement, required):
         if one.marker is not None and not one.marker.evaluate({"extra": ""}):
             continue
