@@ -55,6 +55,9 @@ FORCE_MAX = 10.0  # N
 # their lines.
 BIN, BINS = 1e-6, 10_000  # m; the last bin holds all larger ones
 
+# Quantities whose largest value is kept with its control step.
+STEPPED = ("penetration", "force", "excess", "tip_step")
+
 # Most control steps between two changes of the action.
 LONGEST_HOLD = 100
 
@@ -176,9 +179,8 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
     simulation.reset()
     warnings = np.zeros(size, dtype=int)
     before = simulation.batch.warning.reshape(size, -1).copy()
-    excess, force, total = (Peak.none(size) for _ in range(3))
-    penetration, overflow = Peak.none(size), Peak.none(size)
-    tip_step, tip = Peak.none(size), simulation.rollout.readings.head
+    peaks = {name: Peak.none(size) for name in (*STEPPED, "force_sum", "contacts")}
+    tip = simulation.rollout.readings.head
     counts = np.zeros((size, BINS), dtype=np.int64)
     force_sum = np.zeros(size)
     errors = np.full(size, -1)
@@ -195,14 +197,17 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
         touching = contacts.present.any(-1)
         bins = np.clip((deepest / BIN).astype(int), 0, BINS - 1)
         np.add.at(counts, (np.nonzero(touching)[0], bins[touching]), 1)
-        penetration.update(deepest.max(-1), step)
-        force.update(contacts.magnitude.max((-1, -2)), step)
-        total.update(contacts.magnitude.sum(-1).max(-1), step)
-        overflow.update(contacts.found.max(-1), step)
-        moved = np.linalg.norm(result.readings.head - tip, axis=-1)
-        tip_step.update(moved, step)
+        found = {
+            "penetration": deepest.max(-1),
+            "force": contacts.magnitude.max((-1, -2)),
+            "excess": containment.largest_excess(result.readings.centreline),
+            "tip_step": np.linalg.norm(result.readings.head - tip, axis=-1),
+            "force_sum": contacts.magnitude.sum(-1).max(-1),
+            "contacts": contacts.found.max(-1),
+        }
+        for name, value in found.items():
+            peaks[name].update(value, step)
         tip = result.readings.head
-        excess.update(containment.largest_excess(result.readings.centreline), step)
         force_sum += contacts.magnitude.sum(-1).mean(-1)
         insertion = np.maximum(insertion, result.readings.insertion)
     radius = containment.device_radius
@@ -212,18 +217,12 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
             "steps": steps,
             "warnings": int(warnings[index]),
             "physics_error_step": int(errors[index]),
-            "escaped": bool(excess.value[index] > 2 * radius),
-            "excess_max": float(excess.value[index]),
-            "excess_step": int(excess.step[index]),
-            "penetration_max": float(penetration.value[index]),
-            "penetration_step": int(penetration.step[index]),
-            "tip_step_max": float(tip_step.value[index]),
-            "tip_step_step": int(tip_step.step[index]),
-            "force_max": float(force.value[index]),
-            "force_step": int(force.step[index]),
-            "force_sum_max": float(total.value[index]),
+            "escaped": bool(peaks["excess"].value[index] > 2 * radius),
+            **{f"{name}_max": float(peaks[name].value[index]) for name in STEPPED},
+            **{f"{name}_step": int(peaks[name].step[index]) for name in STEPPED},
+            "force_sum_max": float(peaks["force_sum"].value[index]),
             "force_sum_mean": float(force_sum[index] / steps),
-            "contacts_max": int(overflow.value[index]),
+            "contacts_max": int(peaks["contacts"].value[index]),
             "insertion_max": float(insertion[index]),
             "penetration_histogram": {
                 int(bin_): int(counts[index, bin_])
@@ -324,9 +323,7 @@ def report(rows: list[dict]) -> dict:
     return {
         "checks": [dataclasses.asdict(check) for check in checks],
         "total": total,
-        "worst": {
-            key: worst(key) for key in ("penetration", "force", "excess", "tip_step")
-        },
+        "worst": {key: worst(key) for key in STEPPED},
         "groups": groups,
     }
 

@@ -296,11 +296,13 @@ def drawn(table, reference, compared, images):
     main = {task: table[task] for task in reference if task in table}
     further = {task: one for task, one in table.items() if task not in main}
     shown_main, shown_further = ["## Figures\n"], ["## Figures\n"]
-    for name, tasks in (("", main), ("_further", further)):
+    diamonds = "; whiskers at 1.5 interquartile ranges. Diamonds are the published mean"
+    for parts, which, name, tasks, more in (
+        (shown_main, "published", "", main, f"{diamonds} ± deviation"),
+        (shown_further, "further", "_further", further, ""),
+    ):
         if not tasks:
             continue
-        parts = shown_further if name else shown_main
-        which = "further" if name else "published"
         path = learning_curves(tasks, looks, images / f"results_curves{name}.png")
         parts += shown(
             path,
@@ -313,11 +315,7 @@ def drawn(table, reference, compared, images):
         parts += shown(
             path,
             f"Largest contact force of every evaluation episode on the {which} tasks, "
-            "episodes of all seeds together; whiskers at 1.5 interquartile ranges. "
-            "Diamonds are the published mean ± deviation."
-            if not name
-            else "Largest contact force of every evaluation episode on the further "
-            "tasks, episodes of all seeds together.",
+            f"episodes of all seeds together{more}.",
         )
     if compared:
         task = next(iter(compared.values()))[0].evaluation["task"]
