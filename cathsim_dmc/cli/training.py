@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import json
 import shlex
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,7 +19,7 @@ from cathsim_dmc import files
 from cathsim_dmc.agents.checkpoint import checkpoints_in
 from cathsim_dmc.agents.learners import LEARNERS, config_from_dict
 from cathsim_dmc.agents.training import CONFIG_FILE, no_run
-from cathsim_dmc.cli.options import INTERRUPTED, Modules
+from cathsim_dmc.cli.options import INTERRUPTED, Modules, say
 from cathsim_dmc.cli.task_options import field_helps, task_kind
 
 # Shorter names of settings.
@@ -79,7 +78,6 @@ def command(arguments: list[str]) -> Any:
         The defaults of the settings are those of the algorithm and preset chosen; a run
         that is resumed keeps its own.
         """
-        run = options.run
         chosen = vars(options.settings)
         chosen = {**chosen, "modules": [*dict.fromkeys(chosen["modules"])] or None}
         config = settings.replace(
@@ -87,33 +85,36 @@ def command(arguments: list[str]) -> Any:
             **chosen,
             task_kwargs={**settings.task_kwargs, **options.options.given},
         )
-        done = [int(each.name) for each in checkpoints_in(run.out)][-1:]
-        how: Any = {"resume": run.resume, "without_replay": run.without_replay}
-        if run.films:
-            how["on_checkpoint"] = _filming(run.out / "films", f".{run.films}")
-        result = agents.train(config, run.out, progress=not run.quiet, **how)
-        if result.interrupted:
-            again = ["cathsim", "train", config.task, "--out", str(run.out), "--resume"]
-            for module in config.modules or ():
-                again += ["--import", module]
-            print(
-                f"interrupted after {result.frames} of {config.total_frames} frames, "
-                f"which are saved; go on with: {shlex.join(again)}",
-                file=sys.stderr,
-            )
-            return INTERRUPTED
-        if done and done[0] >= config.total_frames:
-            print(
-                f"{done[0]} frames are done, and {config.total_frames} are asked for: "
-                "nothing is left to train (--frames)",
-                file=sys.stderr,
-            )
-        print(f"{result.frames} frames in {result.seconds:.0f} s: {result.checkpoint}")
-        return 0
+        return _train(config, options.run)
 
     # The class of the options is made here, so no annotation can name it.
     train.__annotations__["options"] = Annotated[options, conf.arg(name="")]
     return train
+
+
+def _train(config: agents.TrainingConfig, run: _Run) -> int:
+    """Trains an agent, says what is left to do, and returns the exit code."""
+    done = [int(each.name) for each in checkpoints_in(run.out)][-1:]
+    how: Any = {"resume": run.resume, "without_replay": run.without_replay}
+    if run.films:
+        how["on_checkpoint"] = _filming(run.out / "films", f".{run.films}")
+    result = agents.train(config, run.out, progress=not run.quiet, **how)
+    if result.interrupted:
+        again = ["cathsim", "train", config.task, "--out", str(run.out), "--resume"]
+        for module in config.modules or ():
+            again += ["--import", module]
+        say(
+            f"interrupted after {result.frames} of {config.total_frames} frames, "
+            f"which are saved; go on with: {shlex.join(again)}"
+        )
+        return INTERRUPTED
+    if done and done[0] >= config.total_frames:
+        say(
+            f"{done[0]} frames are done, and {config.total_frames} are asked for: "
+            "nothing is left to train (--frames)"
+        )
+    print(f"{result.frames} frames in {result.seconds:.0f} s: {result.checkpoint}")
+    return 0
 
 
 def _filming(folder: Path, suffix: str) -> Callable[[Path], Any]:

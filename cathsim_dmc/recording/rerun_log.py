@@ -127,22 +127,10 @@ def _layout(
     texts = rrb.TextLogView(origin=rerun_text.EVENTS, name="Events")
     page = rrb.TextDocumentView(origin=rerun_text.PAGE, name="Episode")
     images.append(rrb.Tabs(texts, page))
-    there = {
-        "distance_mm": "distance" in episode.meta,
-        "rotation_deg": log.coaxial is not None,
-        "vessel": log.vessel is not None,
-    }
-    plots = []
-    for name, entity, several in _PLOTS:
-        if there.get(entity, True):
-            legend = rrb.PlotLegend(corner="LeftTop", visible=several)
-            look: Any = {"name": name, "plot_legend": legend}
-            plots.append(rrb.TimeSeriesView(origin=f"series/{entity}", **look))
     left = rrb.Vertical(scene, rrb.Horizontal(*insets), row_shares=[3, 2])
-    columns = [(left, 5), (rrb.Vertical(*images), 3.4), (rrb.Vertical(*plots), 3)]
-    columns, shares = zip(*columns, strict=True)
+    columns = left, rrb.Vertical(*images), rrb.Vertical(*_plots(log))
     return rrb.Blueprint(
-        rrb.Horizontal(*columns, column_shares=shares),
+        rrb.Horizontal(*columns, column_shares=[5, 3.4, 3]),
         rrb.TimePanel(
             state="collapsed",
             play_state="playing",
@@ -153,6 +141,22 @@ def _layout(
         auto_layout=False,
         collapse_panels=True,
     )
+
+
+def _plots(log: Log) -> list[rrb.TimeSeriesView]:
+    """Return the plots of the series that an episode has."""
+    there = {
+        "distance_mm": "distance" in log.episode.meta,
+        "rotation_deg": log.coaxial is not None,
+        "vessel": log.vessel is not None,
+    }
+    plots = []
+    for name, entity, several in _PLOTS:
+        if there.get(entity, True):
+            legend = rrb.PlotLegend(corner="LeftTop", visible=several)
+            look: Any = {"name": name, "plot_legend": legend}
+            plots.append(rrb.TimeSeriesView(origin=f"series/{entity}", **look))
+    return plots
 
 
 def _world(
