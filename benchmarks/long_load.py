@@ -170,6 +170,11 @@ def main() -> int:
     if arguments.serve:
         serve(Load(arguments), arguments.serve)
         return 0
+    if arguments.steps < (least := 2 * arguments.simulations):
+        parser.error(
+            f"--steps is {arguments.steps}; it must be {least} or more, two for each "
+            "simulation: one warms up"
+        )
     try:
         if arguments.out is not None:
             files.require_file(arguments.out)

@@ -28,6 +28,12 @@ def test_a_folder_that_is_not_there_is_refused_before_the_load(tmp_path):
     assert "no directory" in done.stderr
 
 
+def test_a_load_of_the_warm_up_alone_is_refused():
+    done = run("--steps", 16)
+    assert done.returncode == 2
+    assert "--steps is 16; it must be 32 or more" in done.stderr
+
+
 @pytest.mark.slow
 def test_eight_thousand_steps_keep_the_bounds(tmp_path):
     out = tmp_path / "load.json"

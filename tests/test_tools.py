@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 
 import nbformat
+import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -45,6 +46,20 @@ def test_scripts_answer_help_and_refuse_what_they_do_not_know():
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.stdout.startswith("usage:") == (words == ["--help"])
         assert done.returncode == (0 if words == ["--help"] else 2)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("docs/scripts/vessel.py", "costs"), ("tools/trajectories.py", "--only", "x")],
+)
+def test_scripts_refuse_parts_that_they_do_not_know(words):
+    """Else they end in a traceback, or write pages and measure nothing."""
+    script, *rest = words
+    done = subprocess.run(
+        [sys.executable, TOOLS.parent / script, *rest], capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert f"{rest[-1]}" in done.stderr.splitlines()[-1]
 
 
 def test_what_stands_for_labmaze_is_the_version_that_is_pinned():

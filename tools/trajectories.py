@@ -104,7 +104,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, help="where to write the digests")
     parser.add_argument("--compare", type=Path, help="digests of before")
-    parser.add_argument("--only", nargs="*", default=list(CASES), help="some cases")
+    parser.add_argument("--only", nargs="*", default=list(CASES), choices=CASES)
     options = parser.parse_args()
     if options.out:
         files.require_file(options.out)

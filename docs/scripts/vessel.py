@@ -190,6 +190,10 @@ def main():
     parser.add_argument("--policy", action="append", choices=TASKS)
     parser.add_argument("--case", action="append", choices=CASES)
     given = parser.parse_args()
+    if unknown := set(given.parts) - {"cost", "soak", "policies"}:
+        parser.error(
+            f"no part is called {', '.join(unknown)}; give some of those above"
+        )
     if "cost" in given.parts:
         _keep(cost=costs())
     if "soak" in given.parts:
