@@ -10,7 +10,7 @@ step.
 
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 # torchrl must be imported before dm_control.
 from cathsim_dmc.agents import protocols  # isort: skip
@@ -20,12 +20,22 @@ import tyro
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.analysis.intervals import success_interval
-from cathsim_dmc.cli.options import EVALUATION_SEED, show
+from cathsim_dmc.cli.options import EVALUATION_SEED, say, show
 from cathsim_dmc.simulation import episodes
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation.checks import Check, Report
 
 OBSERVED = ("internal", "tracking", "force")
+
+
+class Row(NamedTuple):
+    """An episode of both paths; `differs` is the first step that does, or None."""
+
+    seed: int
+    success: bool
+    steps: int
+    force: float  # largest sum of the wall force, N
+    differs: int | None
 
 
 class Play:
@@ -128,33 +138,33 @@ def main(
         json: Whether to print one JSON object and nothing else.
     """
     protocol = protocols.get("varied")
-    play = []
+    rows = []
     for part in protocols.parts(protocol, task, {}, seeds, seed):
         options = dict(part.task_kwargs)
         one = Play(task, policy, part.seeds, options, steps, threads)
-        print(f"{one.success.sum()} of {len(part.seeds)} succeed", file=sys.stderr)
+        say(f"{one.success.sum()} of {len(part.seeds)} succeed")
         for i, own in enumerate(part.seeds):
             differs = first_difference(
                 task, own, options, one.actions[i], one.states[i]
             )
-            play.append((own, one.success[i], len(one.actions[i]), one.force[i]))
-            play[-1] += (differs,)
-            print(*play[-1], file=sys.stderr, flush=True)
-    success = sum(bool(row[1]) for row in play)
-    different = sum(row[4] is not None for row in play)
-    low, high = success_interval(success, len(play))
+            success, force = bool(one.success[i]), float(one.force[i])
+            rows.append(Row(own, success, len(one.actions[i]), force, differs))
+            say(" ".join(map(str, rows[-1])))
+    success = sum(row.success for row in rows)
+    different = sum(row.differs is not None for row in rows)
+    low, high = success_interval(success, len(rows))
     label = f"{task}, {policy}: episodes that differ between batch and environment"
-    checks = [Check.at_most(label, different, 0, "", f"of {len(play)}")]
+    checks = [Check.at_most(label, different, 0, "", f"of {len(rows)}")]
     findings = {
-        "episodes": len(play),
+        "episodes": len(rows),
         "successes": success,
         "success_ci95": [low, high],
-        "safe at 0.5 N": sum(bool(row[1]) and row[3] <= 0.5 for row in play),
-        "control steps, mean": float(np.mean([row[2] for row in play])),
-        "control steps, longest": max(row[2] for row in play),
-        "control steps compared": sum(row[2] for row in play),
-        "largest sum, N": float(max(row[3] for row in play)),
-        "failed seeds": [row[0] for row in play if not row[1]],
+        "safe at 0.5 N": sum(row.success and row.force <= 0.5 for row in rows),
+        "control steps, mean": float(np.mean([row.steps for row in rows])),
+        "control steps, longest": max(row.steps for row in rows),
+        "control steps compared": sum(row.steps for row in rows),
+        "largest sum, N": max(row.force for row in rows),
+        "failed seeds": [row.seed for row in rows if not row.success],
     }
     return show(Report("both paths", checks, findings), json)
 

@@ -25,7 +25,7 @@ import tyro
 from cathsim_dmc import files, policies, suite
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, ForceTracker
 from cathsim_dmc.analysis.intervals import success_interval
-from cathsim_dmc.cli.options import BAD_INPUT, EVALUATION_SEED, show
+from cathsim_dmc.cli.options import BAD_INPUT, EVALUATION_SEED, say, show
 from cathsim_dmc.simulation import episodes
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.step import Step
@@ -369,7 +369,7 @@ def main(
             seed,
             players=policy or None,
             num_threads=threads,
-            say=lambda text: print(text, file=sys.stderr, flush=True),
+            say=say,
             keep=keep,
         )
     except (ValueError, OSError) as error:

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from cathsim_dmc import files, suite
+from cathsim_dmc.cli.options import say
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation.checks import Check
 
@@ -129,13 +130,9 @@ def measure(arguments: argparse.Namespace) -> dict:
     stretch = max(1, (calls - warm) // 20)
     while load.count < calls:
         speed = load.run(min(stretch, calls - load.count))
-        series.append((load.count * arguments.simulations, memory() - held, speed))
-        print(
-            f"{series[-1][0]:,} steps, {series[-1][1] / 1e6:+.1f} MB, {speed:.0f}/s",
-            file=sys.stderr,
-            flush=True,
-        )
-    growth = series[-1][1]
+        steps, growth = load.count * arguments.simulations, memory() - held
+        series.append((steps, growth, speed))
+        say(f"{steps:,} steps, {growth / 1e6:+.1f} MB, {speed:.0f}/s")
     here, fresh = in_turns(load, arguments, max(1, min(stretch, 400)))
     ratio = float(np.median(np.divide(here, fresh)))
     checks = [

@@ -36,6 +36,7 @@ from containment import Containment
 from scipy.stats import qmc
 
 from cathsim_dmc import files, suite
+from cathsim_dmc.cli.options import say
 from cathsim_dmc.physics import forces
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation.checks import Check
@@ -384,10 +385,7 @@ def main() -> int:
             simulation = BatchSimulation(made, len(part), num_threads=options.threads)
             rows = read_rows(path, steps) + run(simulation, part, steps)
             files.write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
-            print(
-                f"{task}: {len(part)} episodes in {time.perf_counter() - start:.0f} s",
-                file=sys.stderr,
-            )
+            say(f"{task}: {len(part)} episodes in {time.perf_counter() - start:.0f} s")
     rows = [row for row in read_rows(path, steps) if row["number"] < episodes]
     result = report(rows)
     files.write_text(options.out / "soak.json", json.dumps(result, indent=2) + "\n")

@@ -25,7 +25,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.cli.options import show
+from cathsim_dmc.cli.options import say, show
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
@@ -401,5 +401,4 @@ if __name__ == "__main__":
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
     measure = speed if options.short else everything
-    report = measure(lambda text: print(text, file=sys.stderr, flush=True))
-    sys.exit(show(report, options.json))
+    sys.exit(show(measure(say), options.json))

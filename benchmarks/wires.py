@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.cli.options import show
+from cathsim_dmc.cli.options import say, show
 from cathsim_dmc.entities.device import Arc, Device, Section
 from cathsim_dmc.entities.devices import METAL_POISSON_RATIO
 from cathsim_dmc.validation import bench, bench_data
@@ -112,11 +112,6 @@ def main(folder: str) -> int:
         say(f"{name}: " + ", ".join(f"{k} {v:.2f} mm" for k, v in found[name].items()))
     findings = {**report.findings, "sensitivity": found}
     return show(replace(report, findings=findings), as_json=True)
-
-
-def say(text: str) -> None:
-    """Report progress on standard error."""
-    print(text, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":
