@@ -14,8 +14,9 @@ from cathsim_dmc.tasks.observation_kind import Entry, Sizes
 SCRIPT = Path(__file__).parents[1] / "docs" / "scripts" / "observations.py"
 
 
-@pytest.fixture(scope="module")
-def script():
+@pytest.fixture
+def script(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
     spec = importlib.util.spec_from_file_location("docs_observations", SCRIPT)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
