@@ -19,6 +19,7 @@ import time
 import urllib.error
 import urllib.request
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -26,6 +27,7 @@ import rerun_cli
 from PIL import Image
 
 from cathsim_dmc import agents, suite  # agents must be imported before dm_control
+from cathsim_dmc.agents.evaluation import EVALUATION_SEED
 from cathsim_dmc.agents.policies import task_and_options
 from cathsim_dmc.anatomy.scan.topology import decimated
 from cathsim_dmc.imaging import materials
@@ -59,13 +61,25 @@ POLICY = (
     '<meta http-equiv="Content-Security-Policy" '
     "content=\"connect-src 'self' blob: data:\" />"
 )
+
+
+class Recording(NamedTuple):
+    """An episode that the pages play; a task of None is the policy's own."""
+
+    name: str
+    title: str
+    policy: str
+    task: str | None = None
+    seed: int = EVALUATION_SEED
+    steps: int | None = None  # at most
+
+
 RECORDINGS = (
-    # name, title, policy, task, seed, most steps
-    ("type1_bca", "Type I, BCA", "pretrained:type1_bca", None, 1_000_000, None),
-    ("type1_lcca", "Type I, LCCA", "pretrained:type1_lcca", None, 1_000_000, None),
-    ("type2_lcca", "Type II, LCCA", "pretrained:type2_lcca", None, 1_000_000, None),
-    ("femoral", "From the groin", "expert", "femoral_type1_lcca", 3, None),
-    ("jam", "A straight push jams", "push", "type1_lcca", 0, 150),
+    Recording("type1_bca", "Type I, BCA", "pretrained:type1_bca"),
+    Recording("type1_lcca", "Type I, LCCA", "pretrained:type1_lcca"),
+    Recording("type2_lcca", "Type II, LCCA", "pretrained:type2_lcca"),
+    Recording("femoral", "From the groin", "expert", "femoral_type1_lcca", 3),
+    Recording("jam", "A straight push jams", "push", "type1_lcca", 0, 150),
 )
 
 
@@ -228,40 +242,32 @@ def _window(plane) -> list[float]:
 def write_recordings(out: Path) -> None:
     """Writes recordings of policies that ship, of the expert and of a failure."""
     out.mkdir(parents=True, exist_ok=True)
-    listed = [write_recording(out, *each) for each in RECORDINGS]
+    listed = [write_recording(out, each) for each in RECORDINGS]
     (out / "recordings.json").write_text(json.dumps(listed, indent=1))
 
 
-def write_recording(
-    out: Path,
-    name: str,
-    title: str,
-    policy: str,
-    task: str | None,
-    seed: int,
-    steps: int | None,
-) -> dict[str, str]:
+def write_recording(out: Path, one: Recording) -> dict[str, str]:
     """Writes a recording for Rerun and a headset; returns its entry in the list."""
-    path = out / f"{name}.rrd"
-    player = agents.load_policy(policy, seed)
-    limit = {"max_steps": steps} if steps else {}
-    played, options = task_and_options(player, task, limit)
+    path = out / f"{one.name}.rrd"
+    player = agents.load_policy(one.policy, one.seed)
+    limit = {"max_steps": one.steps} if one.steps else {}
+    played, options = task_and_options(player, one.task, limit)
     if played not in SCENES:
-        raise SystemExit(f"{name} plays {played}, whose scene is not in SCENES")
+        raise SystemExit(f"{one.name} plays {played}, whose scene is not in SCENES")
     options["observation"] = player.observation or "internal"
     env = suite.load("cathsim", played, options)
-    episode = record(env, player, path, seed=seed)
-    write_states(episode, title, env.task.scene.goal.name, path)
+    episode = record(env, player, path, seed=one.seed)
+    write_states(episode, one.title, env.task.scene.goal.name, path)
     largest = 1e3 * episode.wall_force_max.max()
-    command = f"cathsim record {policy} --seed {seed} --out {path.name}"
-    command += f" --task {task}" if task else ""
-    command += f" --max-steps {steps}" if steps else ""
+    command = f"cathsim record {one.policy} --seed {one.seed} --out {path.name}"
+    command += f" --task {one.task}" if one.task else ""
+    command += f" --max-steps {one.steps}" if one.steps else ""
     text = (
-        f"{episode.task}, {policy}: {episode.termination} after {episode.steps} "
+        f"{episode.task}, {one.policy}: {episode.termination} after {episode.steps} "
         f"steps of 40 ms, largest contact {largest:.0f} mN. Made by: {command}"
     )
     print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB")
-    entry = {"name": name, "title": title, "file": path.name, "text": text}
+    entry = {"name": one.name, "title": one.title, "file": path.name, "text": text}
     return {**entry, "scene": played}
 
 

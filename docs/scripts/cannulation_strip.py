@@ -47,7 +47,6 @@ def run() -> tuple[object, list[dict]]:
 
 
 def main() -> None:
-    """Draws the figure."""
     task, states = run()
     surface, random = task.scene.anatomy.surface, np.random.RandomState(0)
     chosen = np.linspace(0, len(states) - 1, MOMENTS).round().astype(int)

@@ -35,7 +35,6 @@ def episode(case, seed, actions=None):
 
 
 def main():
-    """Measures and writes the table."""
     stated = [episode("as stated", seed) for seed in SEEDS]
     rows = ["| damping | tip, mm, median (max) | force | steps of the expert |"]
     rows.append("|---|---|---|---|")

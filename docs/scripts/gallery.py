@@ -15,6 +15,7 @@ from cathsim_dmc.agents import load_policy  # must be imported before dm_control
 
 import figures  # isort: skip
 import cathsim_dmc  # isort: skip
+from cathsim_dmc.agents.evaluation import EVALUATION_SEED  # isort: skip
 from cathsim_dmc.agents.policies import task_and_options  # isort: skip
 from cathsim_dmc import suite  # isort: skip
 from cathsim_dmc.pictures.animation import animate  # isort: skip
@@ -25,7 +26,6 @@ LIMIT = 3_000_000  # bytes, all clips together
 CLIP = {"frames": 36, "width": 400, "quality": 50}
 FILM = {"frames": 72, "width": 780, "quality": 72}
 COLUMNS = 3
-EVALUATION = 1_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,13 +46,15 @@ class Clip:
         parts = ["cathsim record", self.policy]
         parts += [] if self.own_task else [f"--task {self.task}"]
         parts += [f"--{name} {value}" for name, value in self.options.items()]
-        parts += [f"--seed {self.seed}"] if self.seed != EVALUATION else []
+        parts += [f"--seed {self.seed}"] if self.seed != EVALUATION_SEED else []
         parts += [f"--max-steps {self.steps}"] if self.steps else []
         return " ".join([*parts, f"--gif {self.name}.webp"])
 
 
 def _shipped(task: str, caption: str) -> Clip:
-    return Clip(task, caption, f"pretrained:{task}", task, EVALUATION, own_task=True)
+    return Clip(
+        task, caption, f"pretrained:{task}", task, EVALUATION_SEED, own_task=True
+    )
 
 
 # A row for each family: published tasks, femoral access, any arch, coaxial devices.
@@ -77,7 +79,7 @@ CLIPS = (
         "Navigator, random arch that it has not seen",
         "pretrained:navigator",
         "arch_any",
-        EVALUATION,
+        EVALUATION_SEED,
         own_task=True,
         options={"first": 7, "pool": 1},
     ),
@@ -95,7 +97,7 @@ CLIPS = (
         "Learnt from the expert, guidewire in catheter",
         "pretrained:femoral_type1_lcca_pair",
         "femoral_type1_lcca_pair",
-        EVALUATION,
+        EVALUATION_SEED,
         own_task=True,
     ),
     Clip(
@@ -126,7 +128,7 @@ CLIPS = (
         "Wire in catheter, to a vertebral artery of an arch not seen before",
         "pretrained:navigator_pair",
         "neck_any_pair",
-        EVALUATION,
+        EVALUATION_SEED,
         own_task=True,
         options={"first": 7, "pool": 1, "arches": "test_neck", "goal": "lva"},
     ),

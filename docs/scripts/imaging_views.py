@@ -67,7 +67,6 @@ def views(tree, surface) -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    """Draw the figure."""
     tree = arch_tree(ARCHES["simple1"])
     images = views(tree, lumen_surface(tree))
     figure = Figure(figsize=(9.6, 5.1), layout="constrained")

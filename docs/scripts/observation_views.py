@@ -102,7 +102,6 @@ def endoluminal() -> Path:
 
 
 def main() -> None:
-    """Draws the figures."""
     print(fluoroscopy())
     print(endoluminal())
 

@@ -260,7 +260,6 @@ def page() -> str:
 
 
 def main() -> None:
-    """Writes the page."""
     OUTPUT.write_text(page(), encoding="utf-8")
     print(OUTPUT)
 

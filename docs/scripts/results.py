@@ -25,6 +25,7 @@ from cathsim_dmc.analysis.intervals import success_interval
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 import results_figures as drawings
 from figures import grid
+from results_figures import rate_of, values_of
 from trainings import HERE, read_grid, read_result
 
 DOCS = Path(__file__).parents[1]
@@ -377,14 +378,6 @@ def marked(text, found):
     return text + " †" * any("mean_sum" not in one for one in forces)
 
 
-def rate_of(found):
-    """Success rate over the episodes of all seeds, and the number of episodes."""
-    counts = [result.evaluation["summary"]["episodes"] for result in found]
-    rates = [result.success for result in found]
-    reached = sum(round(r * n) for r, n in zip(rates, counts, strict=True))
-    return reached / sum(counts), sum(counts)
-
-
 def figures_of(found):
     """Seeds, success, worst seed, reward, steps and forces of one agent, as text."""
     rate, count = rate_of(found)
@@ -412,11 +405,6 @@ def published_figures(theirs):
         7: "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["mean_force"])),
         8: "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["max_force"])),
     }
-
-
-def values_of(found, name):
-    """Values of a quantity in the episodes of all seeds, without missing ones."""
-    return [v for r in found for v in r.evaluation["episodes"][name] if v is not None]
 
 
 def spread(found, name, scale, digits):

@@ -19,6 +19,19 @@ STYLES = ("-", "--", ":")
 POINTS = 200
 
 
+def rate_of(found):
+    """Success rate over the episodes of all seeds, and the number of episodes."""
+    counts = [result.evaluation["summary"]["episodes"] for result in found]
+    rates = [result.success for result in found]
+    reached = sum(round(r * n) for r, n in zip(rates, counts, strict=True))
+    return reached / sum(counts), sum(counts)
+
+
+def values_of(found, name):
+    """Values of a quantity in the episodes of all seeds, without missing ones."""
+    return [v for r in found for v in r.evaluation["episodes"][name] if v is not None]
+
+
 class Looks:
     """Colour and line style of each agent, the same in every figure."""
 
@@ -56,15 +69,11 @@ def learning_curves(by_task, looks, path):
                     alpha=0.2,
                     lw=0,
                 )
+        _by_frames(axes)
         axes.set_title(task, fontsize=10)
-        axes.set_ylim(-3, 103)
-        axes.set_xscale("log")
         axes.set_xticks([1e4, 2e4, 5e4, 1e5, 2e5, 5e5])
         axes.minorticks_off()
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.set_xlabel("frames")
         axes.set_ylabel("success in training episodes, %")
-        axes.grid(alpha=0.3)
     named = {
         label: line
         for axes in figure.axes
@@ -72,7 +81,8 @@ def learning_curves(by_task, looks, path):
     }
     lines, labels = named.values(), named.keys()
     figure.legend(lines, labels, fontsize=8, loc="outside lower center", ncols=3)
-    return _save(figure, path)
+    style.save(figure, path, DPI)
+    return path
 
 
 def with_demonstrations(agents, looks, path):
@@ -89,10 +99,8 @@ def with_demonstrations(agents, looks, path):
         frames, success = _common(results)
         if frames is not None:
             axes.plot(frames, 100 * success.mean(0), lw=1.2, alpha=0.6, **line)
-        rates = [result.success for result in results]
-        counts = [result.evaluation["summary"]["episodes"] for result in results]
-        reached = sum(round(r * n) for r, n in zip(rates, counts, strict=True))
-        rate, interval = reached / sum(counts), success_interval(reached, sum(counts))
+        rate, count = rate_of(results)
+        interval = success_interval(round(rate * count), count)
         axes.errorbar(
             [np.mean([result.training["frames"] for result in results])],
             [100 * rate],
@@ -102,14 +110,20 @@ def with_demonstrations(agents, looks, path):
             **line,
             label=f"{label} ({_seeds(len(results))})",
         )
+    _by_frames(axes)
+    axes.set_ylabel("success, %")
+    figure.legend(fontsize=8, loc="outside right center", handlelength=4)
+    style.save(figure, path, DPI)
+    return path
+
+
+def _by_frames(axes):
+    """Makes axes of success, %, over frames."""
     axes.set_xscale("log")
     axes.set_ylim(-3, 103)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_xlabel("frames")
-    axes.set_ylabel("success, %")
     axes.grid(alpha=0.3)
-    figure.legend(fontsize=8, loc="outside right center", handlelength=4)
-    return _save(figure, path)
 
 
 # Episodes after which the running mean of success is shown.
@@ -152,12 +166,7 @@ def force_boxes(by_task, looks, published, path):
     for axes, (task, agents) in zip(panels, by_task.items(), strict=False):
         labels = list(agents)[::-1]
         for row, label in enumerate(labels):
-            forces = [
-                1e3 * value
-                for result in agents[label]
-                for value in result.evaluation["episodes"]["max_force"]
-                if value is not None
-            ]
+            forces = [1e3 * value for value in values_of(agents[label], "max_force")]
             colour = looks[label]["color"]
             axes.boxplot(
                 forces,
@@ -182,7 +191,8 @@ def force_boxes(by_task, looks, published, path):
         axes.set_title(task, fontsize=10)
         axes.set_xlabel("largest contact, mN")
         axes.grid(axis="x", alpha=0.3)
-    return _save(figure, path)
+    style.save(figure, path, DPI)
+    return path
 
 
 def force_maps(chosen, path):
@@ -211,7 +221,8 @@ def force_maps(chosen, path):
         axes.set_title(
             f"{task}\n{label}\n{_seeds(len(results))}, {episodes} episodes", fontsize=8
         )
-    return _save(figure, path)
+    style.save(figure, path, DPI)
+    return path
 
 
 def _draw_map(figure, axes, field, task):
@@ -272,11 +283,6 @@ def _panels(count, columns=2, width=PANEL[0], height=PANEL[1]):
 
 def _seeds(count):
     return f"{count} seed" + "s" * (count != 1)
-
-
-def _save(figure, path):
-    style.save(figure, path, DPI)
-    return path
 
 
 def drawn(table, reference, compared, images):
