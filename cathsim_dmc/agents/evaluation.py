@@ -185,13 +185,11 @@ class _Plan:
             # Checked first: an evaluation that cannot be written would be lost.
             files.require_place(out_dir)
             errors = Path(out_dir).absolute() / "errors"
-        make = functools.partial(
-            _recorded, make_env, errors, self.task, observation=self.observation
-        )
+        make = functools.partial(make_env, self.task, observation=self.observation)
         varied = bool(protocols.get(self.protocol).task_kwargs)
         return [
             _Group(
-                part, range(len(part.seeds)), self.player, varied, make,
+                part, range(len(part.seeds)), self.player, varied, make, errors,
                 num_threads, torch.get_num_threads(), start,
             )
             for part in self.parts
@@ -230,6 +228,7 @@ class _Group:
         player: Policy for all episodes of the part.
         varied: Whether each episode has a seed of its own; otherwise seeds count up.
         make_env: Function of num_envs, num_threads, seed and task_kwargs.
+        errors: Folder for physics errors; None writes none.
         num_threads: Number of threads of the simulation; None for one per core.
         torch_threads: Number of threads of torch; rounding depends on it.
         start: State at which the episodes of the part begin; None for their starts.
@@ -240,6 +239,7 @@ class _Group:
     player: Policy
     varied: bool
     make_env: EnvFactory
+    errors: Path | None
     num_threads: int | None
     torch_threads: int
     start: Snapshot | None
@@ -252,20 +252,14 @@ class _Group:
         return [replace(self, rows=rows, num_threads=threads) for rows in cut]
 
 
-def _recorded(make_env: EnvFactory, folder: Path | None, *args, **kwargs) -> EnvBase:
-    """Makes an environment that writes physics errors to a folder, None for none."""
-    env = make_env(*args, **kwargs)
-    if folder is not None:
-        environments.record_errors(env, folder)
-    return env
-
-
 def _play(group: _Group, observer: Observer | None) -> list[EpisodeOutcome]:
     seeds = group.part.seeds[group.rows.start : group.rows.stop]
     env = group.make_env(
         num_envs=len(seeds), num_threads=group.num_threads,
         seed=seeds if group.varied else seeds[0], task_kwargs=group.part.task_kwargs,
     )  # fmt: skip
+    if group.errors is not None:
+        environments.record_errors(env, group.errors)
     first = group.rows.start
     start = None if group.start is None else group.start[first : group.rows.stop]
     policy = group.player.among(first, len(group.part.seeds))

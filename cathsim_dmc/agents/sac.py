@@ -135,10 +135,14 @@ class SAC(Learner):
         self.replay = ReplayMemory(directory / "replay", self.replay_keys, most, size)
         self.demonstrations: TensorDictBase | None = None
         if config.demonstrations is not None:
-            names, options = config.collected_observation, config.training_kwargs
-            own = {"task": config.task, "reward": options.get("reward")}
-            own |= alike(config.task_kwargs)
-            shown = load_transitions(config.demonstrations, names, shapes, **own)
+            shown = load_transitions(
+                config.demonstrations,
+                config.collected_observation,
+                shapes,
+                task=config.task,
+                reward=config.training_kwargs.get("reward"),
+                **alike(config.task_kwargs),
+            )
             self.demonstrations = shown.select(*self.replay_keys)
             self.observe(shown)
         self.owed_steps = 0.0

@@ -253,7 +253,7 @@ def check(
         print_json(report.findings[anatomy.name]["measures"])
     if figure is not None:
         style.save(anatomy_figure(anatomy), figure)
-        print(f"three views: {figure}", file=sys.stderr)
+        say(f"three views: {figure}")
     return code
 
 
