@@ -331,7 +331,6 @@ def _repeated(
             actions, in double precision.
         rewarded: Whether the environment has the reward of the record.
     """
-    name = f"episode with seed {episode.seed}"
 
     def shown(timestep: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         row = {
@@ -351,17 +350,11 @@ def _repeated(
         moved = np.abs(environment.physics.data.qpos - episode.qpos[step + 1]).max()
         off = abs(rewards[step] - episode.reward[step]) > _SAME_REWARD
         if off if rewarded else moved > _SAME_POSITION:
-            raise ValueError(
-                f"{name} does not repeat: reward {rewards[step]} instead of "
-                f"{episode.reward[step]}, positions {moved:.2g} apart, at step "
-                f"{step}; it was recorded with "
-                f"{episode.meta.get('versions')} and the options "
-                f"{episode.meta.get('task_kwargs')}, without effects and other objects"
-            )
+            raise ValueError(_difference(episode, step, rewards[step], moved))
         if ends[-1] and step + 1 < episode.steps:
             raise ValueError(
-                f"{name} ends at step {step} instead of {episode.steps - 1}; export it "
-                "with the options it was recorded with"
+                f"episode with seed {episode.seed} ends at step {step} instead of "
+                f"{episode.steps - 1}; export it with the options it was recorded with"
             )
     terminated = np.array(ends) & (timestep.discount == 0)
     truncated = np.arange(1, episode.steps + 1) == episode.steps
@@ -379,3 +372,13 @@ def _repeated(
         "truncations": (truncated & ~terminated).tolist(),
         "infos": infos,
     }
+
+
+def _difference(episode: Episode, step: int, reward: float, moved: float) -> str:
+    """Returns the text on a step that does not repeat; `moved` in m or rad."""
+    return (
+        f"episode with seed {episode.seed} does not repeat: reward {reward} instead of "
+        f"{episode.reward[step]}, positions {moved:.2g} apart, at step {step}; it was "
+        f"recorded with {episode.meta.get('versions')} and the options "
+        f"{episode.meta.get('task_kwargs')}, without effects and other objects"
+    )
