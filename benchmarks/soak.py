@@ -23,6 +23,7 @@ Goals do not end episodes: their radius is tiny.
 """
 
 import argparse
+import collections
 import dataclasses
 import itertools
 import json
@@ -130,13 +131,11 @@ def plan(
 ) -> list[Episode]:
     """Spreads episodes evenly over tasks and policies."""
     pairs = itertools.cycle(itertools.product(policies, tasks))
-    counts: dict[tuple[str, str], int] = {}
-    result = []
-    for number, (policy, task) in zip(range(episodes), pairs, strict=False):
-        repeat = counts.get((policy, task), 0)
-        counts[policy, task] = repeat + 1
-        result.append(Episode(number, task, policy, repeat))
-    return result
+    size = len(policies) * len(tasks)
+    return [
+        Episode(number, task, policy, number // size)
+        for number, (policy, task) in zip(range(episodes), pairs, strict=False)
+    ]
 
 
 @dataclasses.dataclass
@@ -264,17 +263,15 @@ def read_rows(path: Path, steps: int) -> list[dict]:
 
 def percentile(rows: list[dict], percent: float) -> float:
     """Percentile of the penetration over all rows, m (0 without contact)."""
-    counts: dict[int, int] = {}
+    counts = collections.Counter()
     for row in rows:
-        for key, count in row["penetration_histogram"].items():
-            counts[int(key)] = counts.get(int(key), 0) + count
-    total = sum(counts.values())
-    seen = 0
-    for bin_ in sorted(counts):
-        seen += counts[bin_]
-        if seen >= total * percent / 100:
-            return (bin_ + 1) * BIN
-    return 0.0
+        found = row["penetration_histogram"].items()
+        counts.update({int(key): count for key, count in found})
+    if not counts:
+        return 0.0
+    bins = sorted(counts)
+    below = np.cumsum([counts[one] for one in bins])
+    return (bins[np.searchsorted(below, below[-1] * percent / 100)] + 1) * BIN
 
 
 def summarise(rows: list[dict]) -> dict:

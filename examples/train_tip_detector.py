@@ -119,7 +119,7 @@ def detect(model, images, batch: int):
     found = []
     for part in images.split(batch):
         logits = model(part)
-        count, height, width = logits.shape
+        height, width = logits.shape[1:]
         peak = logits.flatten(1).argmax(1)
         rows, columns = torch.meshgrid(
             torch.arange(height), torch.arange(width), indexing="ij"

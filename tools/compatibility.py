@@ -38,11 +38,7 @@ def lowest() -> list[str]:
         found = re.fullmatch(r"([\w-]+)\s*>=\s*([\d.]+).*", requirement)
         if found and found[1] in MAIN:
             version = found[2] if "." in found[2] else f"{found[2]}.0"
-            pins.append(
-                f"{found[1]}=={version}.*"
-                if version.count(".") < 2
-                else f"{found[1]}=={version}"
-            )
+            pins.append(f"{found[1]}=={version}" + ".*" * (version.count(".") < 2))
     return pins
 
 

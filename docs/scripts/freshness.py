@@ -86,20 +86,21 @@ def summary(names: list[str], known: dict[str, dict]) -> list[str]:
         "depend on (last column; `docs/data/depends.json` says what that is). Files of "
         "results older than such a change:",
         "",
-        "| files | older | changed since |",
-        "|---|---|---|",
     ]
-    groups = {}
+    groups, rows = {}, []
     for name, parts in files().items():
-        groups.setdefault(name.rpartition("/")[0], []).append((name, parts))
-    for folder, rows in groups.items():
-        for name, parts in rows if len(rows) < 10 else ():
-            lines.append(f"| `{name}` | {'yes' if parts else 'no'} | {_shown(parts)} |")
-        if len(rows) >= 10:
-            parts = sorted({part for _, each in rows for part in each})
-            older = sum(bool(each) for _, each in rows)
-            lines.append(f"| `{folder}` | {older} of {len(rows)} | {_shown(parts)} |")
-    return lines
+        groups.setdefault(name.rpartition("/")[0], {})[name] = parts
+    for folder, found in groups.items():
+        if len(found) < 10:
+            rows += [
+                (f"`{name}`", "yes" if parts else "no", _shown(parts))
+                for name, parts in found.items()
+            ]
+        else:
+            older = sum(map(bool, found.values()))
+            parts = sorted(set().union(*found.values()))
+            rows.append((f"`{folder}`", f"{older} of {len(found)}", _shown(parts)))
+    return lines + figures.grid(("files", "older", "changed since"), rows)
 
 
 def _shown(parts: list[str]) -> str:
