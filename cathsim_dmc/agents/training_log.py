@@ -73,9 +73,10 @@ class TrainingLog:
         self.row = dict(self._rows[-1]) if self._rows else {}
         self._write()
         self._logger = FigureLogger(config.logger, run, self._rows)
-        label, total = f"{config.algorithm} {config.task}", config.total_frames
-        done = {"initial": self.frames, "disable": not progress}
-        self.bar = progress_bar(label, " frames", total=total, **done)
+        self.bar = progress_bar(
+            f"{config.algorithm} {config.task}", " frames", total=config.total_frames,
+            initial=self.frames, disable=not progress,
+        )  # fmt: skip
         self._before, self._began = state, time.monotonic()
 
     def close(self) -> None:

@@ -168,9 +168,10 @@ def submit(
         out: File to write, ending in .json.
         episodes: Number of episodes; fewer than the 100 of the protocol are not listed.
     """
-    how: Any = {"episodes": episodes, "num_threads": threads}
     with told_of_replaced([out, out.with_suffix(submission.RECORDED)]):
-        done = submission.submit(policy, out, task, **how)
+        done = submission.submit(
+            policy, out, task, episodes=episodes, num_threads=threads
+        )
     rates = {"success": done["summary"]["success"]}
     safe = done["summary"]["safe_success"].items()
     rates |= {f"safe success, {limit}": rate for limit, rate in safe}
@@ -346,8 +347,9 @@ def play(
     if player is not None:
         _, given = task_and_options(player, suite.known(task), given)
         require_actions(player, task, given)
-    how: Any = {"seed": seed, "episodes": episodes, "speed": speed, "policy": player}
-    how |= {"hands": hands, "task_kwargs": given}
-    for path in by_hand.play(task, out, **how):
+    for path in by_hand.play(
+        task, out, seed=seed, episodes=episodes, speed=speed, task_kwargs=given,
+        policy=player, hands=hands,
+    ):  # fmt: skip
         print(path)
     return 0

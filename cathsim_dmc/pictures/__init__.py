@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from cathsim_dmc.pictures.anatomies import Picture
+    from cathsim_dmc.pictures.curves import plot
     from cathsim_dmc.pictures.moment import Moment
     from cathsim_dmc.pictures.readout import ForceReadout, forces
     from cathsim_dmc.pictures.recorded import record, write
@@ -35,6 +35,7 @@ _MODULES = {
     "ForceReadout": "cathsim_dmc.pictures.readout",
     "Moment": "cathsim_dmc.pictures.moment",
     "forces": "cathsim_dmc.pictures.readout",
+    "plot": "cathsim_dmc.pictures.curves",
     "record": "cathsim_dmc.pictures.recorded",
     "write": "cathsim_dmc.pictures.recorded",
 }
@@ -77,26 +78,6 @@ def show(
         return scene_figure(Moment.of(env), **options)
     moment = Moment.of_episode(episode, surface_of(episode, env), step)
     return scene_figure(moment, **options)
-
-
-def plot(episode: "Episode") -> "Picture":
-    """Draw forces, insertion and distance of an episode over time, with its phases.
-
-    Args:
-        episode: What `record` returns or `Episode.load` reads.
-
-    Returns:
-        The figure; a notebook draws it, `.savefig(path)` writes it. Forces are in mN:
-        sum and largest contact, means over each control step, the peak of the sum
-        within it, and the push force at the base. Shades are the phases of the base:
-        it advances, rests or withdraws. A bar marks contact with the wall.
-
-    Raises:
-        TypeError: it is no episode.
-    """
-    from cathsim_dmc.pictures import curves
-
-    return curves.plot(episode)
 
 
 def fluoroscopy(env: Any, *, seed: int = 0, **options: Any) -> np.ndarray:

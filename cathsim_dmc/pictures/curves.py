@@ -45,7 +45,20 @@ def phases(episode: Episode) -> list[tuple[str, int, int]]:
 
 
 def plot(episode: Episode) -> Picture:
-    """Draw an episode over time: see `cathsim_dmc.pictures.plot`."""
+    """Draw forces, insertion and distance of an episode over time, with its phases.
+
+    Args:
+        episode: What `record` returns or `Episode.load` reads.
+
+    Returns:
+        The figure; a notebook draws it, `.savefig(path)` writes it. Forces are in mN:
+        sum and largest contact, means over each control step, the peak of the sum
+        within it, and the push force at the base. Shades are the phases of the base:
+        it advances, rests or withdraws. A bar marks contact with the wall.
+
+    Raises:
+        TypeError: it is no episode.
+    """
     if not isinstance(episode, Episode):
         raise TypeError(
             "plot takes an Episode, such as cathsim_dmc.record returns or "
