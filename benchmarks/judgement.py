@@ -1,10 +1,11 @@
 """The published evaluation of a trained policy, as JSON."""
 
 import dataclasses
+import time
 from importlib.metadata import version
 
 # torchrl must be imported before dm_control.
-from cathsim_dmc.agents import evaluation  # isort: skip
+from cathsim_dmc.agents.evaluation import EVALUATION_SEED, ContactLog, evaluate  # isort: skip
 
 import numpy as np
 
@@ -46,8 +47,8 @@ def judge(policy, task, task_kwargs, episodes=EPISODES, name=None, num_threads=N
 
     The map is None if each episode has another anatomy.
     """
-    log = evaluation.ContactLog()
-    found = evaluation.evaluate(
+    log = ContactLog()
+    found = evaluate(
         policy, task, episodes, name=name, task_kwargs=task_kwargs, observer=log,
         num_threads=num_threads,
     )  # fmt: skip
@@ -80,11 +81,11 @@ def judge_each_arch(policy, task, task_kwargs, arches, name=None):
         anatomy = build_seed(seed, access=suite.TASKS[task].access)
         if sheath_direction(anatomy) is None:
             continue
-        one = evaluation.evaluate(
+        one = evaluate(
             policy,
             task,
             1,
-            evaluation.EVALUATION_SEED + number,
+            EVALUATION_SEED + number,
             name=name,
             task_kwargs={**options, "first": number},
             num_threads=1,
@@ -100,6 +101,25 @@ def judge_each_arch(policy, task, task_kwargs, arches, name=None):
         settings={**played[0].settings, "task_kwargs": options},
     )
     return whole, groups
+
+
+def evaluation(policy, task, task_kwargs, arches, episodes, name, num_threads=None):
+    """The evaluation of a policy as JSON values; in every arch of a set if given."""
+    began, contacts, groups = time.monotonic(), None, None
+    if arches is None:
+        found, contacts = judge(policy, task, task_kwargs, episodes, name, num_threads)
+    else:
+        found, groups = judge_each_arch(policy, task, task_kwargs, arches, name)
+    return {
+        "task": found.task,
+        "seed": found.seeds[0],
+        "settings": dict(found.settings),
+        "seconds": round(time.monotonic() - began, 1),
+        "summary": found.summary(),
+        "episodes": episode_figures(found),
+        "groups": groups,
+        "force_map": None if contacts is None else map_values(contacts),
+    }
 
 
 def episode_figures(found):

@@ -222,17 +222,16 @@ def thread_scaling(steps: int = 30) -> tuple[list[float], float, dict[str, float
     return ratios, undisturbed, rates
 
 
-def torchrl_overhead(steps: int = 30, threads: int = 1) -> tuple[list[float], float]:
+def torchrl_overhead(steps: int = 30) -> tuple[list[float], float]:
     """Time of TorchRL batched steps divided by `Batch.step`, and steps per second."""
     torch.set_num_threads(1)
     env = BatchedEnv(
         "type1_bca",
         NUM_SIMULATIONS,
-        num_threads=threads,
+        num_threads=1,
         task_kwargs={"goal_radius": NEVER},
     )
-    bare = _batch(threads)
-    substeps = bare.task.substeps
+    bare = _batch(1)
     ratios, rates = [], []
     for run in range(_RUNS + 1):
         current = env.reset()
@@ -247,7 +246,7 @@ def torchrl_overhead(steps: int = 30, threads: int = 1) -> tuple[list[float], fl
             current = env.step(current)["next"]
             middle = time.perf_counter()
             bare.batch.ctrl[:] = action.numpy()
-            bare.batch.step(nstep=substeps)
+            bare.batch.step(nstep=bare.task.substeps)
             theirs += time.perf_counter() - middle
             ours += middle - start
         ratios.append(ours / theirs)
@@ -282,12 +281,9 @@ def frame_rates(frames: int = 100) -> dict[str, float]:
     return rates
 
 
-_OBSERVED = ("internal", "image")
-
-
 def image_ratio(steps: int = 20) -> list[float]:
     """Rate of a batch with image observations relative to `internal`, same actions."""
-    simulations = [_batch(1, observation=o) for o in _OBSERVED]
+    simulations = [_batch(1, observation=o) for o in ("internal", "image")]
     ratios = []
     for run in range(_RUNS + 1):
         seconds = []

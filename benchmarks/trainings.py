@@ -201,7 +201,7 @@ def work(cell, runs, results, num_threads=None):
     """
     config, folder = cell.config(), runs / cell.name
     files.require_folder(results, make=True)  # checked first, as a result would be lost
-    task, options, *_ = cell.evaluated(config)
+    task, options, arches, episodes = cell.evaluated(config)
     suite.make_task(task, **options)  # refuses invalid options before the training
     resume = (folder / training.CONFIG_FILE).exists()
     threads = config.num_threads if num_threads is None else num_threads
@@ -210,6 +210,9 @@ def work(cell, runs, results, num_threads=None):
     if done.interrupted:
         return False
     checkpoint = Checkpoint.open(done.checkpoint)
+    evaluation = judgement.evaluation(
+        checkpoint, task, options, arches, episodes, cell.name, num_threads
+    )
     rows = read_metrics(folder / "metrics.csv")
     values = {
         "format": FORMAT,
@@ -221,7 +224,7 @@ def work(cell, runs, results, num_threads=None):
             "solved": solved(rows),
             "curve": learning_curve(rows),
         },
-        "evaluation": evaluation_of(checkpoint, cell, num_threads),
+        "evaluation": evaluation,
         "versions": judgement.versions(),
         "commit": commit(),
         "machine": {"processor": platform.processor(), "cores": os.cpu_count()},
@@ -229,30 +232,6 @@ def work(cell, runs, results, num_threads=None):
     }
     write_result(results / f"{cell.name}.json", values)
     return True
-
-
-def evaluation_of(checkpoint, cell, num_threads=None):
-    """The evaluation of a cell's policy, as JSON values."""
-    task, options, arches, episodes = cell.evaluated(cell.config())
-    began, contacts, groups = time.monotonic(), None, None
-    if arches is None:
-        found, contacts = judgement.judge(
-            checkpoint, task, options, episodes, cell.name, num_threads
-        )
-    else:
-        found, groups = judgement.judge_each_arch(
-            checkpoint, task, options, arches, cell.name
-        )
-    return {
-        "task": found.task,
-        "seed": found.seeds[0],
-        "settings": dict(found.settings),
-        "seconds": round(time.monotonic() - began, 1),
-        "summary": found.summary(),
-        "episodes": judgement.episode_figures(found),
-        "groups": groups,
-        "force_map": None if contacts is None else judgement.map_values(contacts),
-    }
 
 
 def _work_apart(job):
