@@ -19,7 +19,8 @@ def script(monkeypatch):
     spec = importlib.util.spec_from_file_location("results", SCRIPTS / "results.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    monkeypatch.delitem(sys.modules, "results_figures", raising=False)
+    for name in ("results_figures", "results_tables"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
     return module
 
 
@@ -60,7 +61,7 @@ def test_ours_stands_beside_the_published(page, script, tmp_path):
     theirs = [ours[place].split(" / ")[1] for place in (2, 4, 7, 8)]
     assert theirs == ["53 %", "-70 ± 28", "11 ± 21", "121 ± 95"]
     newer = SimpleNamespace(evaluation={"summary": {"forces": {"mean_sum": {}}}})
-    assert script.marked("90 %", [newer]) == "90 %"
+    assert script.tables.marked("90 %", [newer]) == "90 %"
     # What falls short stands first.
     assert line_of(main, "PPO-Internal † (2)", " of ")[3] == "90 %"
     assert main.index("PPO-Internal † (2)") < main.index("## Success")
@@ -104,13 +105,13 @@ def test_a_broken_file_is_named_and_left_out(page, tmp_path, capsys, damage):
 
 def test_the_mean_over_seeds_hides_no_task_that_fails(script):
     scores = [[1.0, 1.0], [0.0, 0.0], [1.0, 1.0], [1.0, 0.6]]
-    mean, interval = script.mean_over_seeds(scores)
+    mean, interval = script.tables.mean_over_seeds(scores)
     assert mean == pytest.approx(0.7)
     assert interval[0] < mean < interval[1] <= 0.75
-    assert script.mean_over_seeds(scores) == (mean, interval)
+    assert script.tables.mean_over_seeds(scores) == (mean, interval)
     for few in ([[0.5], [1.0, 1.0]], [[1.0], []], []):
         with pytest.raises(ValueError, match="two runs or more"):
-            script.mean_over_seeds(few)
+            script.tables.mean_over_seeds(few)
 
 
 @pytest.mark.slow
