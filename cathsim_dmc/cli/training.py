@@ -95,10 +95,11 @@ def command(arguments: list[str]) -> Any:
 def _train(config: agents.TrainingConfig, run: _Run) -> int:
     """Trains an agent, says what is left to do, and returns the exit code."""
     done = [int(each.name) for each in checkpoints_in(run.out)][-1:]
-    how: Any = {"resume": run.resume, "without_replay": run.without_replay}
-    if run.films:
-        how["on_checkpoint"] = _filming(run.out / "films", f".{run.films}")
-    result = agents.train(config, run.out, progress=not run.quiet, **how)
+    filming = _filming(run.out / "films", f".{run.films}") if run.films else None
+    result = agents.train(
+        config, run.out, resume=run.resume, progress=not run.quiet,
+        without_replay=run.without_replay, on_checkpoint=filming,
+    )  # fmt: skip
     if result.interrupted:
         again = ["cathsim", "train", config.task, "--out", str(run.out), "--resume"]
         for module in config.modules or ():

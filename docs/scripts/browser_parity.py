@@ -162,13 +162,14 @@ def draw(measured: list[dict], path: Path) -> None:
     for line, each in zip(axes, measured, strict=True):
         python, page = each["python"], each["browser"]
         time_s = 0.04 * np.arange(1, len(python["head"]) + 1)
-        for heads, dashes in ((python, "-"), (page, "--")):
-            colour = COLOURS[0] if dashes == "-" else COLOURS[1]
-            label = "Python" if dashes == "-" else "WebAssembly"
+        for heads, dashes, colour, label in (
+            (python, "-", COLOURS[0], "Python"),
+            (page, "--", COLOURS[1], "WebAssembly"),
+        ):
+            look = {"ls": dashes, "color": colour, "label": label}
             x, _, z = 1e3 * heads["head"].T
-            line[0].plot(x, z, dashes, color=colour, lw=1.8, label=label)
-            peak = 1e3 * heads["peak_max"]
-            line[2].plot(time_s, peak, dashes, color=colour, lw=1.4, label=label)
+            line[0].plot(x, z, lw=1.8, **look)
+            line[2].plot(time_s, 1e3 * heads["peak_max"], lw=1.4, **look)
         apart = 1e3 * np.linalg.norm(python["head"] - page["head"], axis=1)
         line[1].semilogy(time_s, np.maximum(apart, 1e-15), color="0.25", lw=1.4)
         line[1].set_ylim(1e-15, 10)
