@@ -66,6 +66,10 @@ def test_both_ports_of_the_page_can_be_chosen(recording, monkeypatch):
             open_viewer(recording, web=True, port=free_port(), data_port=ports[1])
         with pytest.raises(ViewerError, match=f"port {ports[1]} cannot be used"):
             open_viewer(recording, web=True, port=ports[1])
+        with pytest.raises(ViewerError, match=f"port is {ports[0]}, as is the port"):
+            open_viewer(recording, web=True, port=ports[0], data_port=ports[0])
+        with pytest.raises(ViewerError, match="port is 9876, as is the port of"):
+            open_viewer(recording, web=True, port=9876)
     assert not started
     open_viewer(recording, web=True, port=ports[0], data_port=ports[1])
     command = started[0][1]

@@ -12,7 +12,7 @@ from cathsim_dmc import files
 _MAGIC = b"RRF2"
 # Near the end of every complete recording, before a checksum of four bytes.
 _FOOTER, _END = b"RRF2FOOT", -4
-LOOPBACK, WEB_PORT = "127.0.0.1", 9090
+LOOPBACK, WEB_PORT, DATA_PORT = "127.0.0.1", 9090, 9876
 
 
 class ViewerError(RuntimeError):
@@ -85,6 +85,11 @@ def open_viewer(
     how = ["--new"] if data_port is None else ["--port", str(data_port)]
     if web:
         how += ["--serve-web", "--web-viewer-port", str(port)]
+        if port == (data_port or DATA_PORT):
+            raise ViewerError(
+                f"port is {port}, as is the port of the data; give another one "
+                f"(--port {port + 1})"
+            )
         _require_free("port", port)
         if data_port is not None:
             _require_free("data_port", data_port)
