@@ -18,9 +18,10 @@ from cathsim_dmc.imaging import views
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.chain_fields import write_still
+from cathsim_dmc.physics.randomisation import Randomisation
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.objectives import Groups, Objective, Shiftable
+from cathsim_dmc.tasks.objectives import Cannulation, Groups, Objective, Shiftable
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.start import StartPosture
 
@@ -103,7 +104,7 @@ def objectives_of(
         if len(numbers) > 1:
             rows = np.flatnonzero(drawn == number)
         if shift is not None:
-            # Navigation has checked that it can be shifted.
+            # `check_shift` has found that it can be shifted.
             objective = cast(Shiftable, objective).shifted(shift[rows])
         found.append((objective, rows))
         goals[rows] = objective.goal
@@ -121,6 +122,24 @@ def _check_objective(objective: Objective) -> None:
         )
     shape = (3,) if np.shape(objective.goal) == (3,) else (-1, 3)
     bounds.array(f"the goal of {name}", objective.goal, shape=shape)
+
+
+def check_shift(objective: Objective, ranges: Randomisation) -> None:
+    """Raise ValueError if an objective does not support the shifts of its goal."""
+    if ranges.goal_shift and not isinstance(objective, Shiftable):
+        raise ValueError(
+            f"randomisation shifts the goal, but {type(objective).__name__} has no "
+            "shifted(shift): derive it from tasks.objectives.Shiftable, or leave "
+            "goal_shift out"
+        )
+    own = isinstance(objective, Cannulation) and objective.goal_arc_length is None
+    if ranges.farthest_shift and own:
+        raise ValueError(
+            "randomisation shifts the goal away from the ostium, but the route of "
+            f"{type(objective).__name__} ends at the goal: give the function of the "
+            "task's objective a keyword farthest_shift and hand it on to "
+            "Cannulation.to, or leave goal_shift out"
+        )
 
 
 def compile_together(

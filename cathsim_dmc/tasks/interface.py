@@ -35,9 +35,7 @@ def action_table(chain: Chain) -> list[dict[str, Any]]:
 
 def observation_table(task: Navigation) -> list[dict[str, Any]]:
     """Key, shape, type, unit and meaning of each entry of an observation, by key."""
-    coaxial, living = task.scene.catheter.coaxial, task.config.vessel.living
-    names = observations.resolve(task.config.observation, coaxial, living)
-    entries = {one.key: one for one in observations.entries(names)}
+    entries = {one.key: one for one in observations.entries(task.observation_names)}
     return [
         {
             "key": key,

@@ -21,7 +21,7 @@ from cathsim_dmc.physics.stepper import SingleStepper, Stepper
 from cathsim_dmc.tasks import cases, observations, rehearsal
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
-from cathsim_dmc.tasks.objectives import Cannulation, Objective, Shiftable
+from cathsim_dmc.tasks.objectives import Objective
 from cathsim_dmc.tasks.observation_kind import OPENGL, FrameObservable, Sizes
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.scene import Scene
@@ -46,6 +46,7 @@ class Navigation(composer.Task, NotCopied):
         config: Options.
         options: Options given to `suite.make_task`; empty for a task made without it.
         num_actions: A, entries of an action.
+        observation_names: Names of the observations, joined ones included.
         rollout: State of the episode; set when an environment compiles the model.
         stepper: Does the rollout's physics steps; set likewise.
     """
@@ -89,33 +90,19 @@ class Navigation(composer.Task, NotCopied):
             config = dataclasses.replace(config, fluoroscopy=aimed)
         self.config = config
         self._random_state = bounds.random_state("random", random)
-        if config.randomisation.goal_shift and not isinstance(objective, Shiftable):
-            raise ValueError(
-                f"randomisation shifts the goal, but {type(objective).__name__} has no "
-                "shifted(shift): derive it from tasks.objectives.Shiftable, or leave "
-                "goal_shift out"
-            )
-        own = isinstance(objective, Cannulation) and objective.goal_arc_length is None
-        if config.randomisation.farthest_shift and own:
-            raise ValueError(
-                "randomisation shifts the goal away from the ostium, but the route of "
-                f"{type(objective).__name__} ends at the goal: give the function of "
-                "the task's objective a keyword farthest_shift and hand it on to "
-                "Cannulation.to, or leave goal_shift out"
-            )
+        cases.check_shift(objective, config.randomisation)
         self.num_actions = len(scene.catheter.action_names)
-        living = config.vessel.living
-        self._names = observations.resolve(
-            config.observation, scene.catheter.coaxial, living
+        self.observation_names = observations.resolve(
+            config.observation, scene.catheter.coaxial, config.vessel.living
         )
-        if observations.needs(self._names, OPENGL):
-            if config.vessel.motion is not None or others is not None:
-                raise ValueError(
-                    f"the observation is {config.observation!r}: MuJoCo's cameras show "
-                    "one anatomy at rest, and this task has several or moves it; "
-                    "observe image, segmentation or endoluminal, or take a pool of 1 "
-                    "and a vessel that does not move"
-                )
+        changes = config.vessel.motion is not None or others is not None
+        if changes and observations.needs(self.observation_names, OPENGL):
+            raise ValueError(
+                f"the observation is {config.observation!r}: MuJoCo's cameras show one "
+                "anatomy at rest, and this task has several or moves it; observe "
+                "image, segmentation or endoluminal, or take a pool of 1 and a vessel "
+                "that does not move"
+            )
         self.set_timesteps(CONTROL_TIMESTEP, config.physics_timestep)
         self._cases: tuple[cases.Case, ...] = ()
         if others is not None:
@@ -129,7 +116,8 @@ class Navigation(composer.Task, NotCopied):
         chosen = self._cases or [
             cases.Case(self._scene, self._objective, model, self.config)
         ]
-        return Rollout(chosen, self.config, model, stepper, self.observation_specs)
+        names, specs = self.observation_names, self.observation_specs
+        return Rollout(chosen, self.config, model, stepper, names, specs)
 
     @property
     def effects(self) -> list[Effect]:
@@ -154,7 +142,8 @@ class Navigation(composer.Task, NotCopied):
         return (
             f"<{self.name}: {anatomy}, goal {scene.goal.name!r} within "
             f"{1e3 * self.objective.goal_radius:g} mm, device {inner}, "
-            f"{self.num_actions} actions, observation {', '.join(self._names)}>"
+            f"{self.num_actions} actions, observation "
+            f"{', '.join(self.observation_names)}>"
         )
 
     # Composer's hooks.
@@ -168,19 +157,18 @@ class Navigation(composer.Task, NotCopied):
     def task_observables(self):
         """One observable per entry of the chosen observations."""
         return {
-            key: FrameObservable(lambda _, key=key: self._seen[key][0], spec)
+            key: FrameObservable(
+                lambda _, key=key: self._current().observation[key][0], spec
+            )
             for key, spec in self.observation_specs.items()
         }
 
     @property
     def observation(self) -> Mapping[str, np.ndarray]:
         """Observation after the last control step or at the start, arrays (1, ...)."""
-        return {key: np.array(value) for key, value in self._seen.items()}
-
-    @property
-    def _seen(self) -> Mapping[str, np.ndarray]:
-        """The observation, which may share memory with the readings."""
-        return self._current().observation
+        # What the rollout observes may share memory with its readings.
+        found = self._current().observation
+        return {key: np.array(value) for key, value in found.items()}
 
     @property
     def observation_specs(self) -> dict[str, dm_env.specs.Array]:
@@ -191,12 +179,12 @@ class Navigation(composer.Task, NotCopied):
             actions=self.num_actions,
             joints=common.num_joints,
             links=common.num_links,
-            devices=len(chain.devices) if self._scene.catheter.coaxial else 0,
+            devices=len(chain.devices) if chain.coaxial else 0,
             fluoroscopy=config.fluoroscopy,
             endoluminal=config.endoluminal_size,
             cameras=config.cameras,
         )
-        return observations.entry_specs(self._names, sizes)
+        return observations.entry_specs(self.observation_names, sizes)
 
     @property
     def info_types(self) -> dict[str, type]:

@@ -76,6 +76,7 @@ class Rollout(Restorable):
         config: NavigationConfig,
         model: mujoco.MjModel,
         stepper: Stepper,
+        names: Sequence[str],
         specs: Mapping[str, dm_env.specs.Array],
     ):
         """Prepares the rollout; `begin` begins the episodes.
@@ -84,16 +85,14 @@ class Rollout(Restorable):
             cases: Anatomies with their objectives; if there are several, each episode
                 draws one.
             stepper: Steps the N simulations.
+            names: Names of the observations, joined ones included.
             specs: Specs of the entries of the observation of one simulation.
         """
         self._cases, self._config, self._stepper = tuple(cases), config, stepper
         count, scene = stepper.num_simulations, cases[0].scene
-        self._case_of, self._specs = np.zeros(count, dtype=int), specs
+        self._case_of = np.zeros(count, dtype=int)
+        self._names, self._specs = names, specs
         self._state = state = stepper.arrays
-        living = config.vessel.living
-        self._names = observations.resolve(
-            config.observation, scene.catheter.coaxial, living
-        )
         self.index = ModelIndex(model, scene.catheter, scene.robot)
         self._read = self.index.reader(state)
         self.effects = config.effects_on(scene.catheter)
@@ -114,10 +113,10 @@ class Rollout(Restorable):
         self._description = describe(scene, cases, self.effects, model, config)
         for index in range(count):
             self._enter(index)
-        self.progress = Progress(self._names, cases, count, config.give_up)
+        self.progress = Progress(names, cases, count, config.give_up)
         self._chain = CommonChain(scene.catheter, config.shaft_link)
-        self._sensors = ImageSensors(self._names, self._cases, count, self._chain)
-        self.views = Views(self._names, config, world, self.effects)
+        self._sensors = ImageSensors(names, self._cases, count, self._chain)
+        self.views = Views(names, config, world, self.effects)
         self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
