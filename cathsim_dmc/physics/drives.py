@@ -102,7 +102,8 @@ class Drives:
         if load is None:
             load = self._arrays.sensordata[:, self._sensed]
         command, load = map(np.ascontiguousarray, (command, load))
-        drive.follow(*self.bound[:2], command, load, self.bound.told, slip)
+        bound = self.bound
+        drive.follow(bound.servos, bound.state, command, load, bound.told, slip)
         return slip
 
 

@@ -1,8 +1,7 @@
 """Forces between device and wall, as functions of the contact sensor's readings."""
 
 import dataclasses
-import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -105,12 +104,7 @@ def wall_force(rows: np.ndarray) -> tuple[WallForce, np.ndarray]:
     Returns:
         Forces, arrays (N,), and the depth (N,) of the deepest contact, m.
     """
-    found = _loops().summed(rows, CONTACT_SIZE)
-    return WallForce._make(found[:6]), found[6]
-
-
-@functools.cache
-def _loops() -> Any:
     from cathsim_dmc.physics import forces_loops  # late, as numba takes long
 
-    return forces_loops
+    found = forces_loops.summed(rows, CONTACT_SIZE)
+    return WallForce._make(found[:6]), found[6]

@@ -14,7 +14,16 @@ from numpy.random import RandomState
 from cathsim_dmc import rows
 from cathsim_dmc.anatomy import Anatomy, Surface
 from cathsim_dmc.anatomy.motion import PARAMETERS, Motion
-from cathsim_dmc.laws.motion import MotionParameters
+from cathsim_dmc.compiled import compiled
+from cathsim_dmc.laws.motion import (
+    VALUES,
+    WARP,
+    MotionParameters,
+    first_past,
+    nth_course,
+    to_rest,
+    to_space,
+)
 from cathsim_dmc.physics.effects import Draw, Effect, World
 from cathsim_dmc.physics.randomisation import Drawn, check_drawn, drawn
 from cathsim_dmc.physics.readings import Readings
@@ -158,26 +167,22 @@ class Moving(Effect):
 
     def at_rest(self, state: Readings) -> Readings:
         """Readings with centreline and head past the inlet mapped to rest."""
-        from cathsim_dmc.physics import motion_loops  # late, as numba takes long
-
         places, times = state.centreline.copy(), self.times
 
         def move(motion: Motion, own: np.ndarray) -> None:
             given = self.world.parameters, times
-            motion_loops.to_rest_of(motion.lattice, own, given, self.inlets, places)
+            _to_rest_of(motion.lattice, own, given, self.inlets, places)
 
         rows.of_each(self.alike, move)
         return state._replace(centreline=places, head=places[:, -1])
 
     def to_space(self, points: np.ndarray) -> np.ndarray:
         """Places in space (N, 3) of places at rest (N, 3), m."""
-        from cathsim_dmc.physics import motion_loops  # late, as numba takes long
-
         places, times = np.array(points), self.times
 
         def move(motion: Motion, own: np.ndarray) -> None:
             given = self.world.parameters, times
-            motion_loops.to_space_of(motion.lattice, own, given, places)
+            _to_space_of(motion.lattice, own, given, places)
 
         rows.of_each(self.alike, move)
         return places
@@ -203,3 +208,32 @@ def add_clock(root) -> None:
     inertia = [_CLOCK_MASS * 1e-4] * 3
     clock.add("inertial", pos=[0, 0, 0], mass=_CLOCK_MASS, diaginertia=inertia)
     clock.add("joint", name="vessel_clock", type="slide", axis=[1, 0, 0])
+
+
+@compiled
+def _to_rest_of(lattice, own, given, inlets, places):
+    """Maps places past the inlet from space to the vessel at rest, in place.
+
+    Args:
+        lattice: Lattice of `anatomy.motion.Motion`.
+        own: (n,) int64, indices of the simulations of its anatomy.
+        given: `MotionParameters` of arrays (N,), and times (N,), s.
+        inlets: (N, 2, 3), position (m) and direction of the inlets.
+        places: (N, P, 3) m, in space; overwritten with the places at rest.
+    """
+    parameters, times = given
+    scratch = np.empty((VALUES + WARP // 4, 4))
+    for n in own:
+        course = nth_course(parameters, n, times[n])
+        moved = places[n, first_past(inlets[n], places[n]) :]
+        to_rest(lattice, course, moved, scratch, moved)
+
+
+@compiled
+def _to_space_of(lattice, own, given, places):
+    """Maps places (N, 3) m of the vessel at rest into space, see `_to_rest_of`."""
+    parameters, times = given
+    scratch, growth = np.empty((VALUES + WARP // 4, 4)), np.empty(1)
+    for n in own:
+        course, one = nth_course(parameters, n, times[n]), places[n : n + 1]
+        to_space(lattice, course, one, scratch, one, growth)

@@ -55,15 +55,13 @@ class VesselReadings(NamedTuple):
 
 def read(
     effects: Sequence[Effect], time: np.ndarray, state: Readings, rows: np.ndarray
-) -> VesselReadings | None:
-    """State of the vessels at times (N,), s; None if they are not living.
+) -> VesselReadings:
+    """State of living vessels at times (N,), s.
 
     Args:
         effects: Effects of the task.
         rows: (N, M * 14), rows of the wall's sensor.
     """
-    if not any(isinstance(effect, Flow) for effect in effects):
-        return None
     from cathsim_dmc.physics import forces_loops  # late, as numba takes long
 
     deepest, work = forces_loops.pressed(rows, forces.CONTACT_SIZE)
@@ -117,7 +115,7 @@ class VesselOptions:
     @property
     def living(self) -> bool:
         """Whether the vessel has a flow, a compliant wall or a motion."""
-        return not self.flow == self.wall == self.motion
+        return any(part is not None for part in (self.flow, self.wall, self.motion))
 
     def effects(self) -> tuple[StillBlood, list[Effect]]:
         """Returns the effect of the blood, and those of the wall."""

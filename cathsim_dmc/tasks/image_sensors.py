@@ -1,6 +1,7 @@
 """Image sensors of N simulations, with the last few images of each."""
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,27 @@ from cathsim_dmc.tasks.observation_kind import BIPLANE, FLUOROSCOPY
 _BIPLANE = ("biplane", "biplane_retry")
 _OF_IMAGES = ("image", "sequential", *_BIPLANE)
 _SHOWING = (*_OF_IMAGES, "segmentation")  # the vessel, too
+
+
+class Exposure(NamedTuple):
+    """What N machines image in a control step.
+
+    Attributes:
+        line: (N, n, 3), centrelines of the chains, m.
+        ends: (N, m, 3), tracked points of coaxial devices, m.
+        goal: (N, 3), m.
+        shadows: X-ray shadows of the devices.
+        handles: (N, 3, 3), orientation of the handles, axes in columns.
+        last: (N,), last arc lengths of the heads on their routes, m, see
+            `BiplaneSight.see`.
+    """
+
+    line: np.ndarray
+    ends: np.ndarray
+    goal: np.ndarray
+    shadows: Sequence[Shadow]
+    handles: np.ndarray
+    last: np.ndarray
 
 
 class ImageSensors:
@@ -68,12 +90,9 @@ class ImageSensors:
         self,
         rows: np.ndarray,
         begins: bool,
-        points: Sequence[np.ndarray],
-        shadows: Sequence[Shadow],
-        handles: np.ndarray,
+        exposure: Exposure,
         random_states: Sequence[np.random.RandomState] | None,
         around: Callable[[angiographs.Planes, int], angiographs.Planes],
-        last: np.ndarray,
     ) -> None:
         """Captures the next images; requires `planes`.
 
@@ -81,17 +100,13 @@ class ImageSensors:
             rows: (K,) numbers of the simulations whose images are captured.
             begins: Whether they begin an episode, so that the images fill their
                 history. If not, the images of all N are captured.
-            points: Centrelines of the chains (N, n, 3), tracked points of coaxial
-                devices (N, m, 3), and goals (N, 3), m.
-            handles: (N, 3, 3), orientation of the handles, axes in columns.
+            exposure: Devices and goals of all N.
             random_states: N sources of quantum noise, None for images without noise.
             around: Function from a simulation's planes and its number to the planes
                 with its vessel as moved.
-            last: (N,), last arc lengths of the heads on their routes, m, see
-                `BiplaneSight.see`.
         """
         planes = [self.planes[index] for index in rows]
-        own = [shadow.of(rows) for shadow in shadows]
+        own = [shadow.of(rows) for shadow in exposure.shadows]
         if self._wants(_SHOWING):
             planes = list(map(around, planes, rows.tolist()))
         if self._wants(_OF_IMAGES):
@@ -99,32 +114,40 @@ class ImageSensors:
             if random_states is not None and self._noise:
                 noise = [random_states[index] for index in rows]
             image = angiographs.images(planes, own, noise)
-            for age in reversed(range(observations.SEQUENCE_LENGTH)):
-                if begins or not age:
-                    self.hold(f"past_{age}", image, rows)
-                else:
-                    last_one = self.images[f"past_{age - 1}"]
-                    self.images[f"past_{age}"] = array_rows.copied(last_one)
+            self._append(rows, begins, image)
             if self._wants(_BIPLANE):
-                # The roadmaps show the vessel at rest.
-                resting = [self.planes[index] for index in rows]
-                marked = angiographs.pixels(resting, points[-1][rows, None])[:, :, 0]
                 if begins and random_states is not None:
                     self.sight.draw(rows, random_states)
-                seen = self.sight.see(
-                    [(self.planes[index], self.thirds[index]) for index in rows],
-                    image, marked, handles[rows], rows, begins, last[rows],
-                )  # fmt: skip
-                for key, value in seen.items():
-                    if key != "place" or "biplane_retry" in self._names:
-                        self.hold(f"biplane_{key}", value, rows)
+                self._reconstruct(rows, begins, image, exposure)
         if "segmentation" in self._names:
             self.hold("masks", angiographs.masks(planes, own), rows)
         if "tracking_2d" in self._names:
-            line, devices, goal = points
-            seen = self._chain.tracked(line[rows]), devices[rows], goal[rows, None]
-            pixels = angiographs.pixels(planes, np.concatenate(seen, axis=-2))
-            self.hold("pixels", pixels, rows)
+            line, ends = self._chain.tracked(exposure.line[rows]), exposure.ends[rows]
+            points = np.concatenate([line, ends, exposure.goal[rows, None]], axis=-2)
+            self.hold("pixels", angiographs.pixels(planes, points), rows)
+
+    def _append(self, rows: np.ndarray, begins: bool, image: np.ndarray) -> None:
+        """Adds images (K, ...) to the history, or fills it with them."""
+        for age in reversed(range(observations.SEQUENCE_LENGTH)):
+            if begins or not age:
+                self.hold(f"past_{age}", image, rows)
+            else:
+                newer = self.images[f"past_{age - 1}"]
+                self.images[f"past_{age}"] = array_rows.copied(newer)
+
+    def _reconstruct(
+        self, rows: np.ndarray, begins: bool, image: np.ndarray, exposure: Exposure
+    ) -> None:
+        """Stores the entries of `biplane`, reconstructed from images (K, ...)."""
+        # The roadmaps show the vessel at rest.
+        machines = [(self.planes[index], self.thirds[index]) for index in rows]
+        resting, goal = [two for two, _ in machines], exposure.goal[rows, None]
+        marked = angiographs.pixels(resting, goal)[:, :, 0]
+        handles, last = exposure.handles[rows], exposure.last[rows]
+        seen = self.sight.see(machines, image, marked, handles, rows, begins, last)
+        for key, value in seen.items():
+            if key != "place" or "biplane_retry" in self._names:
+                self.hold(f"biplane_{key}", value, rows)
 
     def hold(self, name: str, image: np.ndarray, rows: np.ndarray) -> None:
         """Stores images (K, ...) of some simulations (K,)."""

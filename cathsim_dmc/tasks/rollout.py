@@ -26,7 +26,7 @@ from cathsim_dmc.tasks import observations, physics_errors
 from cathsim_dmc.tasks.cases import Case, objectives_of
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.image_sensors import ImageSensors
+from cathsim_dmc.tasks.image_sensors import Exposure, ImageSensors
 from cathsim_dmc.tasks.objectives import (
     Measurement,
     judge,
@@ -329,13 +329,15 @@ class Rollout(Restorable):
         state, devices = self._tracking.seen(self.readings, self.devices, random, rows)
         if sensors.planes and len(rows):
             ends = np.zeros((0, 3)) if devices is None else devices.points
-            ends = ends.reshape(len(goal), -1, 3)
-            points = state.centreline, ends, goal
-            handles = self.index.handles(self._state.cdof)
-            last = self.progress.steady(rows, begins)
-            sensors.capture(
-                rows, begins, points, self.shadows, handles, random, self.around, last
+            exposure = Exposure(
+                line=state.centreline,
+                ends=ends.reshape(len(goal), -1, 3),
+                goal=goal,
+                shadows=self.shadows,
+                handles=self.index.handles(self._state.cdof),
+                last=self.progress.steady(rows, begins),
             )
+            sensors.capture(rows, begins, exposure, random, self.around)
         if self.views.wanted and len(rows):
             scenes = [self.case(index).scene for index in rows]
             found = self.views.see(

@@ -65,7 +65,7 @@ class Views:
         stepper: Stepper,
         readings: Readings,
         moving: Moving | None,
-        begun: bool = True,
+        begun: bool,
     ) -> dict[str, np.ndarray]:
         """Renders the views of some simulations.
 
