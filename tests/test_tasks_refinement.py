@@ -1,11 +1,14 @@
 """Control steps that are done again with shorter physics steps."""
 
+import threading
+
+import mujoco
 import numpy as np
 import pytest
 from conftest import twin
 
 from cathsim_dmc import suite
-from cathsim_dmc.physics import forces
+from cathsim_dmc.physics import deep_links, forces
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.simulation.batch import BatchSimulation, _BatchStepper
 
@@ -154,3 +157,22 @@ def test_what_diverges_is_done_again_in_both_paths(monkeypatch):
     # Faster still, it diverges in shorter steps, too.
     batch.batch.qvel[0, hinges] = 1e4 * whip
     assert batch.step(0.0 * push).errors[0] is not None
+
+
+def test_what_does_not_move_is_no_link():
+    text = """<mujoco><worldbody>
+      <geom size="0.1" contype="0" conaffinity="1"/>
+      <body mocap="true"><geom size="0.1" contype="0" conaffinity="1"/></body>
+      <body><joint/><joint axis="1 0 0"/><body>
+        <geom size="0.1" contype="0" conaffinity="1"/>
+      </body></body>
+    </worldbody></mujoco>"""
+    model, found = mujoco.MjModel.from_xml_string(text), []
+    # In a thread: a search for the joint of the world has no end.
+    search = threading.Thread(
+        target=lambda: found.append(deep_links.moving(model)), daemon=True
+    )
+    search.start()
+    search.join(timeout=20.0)
+    (links,) = found
+    assert (links.bodies.tolist(), links.last.tolist()) == ([3], [1])

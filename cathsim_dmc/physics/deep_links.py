@@ -37,16 +37,20 @@ class Links(NamedTuple):
 
 
 def moving(model: mujoco.MjModel) -> Links:
-    """The links of a model that can touch a wall."""
-    links = np.flatnonzero((model.geom_contype == 0) & (model.geom_conaffinity != 0))
-    bodies, last = model.geom_bodyid[links], []
-    for body in bodies:
-        while model.body_dofnum[body] == 0:
-            body = model.body_parentid[body]
-        last.append(model.body_dofadr[body] + model.body_dofnum[body] - 1)
+    """The links of a model that move and can touch a wall."""
+    touches = (model.geom_contype == 0) & (model.geom_conaffinity != 0)
+    links = np.flatnonzero(touches & (last_dofs(model, model.geom_bodyid) >= 0))
+    bodies = model.geom_bodyid[links]
     reach = np.linalg.norm(model.geom_pos[links], axis=1) + model.geom_size[links, 1]
-    roots = model.body_rootid[bodies]
-    return Links(model.dof_parentid.copy(), bodies, np.array(last), roots, reach)
+    last, roots = last_dofs(model, bodies), model.body_rootid[bodies]
+    return Links(model.dof_parentid.copy(), bodies, last, roots, reach)
+
+
+def last_dofs(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
+    """Last degree of freedom (n,) that moves each of some bodies (n,); -1 for none."""
+    moved = model.body_weldid[bodies]
+    last = model.body_dofadr[moved] + model.body_dofnum[moved] - 1
+    return np.where(model.body_dofnum[moved] > 0, last, -1)
 
 
 @compiled

@@ -10,6 +10,7 @@ import numpy as np
 
 from cathsim_dmc.collision.fields import Registered, registered
 from cathsim_dmc.laws.planes import MOST
+from cathsim_dmc.physics.deep_links import last_dofs
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.simulation.warp.contact_arrays import (
     ROW,
@@ -209,33 +210,20 @@ def _links(model: mujoco.MjModel, carriers: np.ndarray) -> Links:
             "a geom beside links and walls collides in this scene; simulation on Warp "
             "has contacts of links with walls only: take simulation_device='cpu'"
         )
-    bodies, joints, last = model.geom_bodyid[geoms], [], []
-    for body in bodies.tolist():
-        joints.append(body if model.body_parentid[body] else -1)
-        while body > 0 and model.body_dofnum[body] == 0:
-            body = model.body_parentid[body]
-        last.append(model.body_dofadr[body] + model.body_dofnum[body] - 1)
-    priority = model.geom_priority
+    bodies, priority = model.geom_bodyid[geoms], model.geom_priority
     above = np.sign(priority[None, carriers] - priority[geoms, None])
     own, other = model.geom_condim[geoms, None], model.geom_condim[None, carriers]
     mixed = np.maximum(own, other)
     dims = np.where(above > 0, other, np.where(above < 0, own, mixed))
     weights = model.geom_solmix[geoms, None], model.geom_solmix[None, carriers]
-    whole = Links(
-        geoms=geoms,
-        joints=joints,
-        carriers=carriers,
-        last_dof=last,
+    return Links(
+        geoms=geoms.astype(np.int32),
+        joints=np.where(model.body_parentid[bodies] > 0, bodies, -1),
+        carriers=carriers.astype(np.int32),
+        last_dof=last_dofs(model, bodies),
         roots=model.body_rootid[bodies],
         parents=model.dof_parentid,
         dims=dims,
         priorities=above,
         mix=weights[0] / sum(weights),
-    )
-    return whole._replace(
-        **{
-            name: np.asarray(each, np.int32)
-            for name, each in whole._asdict().items()
-            if name != "mix"
-        }
     )
