@@ -18,6 +18,7 @@ import numpy as np
 
 from cathsim_dmc import bounds, extras
 from cathsim_dmc.compiled import compiled, for_cuda
+from cathsim_dmc.compiled_parts import uncollected
 
 # Threads of a block where there are more than `_MANY` threads in all.
 _THREADS, _MANY = 64, 32_768
@@ -62,16 +63,10 @@ class Device:
 
         Garbage collection is off meanwhile: CUDA ends a capture if memory is freed.
         """
-        collects = gc.isenabled()
         gc.collect()
-        gc.disable()
-        try:
-            with self.active(), _cuda().defer_cleanup():
-                with self._warp.ScopedCapture() as capture:
-                    yield capture
-        finally:
-            if collects:
-                gc.enable()
+        with uncollected(), self.active(), _cuda().defer_cleanup():
+            with self._warp.ScopedCapture() as capture:
+                yield capture
 
     def constant(self, values: Any) -> Any:
         """A copy on the device of an array, or of a named tuple of arrays."""
