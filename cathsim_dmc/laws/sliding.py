@@ -227,33 +227,6 @@ def settle(devices, loads, state, scratch, chain):
 
 
 @compiled
-def held(insertion, reached, where):
-    """Writes the insertions (N, K) of all devices, m.
-
-    The leading device is at `reached` (N,); the others are as commanded by `insertion`
-    (N, K), at most at `reached`.
-    """
-    count, devices = insertion.shape
-    for i in range(count):
-        leader = 0
-        for k in range(devices):
-            where[i, k] = min(insertion[i, k], reached[i])
-            if insertion[i, k] > insertion[i, leader]:
-                leader = k
-        where[i, leader] = reached[i]
-
-
-@compiled
-def gaps(insertion, ways):
-    """Writes the distance (N, K) from the end of each device to the chain's, m."""
-    count, devices = insertion.shape
-    for i in range(count):
-        farthest = insertion[i].max()
-        for k in range(devices):
-            ways[i, k] = farthest - insertion[i, k]
-
-
-@compiled
 def advance(before, step, limits, target, lead):
     """Writes the target insertions (N, K) of the devices and (N,) of the chain, m.
 

@@ -32,11 +32,5 @@ def points_at(line: np.ndarray, places: np.ndarray, nodes: np.ndarray) -> np.nda
 
 
 def gaps_of(insertion: np.ndarray) -> np.ndarray:
-    """Distances (N, K) from the ends of the devices to the end of the chain, m.
-
-    Args:
-        insertion: (N, K), m.
-    """
-    ways = np.empty_like(insertion)
-    sliding.gaps(insertion, ways)
-    return ways
+    """Distances (N, K), m, of the ends of devices behind the one that leads."""
+    return insertion.max(axis=1, keepdims=True) - insertion

@@ -118,12 +118,9 @@ class SlidingDevices(SingleDevice):
         for each in (self._angles, self.slipped, self._ways, self._drag):
             each[index] = 0.0
         self._axial[index] = self._others[index] = 0.0
-        drawn = episode.friction, episode.stiffness, episode.loss
-        usual = self._entity.friction, 1.0, 1.0
-        self._friction[index], *self._factors[index] = (
-            default if value is None else value
-            for value, default in zip(drawn, usual, strict=True)
-        )
+        friction, factors = episode.friction, (episode.stiffness, episode.loss)
+        self._friction[index] = self._entity.friction if friction is None else friction
+        self._factors[index] = [1.0 if each is None else each for each in factors]
         self._fields[index] = fields = chain_fields.fields_of(
             lambda name: self.world.field(index, name)
         )
@@ -185,7 +182,7 @@ class SlidingDevices(SingleDevice):
     def _settle(self, rate: np.ndarray, lead: np.ndarray, state: Readings) -> None:
         """Turns the devices, writes the chains and finds the forces of the drives."""
         nodes, turned = self._stack.nodes, MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
-        gaps = gaps_of(np.ascontiguousarray(self._insertion))
+        gaps = gaps_of(self._insertion)
         # The sheath is frictionless.
         depth, outside = self.world.start_depth, state.external_force
         force = np.empty(outside.shape[:2])
@@ -261,13 +258,12 @@ class SlidingDevices(SingleDevice):
     def _pushed(self, reached: np.ndarray | None = None) -> np.ndarray:
         """Insertions (N, K) at which the devices come to rest, m.
 
-        `reached` (N,) is that of the chain; None for that of its drive.
+        The leading device is at `reached` (N,), that of the chain; None for that of its
+        drive. The others are as commanded, at most at that insertion.
         """
         place = self._drives.resting()[:, 0] if reached is None else reached
-        place = np.ascontiguousarray(place)
-        told = np.ascontiguousarray(self._insertion)
-        where = np.empty_like(told)
-        sliding.held(told, place, where)
+        where = np.minimum(self._insertion, place[:, None])
+        where[np.arange(len(where)), self._insertion.argmax(axis=1)] = place
         return where
 
     def pose_robot(self) -> None:

@@ -32,6 +32,7 @@ import numpy as np
 
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.physics import forces
+from cathsim_dmc.physics.device_points import gaps_of
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.policies import attempts
 from cathsim_dmc.policies.attempts import AttemptSettings, State
@@ -198,7 +199,7 @@ def _directions(
 
     The rotation is about the axis of the device, the angle is to that axis.
     """
-    behind = coaxial_ends.gaps(devices.insertion)
+    behind = gaps_of(devices.insertion)
     targets = plan.at(place.arc_length[:, None] - behind + ahead[:, None])
     ways = plan.ends.directions(readings, devices.insertion, targets)
     return coaxial_ends.turns(ways, devices.tip_rotation)

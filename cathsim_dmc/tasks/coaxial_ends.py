@@ -12,6 +12,7 @@ import numpy as np
 from cathsim_dmc.entities import posture
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.physics.device_points import gaps_of
 from cathsim_dmc.physics.readings import Readings
 
 
@@ -44,7 +45,7 @@ class CoaxialEnds:
             insertion: (N, K), insertions of the devices, m.
             targets: (N, K, 3), m, world frame.
         """
-        behind_first = gaps(insertion)
+        behind_first = gaps_of(insertion)
         rows, last = np.arange(len(insertion)), len(self.nodes) - 2
         frames, ways = [readings.head_frame], np.empty(targets.shape)
         for k in range(behind_first.shape[1]):
@@ -56,11 +57,6 @@ class CoaxialEnds:
             way = targets[:, k] - readings.centreline[rows, link]
             ways[:, k] = np.einsum("nij,ni->nj", frame, way)
         return ways
-
-
-def gaps(insertion: np.ndarray) -> np.ndarray:
-    """Distances (N, K) of the ends of coaxial devices behind the leading one, m."""
-    return insertion.max(axis=1, keepdims=True) - insertion
 
 
 def before(frame: np.ndarray, joints: np.ndarray, number: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from cathsim_dmc.physics.device_points import gaps_of
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings, part
 from cathsim_dmc.tasks import coaxial_ends, observations, retry, take_offs
 from cathsim_dmc.tasks.cases import Case
@@ -243,7 +244,7 @@ class Progress:
                 point, m.
         """
         assert self._ends is not None
-        ends = place.arc_length[:, None] - coaxial_ends.gaps(devices.insertion) + ahead
+        ends = place.arc_length[:, None] - gaps_of(devices.insertion) + ahead
         targets = np.empty((*ends.shape, 3))
         for number in np.unique(chosen).tolist():
             rows = chosen == number
