@@ -82,17 +82,11 @@ def fields(
         prefix: Prefix of the names in error messages.
         positive: Names of the attributes that must exceed 0.
     """
-    return {
-        name: number(
-            f"{prefix}{name}",
-            getattr(owner, name),
-            low,
-            high,
-            unit,
-            positive=name in positive,
-        )  # fmt: skip
-        for name, (low, high, unit) in limits.items()
-    }
+    found = {}
+    for name, (low, high, unit) in limits.items():
+        value, above = getattr(owner, name), name in positive
+        found[name] = number(f"{prefix}{name}", value, low, high, unit, positive=above)
+    return found
 
 
 def settings(owner: Any, limits: Mapping[str, tuple[float, float]]) -> None:

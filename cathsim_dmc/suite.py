@@ -307,9 +307,5 @@ def _register_domain() -> None:
     dm_suite.TASKS_BY_DOMAIN = grouped
 
 
-def _register_own() -> None:
-    for name, definition, tags in registered.definitions():
-        register(name, definition, *tags)
-
-
-_register_own()
+for _name, _definition, _tags in registered.definitions():
+    register(_name, _definition, *_tags)

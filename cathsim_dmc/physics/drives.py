@@ -54,7 +54,7 @@ class Drives:
         stiffness, speed = -spring[:, 1], gain / -spring[:, 1]
         # A step s of the rest place moves a critically damped mass at s √(K/m) / e.
         rise = np.sqrt(stiffness * model.dof_armature[dofs]) * speed * math.e
-        self._servos = drive.Servos(
+        servos = drive.Servos(
             qpos=model.jnt_qposadr[joints],
             dof=dofs,
             act=model.actuator_actadr[found],
@@ -68,14 +68,14 @@ class Drives:
         self._sensed = np.array([_load_sensor(model, joint) for joint in joints])
         self.slipped, self.told = np.zeros((2, len(arrays.qpos), len(found)))
         self.bound = Bound(
-            servos=self._servos,
+            servos=servos,
             state=drive.State(arrays.qpos, arrays.qvel, arrays.act),
             told=drive.Told(self.told, self.slipped),
         )
 
     def hold(self, index: int) -> None:
         """Sets the command of one simulation to where its base stands."""
-        servos = self._servos
+        servos = self.bound.servos
         place = self._arrays.qpos[index, servos.qpos]
         self._arrays.act[index, servos.act] = place * servos.stiffness / servos.gain
         self.told[index] = place
@@ -84,7 +84,7 @@ class Drives:
     def resting(self) -> np.ndarray:
         """Places (N, D) at which the bases come to rest after slip, m and rad."""
         slip = np.empty_like(self.told)
-        drive.slip(self._servos, self.bound.state, slip)
+        drive.slip(self.bound.servos, self.bound.state, slip)
         return self.told - slip
 
     def follow(self, command: np.ndarray, load: np.ndarray | None = None) -> np.ndarray:

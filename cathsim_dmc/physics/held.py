@@ -46,11 +46,10 @@ class Held:
         lengths = chain.link_lengths
         self.ends = np.cumsum(lengths)[:-1] - np.sum(lengths)
         joint = np.searchsorted(model.jnt_qposadr, bends_qpos)
-        dofs, qpos = model.jnt_dofadr[joint].astype(np.int64), bends_qpos
         self.joints = sheath.Joints(
             joint=joint,
-            dof=dofs,
-            qpos=qpos.astype(np.int64),
+            dof=model.jnt_dofadr[joint].astype(np.int64),
+            qpos=bends_qpos.astype(np.int64),
             behind=lengths[:-1] / 2,
             ahead=lengths[1:] / 2,
             distal=chain.distal_shares,
@@ -99,14 +98,11 @@ class Released(Effect):
     def bind(self, world: World) -> None:
         """Finds the hinges of the device in the model."""
         super().bind(world)
-        joints = ids(world.model, world.chain.hinges)
-        dofs, qpos = (
-            getattr(world.model, name)[joints] for name in ("jnt_dofadr", "jnt_qposadr")
-        )
-        places = dict(zip(FIELDS, (joints, dofs, qpos), strict=True))
+        model, joints = world.model, ids(world.model, world.chain.hinges)
+        places = joints, model.jnt_dofadr[joints], model.jnt_qposadr[joints]
         self._nominal = [
-            (name, where, getattr(world.model, name)[where])
-            for name, where in places.items()
+            (name, where, getattr(model, name)[where])
+            for name, where in zip(FIELDS, places, strict=True)
         ]
 
     def restart(self, index: int, episode: Draw, random_state: RandomState) -> None:

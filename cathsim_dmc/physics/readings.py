@@ -183,8 +183,10 @@ class ModelIndex:
 
 def part(measured: Any, rows: np.ndarray | slice | int) -> Any:
     """Rows of all arrays of a named tuple and of nested ones; None is kept."""
-    if measured is None or isinstance(measured, np.ndarray):
-        return measured if measured is None else measured[rows]
+    if measured is None:
+        return None
+    if isinstance(measured, np.ndarray):
+        return measured[rows]
     return type(measured)._make(part(value, rows) for value in measured)
 
 
@@ -197,10 +199,11 @@ def copied(measured: Any) -> Any:
 
 def merged(old: Any, new: Any, rows: np.ndarray) -> Any:
     """A copy of `old` with `new` in some rows of its arrays (N, ...)."""
-    if old is None or isinstance(old, np.ndarray):
-        array = old if old is None else old.copy()
-        if array is not None:
-            array[rows] = new
+    if old is None:
+        return None
+    if isinstance(old, np.ndarray):
+        array = old.copy()
+        array[rows] = new
         return array
     pairs = zip(old, new, strict=True)
     return type(old)._make(merged(before, now, rows) for before, now in pairs)

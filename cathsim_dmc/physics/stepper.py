@@ -229,16 +229,12 @@ class Stepper(abc.ABC):
             control steps was too coarse, or may end too deep.
         """
         limits, way = (forces.HARDEST, limit, self._timestep), np.empty_like(depth)
-        if len(way) < rows.MANY:
-            motion, links = self._motion, self._links
-            return way, deep_links.in_doubt(peak, depth, limits, motion, links, way)
         doubt: list[bool] = []
 
-        def measure(part: slice) -> None:
-            motion = deep_links.Motion._make(each[part] for each in self._motion)
-            links, own = self._links, way[part]
+        def measure(own: slice) -> None:
+            motion, links = readings.part(self._motion, own), self._links
             found = deep_links.in_doubt(
-                peak[part], depth[part], limits, motion, links, own
+                peak[own], depth[own], limits, motion, links, way[own]
             )
             doubt.append(found)
 

@@ -19,6 +19,7 @@ from cathsim_dmc.tasks.snapshot import Snapshot
 
 RENDER_MODES = ("rgb_array",)
 VERSION = 0  # of the ids
+_NO_MODE = 'render() without a render_mode; make the environment with "rgb_array"'
 
 
 def space(spec: specs.Array, dtype: np.dtype) -> gymnasium.spaces.Box:
@@ -155,9 +156,7 @@ class CathSimEnv(gymnasium.Env):
     def render(self) -> np.ndarray | None:
         """Fluoroscopy (rows, columns, 3) uint8, two planes side by side."""
         if self.render_mode is None:
-            gymnasium.logger.warn(
-                'render() without a render_mode; make the environment with "rgb_array"'
-            )
+            gymnasium.logger.warn(_NO_MODE)
             return None
         if self._ended is None:
             raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")
@@ -288,9 +287,8 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         self._ended, final = terminated | truncated, {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
             waiting, self._ended = self._ended, np.zeros(self.num_envs, bool)
-            final = _final(
-                _converted(step.observation, self._dtype), step.info(), waiting
-            )
+            last = _converted(step.observation, self._dtype)
+            final = _final(last, step.info(), waiting)
         if waiting.any():
             step = self.simulation.reset(np.flatnonzero(waiting))
         observation = _converted(step.observation, self._dtype)
@@ -316,16 +314,13 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         _require_open(self.closed)
         step = self.simulation.restore(snapshot)
         self._ended = step.terminated | step.truncated
-        everyone = np.ones(self.num_envs, bool)
-        info = _masked(step.info(), everyone)
+        info = _masked(step.info(), np.ones(self.num_envs, bool))
         return _converted(step.observation, self._dtype), info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Fluoroscopy of each simulation, see `CathSimEnv.render`."""
         if self.render_mode is None:
-            gymnasium.logger.warn(
-                'render() without a render_mode; make the environment with "rgb_array"'
-            )
+            gymnasium.logger.warn(_NO_MODE)
             return None
         if not hasattr(self.simulation.rollout, "readings"):
             raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")

@@ -67,9 +67,10 @@ class BatchedEnv(EnvBase):
             if given in options:
                 own = f"without {given}, for which there is the argument {argument}"
                 bounds.refuse("task_kwargs", options, own)
-        self._made = task_name, {**options, "observation": observation}
+        options["observation"] = observation
+        self._task_name, self._options = task_name, options
         self.simulation = _simulation(
-            suite.make_task(task_name, **{**options, "observation": observation}),
+            suite.make_task(task_name, **options),
             num_envs,
             bounds.text("device", device),
             num_threads=num_threads or 0,
@@ -98,7 +99,7 @@ class BatchedEnv(EnvBase):
     def __repr__(self) -> str:
         """Task, number of simulations and device."""
         (count,) = self.batch_size
-        return f"BatchedEnv({self._made[0]!r}, {count}, device={str(self.device)!r})"
+        return f"BatchedEnv({self._task_name!r}, {count}, device={str(self.device)!r})"
 
     def snapshot(self, indices: np.ndarray | None = None) -> Snapshot:
         """The state of some or all simulations; see `BatchSimulation.snapshot`."""
@@ -126,9 +127,8 @@ class BatchedEnv(EnvBase):
         Simulations without snapshots write none.
         """
         if self.simulation.stepper.has_snapshots:
-            self.simulation.error_files = ErrorFiles(
-                folder, self._made[0], self._made[1]
-            )
+            files = ErrorFiles(folder, self._task_name, self._options)
+            self.simulation.error_files = files
 
     def _reset(
         self,

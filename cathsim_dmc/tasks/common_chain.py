@@ -13,7 +13,7 @@ from cathsim_dmc import rows
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.devices import Discretisation
-from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.physics.readings import Readings, part
 from cathsim_dmc.tasks.placement import COMMON_LENGTH
 
 # Distances of the tracked points from the head, m. They are joints of the steerable
@@ -91,16 +91,11 @@ class CommonChain:
         inertia, velocity, force = (np.zeros((*shape, width)) for width in (10, 6, 6))
         found = LinkState(inertia, velocity, force)
 
-        def continue_(part: slice) -> None:
-            own, out = (
-                LinkState._make(a[part] for a in each) for each in (arrays, found)
-            )
-            _continued(own, state.centreline[part], self._behind, out)
+        def extend(own: slice) -> None:
+            line, out = state.centreline[own], part(found, own)
+            _continued(part(arrays, own), line, self._behind, out)
 
-        if len(force) < rows.MANY:
-            _continued(arrays, state.centreline, self._behind, found)
-        else:
-            rows.each(len(force), continue_)
+        rows.each(len(force), extend)
         return found
 
     def tracked(self, line: np.ndarray) -> np.ndarray:

@@ -154,7 +154,7 @@ def place_device(
     if direction is None:  # `start.StartPosture` refuses a device that stands in a wall
         direction = np.array(inlet.direction)
     quaternion = _frame(direction)
-    matrix = _matrix(quaternion)
+    matrix = matrix_of(quaternion)
     outside = np.array([0.0, 0.0, working_length - start_depth])
     # Longer than the inserted part of the device, whose links are chords of the line.
     ahead = np.arange(0.0, route.length, _LINE_SPACING)
@@ -199,7 +199,7 @@ def sheath_direction(anatomy: Anatomy, play: float = 0.0) -> np.ndarray | None:
     least = _CLEAR_OF_LUMEN + max(play - CLEARANCE, 0.0)
     if _clear(anatomy, along[None], least)[0]:
         return along
-    x, y, _ = _matrix(_frame(along)).T
+    x, y, _ = matrix_of(_frame(along)).T
     turns = np.arange(0.0, 2 * np.pi, _AZIMUTH_STEP)
     around = np.cos(turns)[:, None] * x + np.sin(turns)[:, None] * y
     for tilt in np.arange(_TILT_STEP, _LARGEST_TILT + 1e-9, _TILT_STEP):
@@ -232,7 +232,8 @@ def _way_to_branching(anatomy: Anatomy) -> float:
     return min(abs(place - start) for place in places)
 
 
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
+def matrix_of(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation matrix (3, 3) of a quaternion (4,), wxyz."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     return matrix.reshape(3, 3)

@@ -42,17 +42,14 @@ def describe(
     Devices and sheath may not: a snapshot holds stiffnesses of hinges, those held by
     the sheath too, and masses of links, some of which keep their values of the start.
     """
-    anatomies = {
-        f"{case.scene.anatomy.name} {case.scene.anatomy.digest}": (
-            case.scene.placement.start
-        )
-        for case in cases
-    }
-    # Ordered by the case number that a state holds.
-    numbered = [[case.scene.anatomy.name, case.scene.goal.name] for case in cases]
+    starts, numbered = {}, []  # numbered by the case number that a state holds
+    for case in cases:
+        anatomy, start = case.scene.anatomy, 1e3 * case.scene.placement.start
+        starts[f"{anatomy.name} {anatomy.digest}"] = np.round(start, 2).tolist()
+        numbered.append([anatomy.name, case.scene.goal.name])
     return {
         "goal": scene.goal.name,
-        "anatomies": {n: np.round(1e3 * p, 2).tolist() for n, p in anatomies.items()},
+        "anatomies": starts,
         "devices": list(map(_named, scene.catheter.devices)),
         "links": np.round(1e3 * scene.catheter.link_lengths, 3).tolist(),
         "sheath_clearance": config.sheath_clearance,
@@ -104,15 +101,14 @@ class Restorable:
 
     def holders(self) -> dict[str, Any]:
         """Objects with state in Python, by name; `state` names their attributes."""
-        sensors, tracking = self._sensors, self._tracking
-        numbered = enumerate(self.effects)
+        effects = {f"effect_{n}": effect for n, effect in enumerate(self.effects)}
         return {
             "rollout": self,
-            "tracking": tracking,
-            "images": sensors,
-            "sight": sensors.sight,
+            "tracking": self._tracking,
+            "images": self._sensors,
+            "sight": self._sensors.sight,
             "progress": self.progress,
-            **{f"effect_{number}": effect for number, effect in numbered},
+            **effects,
         }
 
     @property

@@ -315,15 +315,10 @@ def restored(name: str, old: Any, arrays: Arrays, rows: np.ndarray) -> Any:
         for row, array in zip(rows, arrays[f"{name}{_RAGGED}"], strict=True):
             new[row] = _unpadded(array)
     elif first is not None:
-        own = _below(arrays, name)
+        own = {f.removesuffix(_RAGGED): a for f, a in _below(arrays, name).items()}
         for k, row in enumerate(rows):
-            new[row] = dataclasses.replace(
-                first,
-                **{
-                    f.removesuffix(_RAGGED): _unpadded(each[k])
-                    for f, each in own.items()
-                },
-            )
+            fields = {field: _unpadded(array[k]) for field, array in own.items()}
+            new[row] = dataclasses.replace(first, **fields)
     return type(old)(new)
 
 

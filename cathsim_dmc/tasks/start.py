@@ -18,7 +18,7 @@ from cathsim_dmc.physics.held import Held
 from cathsim_dmc.physics.randomisation import START_JITTER, start_displacement
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.placement import past_sheath
+from cathsim_dmc.tasks.placement import matrix_of, past_sheath
 from cathsim_dmc.tasks.scene import AROUND_SHEATH, Scene
 
 _SETTLING_TIME = 2.0  # s, after which the device rests
@@ -248,9 +248,7 @@ class _Shape:
         place, lengths = scene.placement, scene.catheter.link_lengths
         self._lengths, self._inlet = lengths, place.inlet
         self._base = place.start_depth - float(np.sum(lengths))
-        self._frame = np.empty(9)
-        mujoco.mju_quat2Mat(self._frame, place.quaternion)
-        self._frame = self._frame.reshape(3, 3)
+        self._frame = matrix_of(place.quaternion)
         counts = np.ceil(lengths / _SAMPLES).astype(int)
         shares = [np.arange(count) / count for count in counts]
         self._links = np.repeat(np.arange(len(lengths)), counts)

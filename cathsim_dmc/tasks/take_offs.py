@@ -9,6 +9,7 @@ from cathsim_dmc.tasks.route import ROUTE_SPACING, Route
 # `_APART`, m, past the last take-off. In narrower vessels all devices follow the wall.
 _WIDE, _SHARE, _WITHIN, _BEND, _APART = 4.5e-3, 0.75, 10e-3, 0.6, 15e-3
 CLOSE = 30e-3  # m from one take-off to the next
+_BEND_WAY = 20e-3  # m, over which directions before and after a place are measured
 
 
 def take_offs(route: Route) -> list[float]:
@@ -55,14 +56,13 @@ def last_apart(route: Route) -> float:
     return places[-1] if apart else float("inf")
 
 
-def bend(route: Route, place: float, way: float = 20e-3) -> tuple[float, float]:
+def bend(route: Route, place: float) -> tuple[float, float]:
     """Turn of a route at a place, rad, and cosine between its plane and that before.
 
     Args:
         place: arc length, m.
-        way: distance over which directions before and after the place are measured, m.
     """
-    points = route.at(place + way * np.array([-2.0, -1.0, 0.0, 1.0]))
+    points = route.at(place + _BEND_WAY * np.array([-2.0, -1.0, 0.0, 1.0]))
     ways = np.diff(points, axis=0)
     ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
     turn = float(np.arccos(np.clip(ways[1] @ ways[2], -1.0, 1.0)))
