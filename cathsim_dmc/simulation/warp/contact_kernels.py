@@ -202,13 +202,7 @@ class Written(NamedTuple):
 
 @compiled
 def find(thread, scratch, scene):
-    """Finds the contacts of a link with a wall.
-
-    Args:
-        thread: As `_whose`.
-        scratch: Arrays of the shapes `SCRATCH`.
-        scene: `Scene`.
-    """
+    """Finds the contacts of a link with a wall of a `Scene`; threads as of `_whose`."""
     scene.found.number[thread] = 0
     pair = pair_of(thread, scene)
     if not is_finite(pair):
@@ -286,13 +280,7 @@ def _write_law(links, fields, out, at, pair):
 
 @compiled
 def count(world, scratch, given):
-    """Counts the contacts of a world.
-
-    Args:
-        world: Its number.
-        scratch: Not used.
-        given: `Written`.
-    """
+    """Counts the contacts of a world of `Written`."""
     links, found, worlds = given.links, given.found, len(given.overflow)
     threads, total = len(links.geoms), 0
     for which in range(len(links.carriers)):
@@ -307,13 +295,7 @@ def count(world, scratch, given):
 
 @compiled
 def place(thread, scratch, given):
-    """Writes the contacts of a link with a wall into Warp's arrays.
-
-    Args:
-        thread: As `_whose`.
-        scratch: Not used.
-        given: `Written`.
-    """
+    """Writes contacts of `Written` into Warp's arrays; threads as of `_whose`."""
     links, found, out = given.links, given.found, given.out
     threads, worlds = len(links.geoms), len(given.overflow)
     link, world, which = _whose(thread, links, worlds)

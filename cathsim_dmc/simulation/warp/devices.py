@@ -1,8 +1,9 @@
 """Devices on which compiled laws run on Warp's arrays: as GPU kernels or CPU loops.
 
-A *thread function* is a compiled function of a thread's number and of named tuples of
-arrays. `Device.launch` runs it for many threads: numba-cuda compiles the same source
-for the GPU and launches it on Warp's stream, so that a captured CUDA graph includes it.
+A *thread function* is a compiled function of a thread's number, of scratch arrays that
+are private to it, and of a named tuple of arrays. `Device.launch` runs it for many
+threads: numba-cuda compiles the same source for the GPU and launches it on Warp's
+stream, so that a captured CUDA graph includes it.
 """
 
 from __future__ import annotations

@@ -116,13 +116,7 @@ def _lattice(walls, number):
 
 @compiled
 def find_moving(thread, scratch, given):
-    """Finds the contacts of a link with a wall that may move.
-
-    Args:
-        thread: See `contact_kernels.find`.
-        scratch: Arrays of the shapes `SCRATCH`.
-        given: `MovingScene`.
-    """
+    """Finds the contacts of a link with a wall of a `MovingScene` that may move."""
     scene, vessels = given.scene, given.vessels
     scene.found.number[thread] = 0
     pair = pair_of(thread, scene)
@@ -178,14 +172,9 @@ def _damping(contacts, at, row, step):
 
 @compiled
 def carry(world, scratch, given):
-    """Adds the velocity of the wall to the contacts of a world.
+    """Adds the velocity of the wall to the contacts of a world of `Carried`.
 
     Warp computes the references of constraints from the velocities of links alone.
-
-    Args:
-        world: Its number.
-        scratch: Arrays of the shapes `SCRATCH`.
-        given: `Carried`.
     """
     walls, out, rows = given.walls, given.contacts, given.velocity.shape[1]
     there, values = scratch[0][SAMPLES:], scratch[1][PLANES:]

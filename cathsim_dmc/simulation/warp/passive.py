@@ -70,13 +70,7 @@ def device_of(world, given):
 
 @compiled
 def add_drag(world, scratch, all_given):
-    """Adds the drag of blood, see `laws.blood`.
-
-    Args:
-        world: Its number.
-        scratch: Not used.
-        all_given: `Given`.
-    """
+    """Adds the drag of blood in a world of `Given`, see `laws.blood`."""
     given = all_given.parameters
     blood = Blood(
         given.density[world],
@@ -94,13 +88,7 @@ def add_drag(world, scratch, all_given):
 
 @compiled
 def add_springs(world, scratch, all_given):
-    """Adds to the hinge springs the torques of the device's shape, see `laws.springs`.
-
-    Args:
-        world: Its number.
-        scratch: Not used.
-        all_given: `Given`.
-    """
+    """Adds torques of the device's shape in a world of `Given`, see `laws.springs`."""
     given, memory = all_given.parameters, all_given.memory
     bends = Bends(memory.bends.bends[world], memory.bends.twists[world])
     own = Scratch(memory.angles[world], bends, memory.free[world])

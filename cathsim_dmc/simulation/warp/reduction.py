@@ -70,13 +70,7 @@ class Added(NamedTuple):
 
 @compiled
 def add(world, scratch, given):
-    """Adds a physics step of a world; see `physics.forces_loops.summed`.
-
-    Args:
-        world: Its number.
-        scratch: Not used.
-        given: `Added`.
-    """
+    """Adds a physics step of a world of `Added`; see `physics.forces_loops.summed`."""
     out, rows, forces = given.out, given.efc_address, given.force
     if given.step == 0:
         for k in range(_FORCES):
@@ -107,7 +101,7 @@ def add(world, scratch, given):
 
 @compiled
 def _end(world, given):
-    """Ends a control step of a world; `given` is `Added`."""
+    """Ends a control step of a world of `Added`."""
     out = given.out
     fine = _is_fine(given.qpos[world]) and _is_fine(given.qvel[world])
     out[_DIVERGED, world] = 0.0 if fine else 1.0
