@@ -30,6 +30,11 @@ TASK = "type1_lcca"
 VARIED = {"task": TASK, "protocol": "varied", "task_kwargs": {"max_steps": 12}}
 
 
+def test_a_job_has_a_processor():
+    with pytest.raises(ValueError, match="processors of a job is 0; it must be"):
+        next(cluster.over(abs, [1], 0))
+
+
 def test_without_ray_the_extra_is_named(monkeypatch, cathsim, tmp_path):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ModuleNotFoundError, match=r"^ray is not installed.*\[ray\]"):

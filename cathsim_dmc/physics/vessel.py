@@ -68,7 +68,7 @@ def read(
     phases = {name: np.zeros(len(time)) for name in INFO[:2]}
     for effect in effects:
         if isinstance(effect, Moving):
-            phases |= zip(INFO, effect.phases(), strict=False)
+            phases |= zip(INFO[:2], effect.phases(), strict=True)
         if isinstance(effect, Flow):
             phases |= effect.read(time, state)
     return VesselReadings(**phases, indentation=deepest, wall_work=work)

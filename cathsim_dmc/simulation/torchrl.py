@@ -78,7 +78,10 @@ class BatchedEnv(EnvBase):
         )
         place = "cpu" if device.startswith("warp:") else device
         super().__init__(device=place, batch_size=[num_envs])
-        task, shape = self.simulation.task, self.batch_size
+        self._declare_specs(self.simulation.task)
+
+    def _declare_specs(self, task: Navigation) -> None:
+        shape = self.batch_size
         entries = {k: _spec(spec, shape) for k, spec in task.observation_specs.items()}
         flag = Binary(1, (*shape, 1), dtype=torch.bool)
         number = Unbounded((*shape, 1), dtype=torch.float32)
@@ -89,7 +92,7 @@ class BatchedEnv(EnvBase):
         entries["info"] = Composite(info, shape=shape)
         self.observation_spec = Composite(entries, shape=shape)
         self.action_spec = Bounded(
-            -1.0, 1.0, (*shape, self.simulation.num_actions), dtype=torch.float32
+            -1.0, 1.0, (*shape, task.num_actions), dtype=torch.float32
         )
         self.reward_spec = number
         self.done_spec = Composite(

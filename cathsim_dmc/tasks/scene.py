@@ -81,14 +81,10 @@ class Scene:
         bounds.instance("config", config, NavigationConfig)
         goal = placement.resolve_goal(anatomy, goal)
         config.vessel.check(anatomy)
-        chosen, length = chosen_devices(config), config.working_length
+        chosen, shift = chosen_devices(config), config.randomisation.farthest_shift
+        length, play = config.working_length, config.sheath_clearance or 0.0
         place = placement.place_device(
-            anatomy,
-            goal,
-            longest_tip(chosen),
-            length,
-            config.randomisation.farthest_shift,
-            config.sheath_clearance or 0.0,
+            anatomy, goal, longest_tip(chosen), length, shift, play
         )
         friction = config.friction
         if config.devices is None:  # in a stack, it differs from link to link
@@ -112,16 +108,19 @@ class Scene:
         moving = config.vessel.motion is not None
         user_data = effects.userdata_size(config.effects_on(catheter), catheter)
         scene._attach(user_data, moving)
-        low, high = anatomy.lumen.box
-        if drawn:
-            vertices = anatomy.surface.vertices
-            low, high = vertices.min(0), vertices.max(0)
-        # The published top view and one from the side. Seen from the front, the
-        # patient's left is on the right of the image.
-        centre, distance = (low + high) / 2, 2.6 * float((high - low).max())
-        scene.arena.add_camera("top", centre, distance, (1, 0, 0, 0, 0, 1))
-        scene.arena.add_camera("side", centre, distance, (0, 1, 0, 0, 0, 1))
+        scene._add_cameras(drawn)
         return scene
+
+    def _add_cameras(self, drawn: bool):
+        """Adds the published top view and one from the side."""
+        low, high = self.anatomy.lumen.box
+        if drawn:
+            vertices = self.anatomy.surface.vertices
+            low, high = vertices.min(0), vertices.max(0)
+        centre, distance = (low + high) / 2, 2.6 * float((high - low).max())
+        # Seen from the front, the patient's left is on the right of the image.
+        self.arena.add_camera("top", centre, distance, (1, 0, 0, 0, 0, 1))
+        self.arena.add_camera("side", centre, distance, (0, 1, 0, 0, 0, 1))
 
     def _attach(self, user_data: int, moving: bool):
         if user_data:

@@ -311,7 +311,7 @@ def _settle(
             stack.enter_context(held.at(model, depth, at))
         for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
             mujoco.mj_step(model, data)
-    _refuse_outside(scene, model, index, data)
+    _refuse_outside(scene, index, data)
     return _Posture(scene, model, index, shape, data, advance)
 
 
@@ -326,9 +326,7 @@ def _settled(
     return settled
 
 
-def _refuse_outside(
-    scene: Scene, model: mujoco.MjModel, index: ModelIndex, data: mujoco.MjData
-) -> None:
+def _refuse_outside(scene: Scene, index: ModelIndex, data: mujoco.MjData) -> None:
     """Raise ValueError unless a device has settled inside the lumen."""
     nodes = np.vstack([data.xpos[index.links], data.site_xpos[index.head_site]])
     place, anatomy = scene.placement, scene.anatomy
