@@ -7,8 +7,6 @@ joint has the compliance of that part of its rod which is outside the sheath.
 
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from cathsim_dmc.compiled import compiled
 
 # Fraction of its compliance that a joint keeps in the sheath. A tip that protrudes
@@ -49,11 +47,6 @@ class Joints(NamedTuple):
     behind: Any
     ahead: Any
     distal: Any
-
-
-def held_stiffness(stiffness, out):
-    """Stiffness, N·m/rad, of joints with a fraction of compliance out of the sheath."""
-    return stiffness / np.maximum(out, LEAST)
 
 
 @compiled

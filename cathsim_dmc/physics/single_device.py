@@ -99,28 +99,24 @@ class SingleDevice(Effect):
             self.world.parameters.compliance[index] = self._springs.compliance
         if not self._holds:
             return
+        from cathsim_dmc.physics import adapters  # late, as numba takes long
+
         self._find_hinges(index)
         self._free[index] = self._held.read(self._hinged[index])
-        self._hold(index)
+        adapters.hold_links(self._sheathed, index, index + 1)
+        self._soften(slice(index, index + 1))
 
     def _find_hinges(self, index: int) -> None:
         fields = held.fields_of(lambda name: self.world.field(index, name))
         self._hinged[index] = fields  # keeps the arrays at these addresses alive
         self._sheathed.places[index] = held.addresses(fields)
 
-    def _hold(self, index: int) -> None:
-        """Holds the links of one simulation that are in the sheath."""
-        from cathsim_dmc.physics import adapters  # late, as numba takes long
-
-        adapters.hold_links(self._sheathed, index, index + 1)
-        self._soften(slice(index, index + 1))
-
     def _soften(self, rows: slice) -> None:
         """Writes the springs of pre-shaped devices that are partly in the sheath."""
         if self.parameters is Springs:
             free, out = self._free[rows, 0, :, 0], self._sheathed.out[rows]
             self.world.parameters.rest[rows] = self._springs.rest * out
-            stiffness = sheath.held_stiffness(free, out)
+            stiffness = free / np.maximum(out, sheath.LEAST)
             self.world.parameters.compliance[rows] = 1 / stiffness
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:

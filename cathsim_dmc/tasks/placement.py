@@ -143,22 +143,12 @@ def place_device(
             f"{least:.3f} m here to be moved at all, and {WORKING_LENGTHS[1]:g} m at "
             "most"
         )
-    direction = sheath_direction(anatomy, play)
-    loose = direction is None and play > CLEARANCE
-    if loose and sheath_direction(anatomy) is not None:
-        raise ValueError(
-            f"sheath_clearance is {play:g} m, with which the device would touch a "
-            f"vessel of {anatomy.name!r} beside the sheath; give {CLEARANCE:g} m, or "
-            "None for a sheath that holds the device"
-        )
-    if direction is None:  # `start.StartPosture` refuses a device that stands in a wall
-        direction = np.array(inlet.direction)
+    direction = _checked_direction(anatomy, play)
     quaternion = _frame(direction)
-    matrix = matrix_of(quaternion)
     outside = np.array([0.0, 0.0, working_length - start_depth])
     # Longer than the inserted part of the device, whose links are chords of the line.
     ahead = np.arange(0.0, route.length, _LINE_SPACING)
-    inside = (route.at(ahead).position - inlet.position) @ matrix
+    inside = (route.at(ahead).position - inlet.position) @ matrix_of(quaternion)
     # The first point of the route is the inlet; the sheath ends there, straight.
     line = np.vstack([np.zeros(3), inside - inside[0] + outside])
     return Placement(
@@ -170,6 +160,21 @@ def place_device(
         working_length=working_length,
         line=line,
     )
+
+
+def _checked_direction(anatomy: Anatomy, play: float) -> np.ndarray:
+    """Direction (3,) of insertion; ValueError if it is the play that leaves none."""
+    direction = sheath_direction(anatomy, play)
+    if direction is not None:
+        return direction
+    if play > CLEARANCE and sheath_direction(anatomy) is not None:
+        raise ValueError(
+            f"sheath_clearance is {play:g} m, with which the device would touch a "
+            f"vessel of {anatomy.name!r} beside the sheath; give {CLEARANCE:g} m, or "
+            "None for a sheath that holds the device"
+        )
+    # `start.StartPosture` refuses a device that stands in a wall.
+    return np.array(anatomy.inlet.direction)
 
 
 def _whole_links(length: float, device: devices.Device) -> float:
