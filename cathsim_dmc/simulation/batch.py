@@ -346,6 +346,7 @@ class _PoolStepper(_BatchStepper):
         self._models = [copy.copy(model) if own else model for _ in self.rows]
         self._loaded: dict[int | Case, Any] = {}
 
+    # Fields are those of the simulations' models, not those of the batch.
     field, _fields_of = Stepper.field, Stepper._fields_of
 
     def _model_of(self, index: int) -> mujoco.MjModel:

@@ -105,9 +105,7 @@ class Scene:
             sheath=Sheath(bore, radius, clearance=config.sheath_clearance),
             robot=Robot(device_radius=radius),
         )
-        moving = config.vessel.motion is not None
-        user_data = effects.userdata_size(config.effects_on(catheter), catheter)
-        scene._attach(user_data, moving)
+        scene._attach(config)
         scene._add_cameras(drawn)
         return scene
 
@@ -122,8 +120,9 @@ class Scene:
         self.arena.add_camera("top", centre, distance, (1, 0, 0, 0, 0, 1))
         self.arena.add_camera("side", centre, distance, (0, 1, 0, 0, 0, 1))
 
-    def _attach(self, user_data: int, moving: bool):
-        if user_data:
+    def _attach(self, config: NavigationConfig):
+        moving, own = config.vessel.motion is not None, config.effects_on(self.catheter)
+        if user_data := effects.userdata_size(own, self.catheter):
             self.arena.mjcf_model.size.nuserdata = user_data
         if len(self.catheter.links) <= _DENSE_LINKS or moving:
             self.arena.mjcf_model.option.jacobian = "dense"
