@@ -85,8 +85,8 @@ def over(
         RuntimeError: a job was lost `RETRIES` + 1 times.
         Exception: that of a job, as it was raised.
     """
-    each = 1 if each is None else each
-    bounds.whole("processors of a job", each, 1, bounds.MOST_THREADS)
+    count = 1 if each is None else each
+    each = bounds.whole("processors of a job", count, 1, bounds.MOST_THREADS)
     connect()
     require_room(1, each)
     import ray
