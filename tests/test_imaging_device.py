@@ -174,7 +174,8 @@ def test_devices_outside_the_view_or_broken_leave_the_rest():
 @pytest.mark.parametrize(
     ("points", "radius", "message"),
     [
-        (np.zeros((4, 2)), RADIUS, "shapes"),
+        (np.zeros((4, 2)), RADIUS, r"have shape \(4, 2\); give two joints or more"),
+        (np.zeros((1, 3)), RADIUS, r"have shape \(1, 3\); give two joints or more"),
         (curve(), 0.0, "> 0"),
         (curve(), np.full(12, RADIUS), "shape"),
         (curve(), 0.5, "px in radius"),

@@ -286,6 +286,8 @@ AXIS = straight(0.2)
         (lambda: DeviceStack(lead=-0.1), "lead is -0.1.*at least 0"),
         (lambda: DeviceStack(lumen_friction=math.nan), "lumen_friction is nan.*0 to 2"),
         (lambda: DeviceStack(()), "devices is \\(\\).*at least one"),
+        (lambda: DeviceStack(3), "devices is 3.*names"),
+        (lambda: DeviceStack(devices.BERENSTEIN_5F), "devices is Device.*names"),
         (lambda: DeviceStack("wire_035_glide"), "devices is 'wire_035_glide'.*names"),
         (lambda: AngiographyArena(0.0), "device_density is 0.0.*above 0"),
         (lambda: AngiographyArena(tolerance=-1), "tolerance is -1.*above 0"),

@@ -109,7 +109,7 @@ class DeviceStack(Chain):
 
 def _passive(given: Sequence[str | Device]) -> tuple[Device, ...]:
     """Devices as given or by name; ValueError if one is steerable, or for none."""
-    if isinstance(given, str) or not given:
+    if isinstance(given, str) or not isinstance(given, Sequence) or not given:
         wanted = "names of devices from the innermost outwards, at least one"
         bounds.refuse("devices", given, wanted)
     devices = tuple(library.get(device) for device in given)

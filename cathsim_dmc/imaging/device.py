@@ -65,6 +65,11 @@ def device_attenuation(carm: CArm, shadow: Shadow) -> np.ndarray:
             wider than 256 pixels.
     """
     points = np.asarray(shadow.points, dtype=np.float64)
+    if points.ndim < 2 or points.shape[-1] != 3 or points.shape[-2] < 2:
+        raise ValueError(
+            f"points of a shadow have shape {points.shape}; give two joints or more, "
+            "(..., n, 3), m"
+        )
     radius = np.asarray(shadow.radius, dtype=np.float64)
     # Filled, not broadcast: numba would compile the loops again for a broadcast array.
     radii = np.empty((*points.shape[:-2], points.shape[-2] - 1))
