@@ -460,7 +460,9 @@ def test_an_evaluation_goes_on_from_a_snapshot(tmp_path, cathsim):
         *("--randomisation", json.dumps(drawn)),
     )
     assert code == 0, err
-    episodes = json.loads(out)["policy"]["episodes"]
+    played = json.loads(out)["policy"]
+    episodes = played["episodes"]
+    assert played["settings"]["started"] is True
     assert [one["length"] for one in episodes] == [8, 8]
     # The seeds have not drawn what the snapshot holds.
     assert not any("conditions" in one for one in episodes)

@@ -8,17 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cathsim_dmc import bounds, files, suite
-from cathsim_dmc.agents import evaluation, protocols, submission
+from cathsim_dmc.agents import evaluation, evaluation_files, protocols, submission
 from cathsim_dmc.agents.checkpoint import CheckpointError
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.agents.submission import PROTOCOL, RECORDED, RecordedActions
-from cathsim_dmc.analysis.force_statistics import (
-    QUANTITIES,
-    STATISTICS,
-    EpisodeForces,
-    Statistics,
-)
+from cathsim_dmc.analysis.force_statistics import QUANTITIES
 from cathsim_dmc.tasks.config import MAX_STEPS
 
 MOST_BYTES = 2**22  # of a submission; one of 100 episodes has 110 kB
@@ -169,34 +164,17 @@ def _result(values: Mapping[str, Any]) -> EvaluationResult:
 
 def _episode(index: int, row: Mapping[str, Any]) -> EpisodeOutcome:
     """Returns an episode of a submission; ValueError for an impossible value."""
-
-    def force(quantity: str, statistic: str) -> float | None:
-        value = row["forces"][quantity][statistic]
-        if value is None and statistic == "mean_in_contact":
-            return None
-        return bounds.number(f"forces.{quantity}.{statistic}", value, 0.0)
-
-    forces = {
-        quantity: Statistics(**{name: force(quantity, name) for name in STATISTICS})  # type: ignore[arg-type]
-        for quantity in QUANTITIES
-        # Files from before 0.3 lack the means.
-        if row["forces"].get(quantity) or not quantity.startswith("mean")
-    }
-    switches = "terminated", "success", "physics_error"
-    found = {name: bounds.switch(name, row[name]) for name in switches}
-    length = bounds.whole("length", row["length"], 1, MAX_STEPS)
-    if found["success"] and (found["physics_error"] or not found["terminated"]):
+    found = evaluation_files.outcome({**row, "env": index})
+    # Files from before 0.3 lack the means.
+    for name in QUANTITIES:
+        if getattr(found.forces, name) is None and not name.startswith("mean"):
+            raise ValueError(f"episode {index} has no forces.{name}")
+    bounds.whole("length", found.length, 1, MAX_STEPS)
+    if found.success and (found.physics_error or not found.terminated):
         raise ValueError(f"episode {index} succeeds, but was not ended by the task")
-    if not found["terminated"] and length != MAX_STEPS:
-        raise ValueError(f"episode {index} is cut off after {length} steps")
-    return EpisodeOutcome(
-        env=index,
-        reward=bounds.number("reward", row["reward"]),
-        length=length,
-        forces=EpisodeForces(**forces),
-        path_ratio=bounds.number("path_ratio", row["path_ratio"], 0.0),
-        **found,
-    )
+    if not found.terminated and found.length != MAX_STEPS:
+        raise ValueError(f"episode {index} is cut off after {found.length} steps")
+    return found
 
 
 def _close(one: Any, other: Any) -> bool:

@@ -212,6 +212,7 @@ class _Plan:
                 "observation": self.observation,
                 "task_kwargs": self.options,
                 "frames": trained and trained.frames,
+                **({"started": True} if started else {}),
             },
             distinct=started or protocols.distinct(self.task, first, count),
             conditions=tuple(drawn),

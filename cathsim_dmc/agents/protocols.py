@@ -2,8 +2,9 @@
 
 import dataclasses
 import itertools
+import json
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ _STRATA, _CANDIDATES = 10, 20
 _STEPS = dict.fromkeys(
     ("friction", "stiffness", "loss", "viscosity", "goal_shift", "roll"), 1e-9
 ) | {"delay": 1, "start_insertion": START_SPACING}
+_NEAR = 2e-3  # m, displacement of the start within which episodes are nearly equal
 # Quantities that a start may reduce after the draw; a displacement may be redrawn.
 _REDUCED = "displacement", "insertion"
 
@@ -113,8 +115,8 @@ def parts(
             wanted = [n % arches for n in range(played, played + count)]
             seeds = stratified(ranges, wanted, first, arches)
         played += count
-        varied = () if ranges == Randomisation() else seeds
         pool = _drawn_from(definition, options)
+        varied = () if ranges == Randomisation() and len(pool) < 2 else seeds
         drawn = tuple(_conditions(ranges, one, pool, own) for one in varied)
         # Effects are objects, which files cannot hold; the task makes its own.
         kept = {
@@ -224,4 +226,24 @@ def distinct(task: str, task_kwargs: Mapping[str, Any], episodes: int) -> bool:
             values *= 1 + (high - low) // step
     if along := task_kwargs.get("start_along_route"):
         values *= STARTS_ALONG_ROUTE if along[1] > along[0] else 1
-    return values >= max(episodes, 2) or (not along and ranges.start_radius > 2e-3)
+    return values >= max(episodes, 2) or (not along and ranges.start_radius > _NEAR)
+
+
+def count_distinct(conditions: Iterable[Mapping[str, Any]]) -> int:
+    """Return how many conditions of episodes differ, by the rule of `distinct`.
+
+    Args:
+        conditions: Of each episode, as in `Part.conditions`.
+    """
+    return len({json.dumps(_compared(one), sort_keys=True) for one in conditions})
+
+
+def _compared(conditions: Mapping[str, Any]) -> dict[str, Any]:
+    names = {"device", "arch", "anatomy", *_STEPS} - {"start_insertion"}
+    found = {name: conditions.get(name) for name in names}
+    inserted = conditions.get("insertion_drawn") or 0.0
+    found["insertion"] = round(inserted / START_SPACING)
+    displacement = conditions.get("displacement_drawn") or (0.0,)
+    if np.linalg.norm(displacement) > _NEAR:
+        found["displacement"] = displacement
+    return found

@@ -3,12 +3,15 @@
 import itertools
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 from cathsim_dmc import bounds, json_options
+from cathsim_dmc.agents import evaluation_files
 from cathsim_dmc.agents.episodes import EpisodeOutcome
+from cathsim_dmc.agents.protocols import count_distinct
 from cathsim_dmc.analysis.force_statistics import FIGURES, QUANTITIES, STATISTICS
 from cathsim_dmc.analysis.intervals import success_interval
 
@@ -25,7 +28,8 @@ class EvaluationResult:
         policy: Name of the policy.
         seeds: Seed of each episode.
         episodes: Episodes in the order of their seeds.
-        settings: Protocol, observation, further task_kwargs, frames of a checkpoint.
+        settings: Protocol, observation, further task_kwargs, frames of a checkpoint,
+            and "started" where the episodes began at a snapshot.
         distinct: Whether all episodes can differ by more than the jitter of the start.
             If not, no interval over them is given.
         conditions: What was drawn for each episode; empty without randomisation.
@@ -38,6 +42,44 @@ class EvaluationResult:
     settings: Mapping[str, Any]
     distinct: bool = True
     conditions: tuple[Mapping[str, Any], ...] = ()
+
+    @classmethod
+    def load(
+        cls, path: str | Path, which: Literal["policy", "baseline"] = "policy"
+    ) -> "EvaluationResult":
+        """Read an evaluation that `cathsim eval --out` or `evaluate` has written.
+
+        Args:
+            path: File, or folder with an `evaluation.json`.
+            which: The policy, or the baseline beside it, which `cathsim eval` plays.
+
+        Returns:
+            The evaluation as it was written: options that are objects are texts.
+
+        Raises:
+            ValueError: the file holds no evaluation, or not this one.
+            OSError: there is no such file.
+        """
+        bounds.choice("which", which, evaluation_files.WHICH)
+        found = evaluation_files.read(path)
+        if which not in found:
+            raise ValueError(
+                f"{path} has no {which}; there is {', '.join(found)}"
+                " (`cathsim eval --no-baseline` plays no baseline)"
+            )
+        return cls(**found[which])
+
+    @property
+    def num_conditions(self) -> int:
+        """Number of different conditions among the episodes.
+
+        Differences in noise and C-arm do not count, nor those of a start within 2 mm,
+        see `protocols.count_distinct`. Where no conditions are recorded it is the
+        number of episodes if all can differ, and 1 otherwise.
+        """
+        if self.conditions:
+            return count_distinct(self.conditions)
+        return len(self.episodes) if self.distinct else 1
 
     def values(self, name: str) -> np.ndarray:
         """Return a figure of every episode, float64 (episodes,); NaN where unknown.

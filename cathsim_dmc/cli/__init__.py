@@ -26,6 +26,7 @@ COMMANDS = {
     "list": ("listing:show", "List the tasks, or the devices with their properties."),
     "dataset": ("recordings:dataset", "Write labelled fluoroscopy of random arches."),
     "eval": ("agents:evaluate", "Play episodes with a policy and report figures."),
+    "table": ("result_tables:table", "Compare evaluations as a table in Markdown."),
     "submit": ("agents:submit", "Write a file for the leaderboard."),
     "record": ("agents:record", "Record one episode: as a Rerun file, or as a film."),
     "demos": ("agents:demos", "Write demonstrations of the expert as a dataset."),

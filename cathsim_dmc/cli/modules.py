@@ -17,7 +17,7 @@ from cathsim_dmc.cli.options import say
 GROUP = "cathsim.tasks"
 # Commands that name a task.
 COMMANDS = (
-    *"train list eval submit record demos play serve drive export".split(),
+    *"train list eval table submit record demos play serve drive export".split(),
     "replay-error",
 )
 

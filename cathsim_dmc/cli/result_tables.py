@@ -1,16 +1,19 @@
-"""Tables of results in the terminal."""
+"""Tables of results in the terminal, and `cathsim table`."""
 
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 from rich.table import Table
+from tyro import conf
 
 from cathsim_dmc import __version__
+from cathsim_dmc.agents import comparison
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons
-from cathsim_dmc.cli.options import console
+from cathsim_dmc.cli.options import Json, Modules, console, print_json
 from cathsim_dmc.physics.forces import PEAK_NOTE
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
@@ -43,10 +46,6 @@ def print_results(results: Sequence[EvaluationResult]) -> None:
 
 def _figures(result: EvaluationResult) -> dict[str, str]:
     summary = result.summary()
-    success = f"{100 * summary['success']:.0f} %"
-    if summary["success_ci95"] is not None:
-        low, high = (round(100 * bound) for bound in summary["success_ci95"])
-        success += f" ({low}–{high})"
     forces = {name: result.mean_sd(f"forces.{name}") for name in FIGURES}
     safe = summary["safe_success"].items()
     return {
@@ -56,7 +55,7 @@ def _figures(result: EvaluationResult) -> dict[str, str]:
             f"{n.replace('_', ' ')}, mN": millinewtons(mean, sd)
             for n, (mean, sd) in forces.items()
         },
-        "success": success,
+        "success": comparison.success(summary),
         **{f"safe success, {limit}": f"{100 * rate:.0f} %" for limit, rate in safe},
     }
 
@@ -98,3 +97,29 @@ def _outcome(
         "peak force, mN": millinewtons(forces.peak_force),
         "largest sum, N": "–" if largest is None else f"{largest:.2f}",
     }
+
+
+def table(
+    evaluations: Annotated[tuple[Path, ...], conf.Positional],
+    /,
+    baseline: bool = True,
+    json: Json = False,
+    modules: Modules = (),
+) -> int:
+    """Compare evaluations as a table in Markdown; mark those under different rules.
+
+    Args:
+        evaluations: Files evaluation.json of `cathsim eval --out`, or folders with such
+            files at any depth.
+        baseline: Whether the baselines of the files are listed too.
+    """
+    if not evaluations:
+        raise ValueError(
+            "no evaluation is given; give files of `cathsim eval --out`, or folders"
+        )
+    found = comparison.Comparison.of(evaluations, baseline)
+    if json:
+        print_json({"checks": [], **found.as_dict()})
+        return 0
+    print(*found.markdown(), sep="\n")
+    return 0
