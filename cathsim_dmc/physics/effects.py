@@ -158,6 +158,15 @@ class Effect:
             random_state: Source of the effect's own draws.
         """
 
+    def conditions(self, index: int) -> Mapping[str, float]:
+        """What the episode of one simulation has drawn by `restart`, by name.
+
+        It is read from the effect's state, so that it is that of a restored episode.
+        Names begin with that of the effect and a dot, such as "wind.speed".
+        """
+        del index
+        return {}
+
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Acts once, before the physics steps of a control step.
 

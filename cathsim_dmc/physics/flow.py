@@ -110,6 +110,19 @@ class Flow(StillBlood):
         blood.rate[index], blood.phase[index] = rate / 60.0, phase
         self._wave_speed[index] = speed
 
+    def conditions(self, index: int) -> dict[str, float]:
+        """Heart of one simulation in the units of `FlowOptions`; none without flow."""
+        if self._options is None:
+            return {}
+        blood, area = self.world.parameters, self._circulations[index].radius ** 2
+        found = {
+            "rate": 60.0 * blood.rate[index],
+            "peak": blood.peak[index] / (np.pi * area),
+            "phase": blood.phase[index],
+            "wave_speed": self._wave_speed[index],
+        }
+        return {f"flow.{name}": float(value) for name, value in found.items()}
+
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Writes velocity and friction of the blood at the middle of each link."""
         nodes = state.centreline

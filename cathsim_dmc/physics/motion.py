@@ -126,6 +126,13 @@ class Moving(Effect):
             each[index] = values[name]
         self._clock[index] = 0.0
 
+    def conditions(self, index: int) -> dict[str, float]:
+        """Motion of one simulation, in the units of `MotionOptions`."""
+        values = self.world.parameters._asdict().items()
+        found = {name: float(each[index]) for name, each in values}
+        found |= {name: 60.0 * found[name] for name in ("rate", "breath_rate")}
+        return {f"motion.{name}": value for name, value in found.items()}
+
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Advances the clock by a control step; the last effect of the vessel."""
         self._clock += CONTROL_TIMESTEP

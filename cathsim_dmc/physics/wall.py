@@ -108,6 +108,11 @@ class Wall(Effect):
         self._fields[index], self._places[index] = fields, held.addresses(fields)
         self._write(slice(index, index + 1))
 
+    def conditions(self, index: int) -> dict[str, float]:
+        """Material of one simulation, in the units of `WallOptions`."""
+        found = zip(_LIMITS, self._material[index].tolist(), strict=True)
+        return {f"wall.{name}": x for name, x in found if not np.isnan(x)}
+
     def _write(self, own: slice) -> None:
         from cathsim_dmc.physics import adapters  # late, as numba takes long
 

@@ -21,6 +21,7 @@ from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks import rehearsal
 from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.conditions import Conditions
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.snapshot import NotCopied, Snapshot
@@ -134,6 +135,11 @@ class BatchSimulation(NotCopied):
     def random_states(self) -> tuple[np.random.RandomState, ...]:
         """Source of randomness of each simulation."""
         return tuple(self._random_states)
+
+    @property
+    def conditions(self) -> list[Conditions]:
+        """What the present episode of each simulation has drawn."""
+        return list(map(self.rollout.conditions, range(self.num_simulations)))
 
     def reset(self, indices: np.ndarray | None = None) -> Step:
         """Starts new episodes.

@@ -13,6 +13,8 @@ from gymnasium.vector.utils import batch_space
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.simulation.infos import final_info, masked, reset_mask
+from cathsim_dmc.tasks.conditions import Conditions
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.snapshot import Snapshot
@@ -133,6 +135,11 @@ class CathSimEnv(gymnasium.Env):
         reward, truncated = float(timestep.reward), self._ended and not terminated
         return observation, reward, terminated, truncated, self.environment.task.info()
 
+    @property
+    def conditions(self) -> Conditions:
+        """What the present episode has drawn; see `tasks.conditions`."""
+        return self.environment.task.conditions
+
     def snapshot(self) -> Snapshot:
         """The state between two steps; see `tasks.environment.Environment.snapshot`."""
         _require_open(self._closed)
@@ -251,7 +258,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
                 (N,) bool is true.
         """
         _require_open(self.closed)
-        mask = _reset_mask(options, self.num_envs)
+        mask = reset_mask(options, self.num_envs)
         if seed is not None:
             seeds = _seeds(seed, self.num_envs)
             super().reset(seed=seeds[0])
@@ -260,7 +267,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
                     state.seed(seeds[i])
         step = self.simulation.reset(np.flatnonzero(mask))
         self._ended &= ~mask
-        return _converted(step.observation, self._dtype), _masked(step.info(), mask)
+        return _converted(step.observation, self._dtype), masked(step.info(), mask)
 
     def step(self, actions: np.ndarray):
         """Advances all by one control step; see `gymnasium.vector.VectorEnv.step`.
@@ -288,12 +295,17 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
             waiting, self._ended = self._ended, np.zeros(self.num_envs, bool)
             last = _converted(step.observation, self._dtype)
-            final = _final(last, step.info(), waiting)
+            final = final_info(last, step.info(), waiting)
         if waiting.any():
             step = self.simulation.reset(np.flatnonzero(waiting))
         observation = _converted(step.observation, self._dtype)
-        infos = {**_masked(step.info(), np.ones(self.num_envs, bool)), **final}
+        infos = {**masked(step.info(), np.ones(self.num_envs, bool)), **final}
         return observation, reward, terminated, truncated, infos
+
+    @property
+    def conditions(self) -> list[Conditions]:
+        """What the present episode of each simulation has drawn."""
+        return self.simulation.conditions
 
     def snapshot(self) -> Snapshot:
         """The state of all simulations; see `BatchSimulation.snapshot`."""
@@ -314,7 +326,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         _require_open(self.closed)
         step = self.simulation.restore(snapshot)
         self._ended = step.terminated | step.truncated
-        info = _masked(step.info(), np.ones(self.num_envs, bool))
+        info = masked(step.info(), np.ones(self.num_envs, bool))
         return _converted(step.observation, self._dtype), info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -342,45 +354,6 @@ def _seeds(seed: Any, count: int) -> Sequence[int | None]:
     return [
         None if one is None else value for one, value in zip(seed, known, strict=True)
     ]
-
-
-def _reset_mask(options: Mapping[str, Any] | None, count: int) -> np.ndarray:
-    """Mask (count,) bool of the option "reset_mask"; all true without it."""
-    mask = (options or {}).get("reset_mask")
-    if mask is None:
-        return np.ones(count, bool)
-    found = np.asarray(mask)
-    if found.shape != (count,) or found.dtype != bool or not found.any():
-        allowed = f"an array ({count},) of bool with a true entry"
-        bounds.refuse("reset_mask", mask, allowed)
-    return found
-
-
-def _masked(info: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
-    """Figures (N,) where a mask (N,) is true, else zero, and "_name", the mask."""
-    masked = {}
-    for name, value in info.items():
-        masked[name] = np.where(mask, value, np.zeros_like(value))
-        masked[f"_{name}"] = mask.copy()
-    return masked
-
-
-def _final(
-    observation: Mapping[str, np.ndarray],
-    info: Mapping[str, np.ndarray],
-    mask: np.ndarray,
-) -> dict[str, Any]:
-    """Entries of infos for ended episodes, in Gymnasium's format."""
-    last = np.full(len(mask), None, dtype=object)
-    for i in np.flatnonzero(mask):
-        last[i] = {name: value[i] for name, value in observation.items()}
-    figures = _masked(info, mask)
-    return {
-        "final_obs": last,
-        "_final_obs": mask.copy(),
-        "final_info": figures,
-        "_final_info": mask.copy(),
-    }
 
 
 def env_spec(task: str, **options: Any) -> EnvSpec:

@@ -20,6 +20,7 @@ from cathsim_dmc.physics.readings import CoaxialReadings, copied, part
 from cathsim_dmc.physics.stepper import SingleStepper, Stepper
 from cathsim_dmc.tasks import cases, observations, rehearsal
 from cathsim_dmc.tasks.common_chain import CommonChain
+from cathsim_dmc.tasks.conditions import Conditions
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective
 from cathsim_dmc.tasks.observation_kind import OPENGL, FrameObservable, Sizes
@@ -366,6 +367,12 @@ class Navigation(composer.Task, NotCopied):
     def info(self) -> dict[str, Any]:
         """Figures of the last control step, or of the start; see `Step.info`."""
         return {name: value[0].item() for name, value in self._current().info().items()}
+
+    @property
+    def conditions(self) -> Conditions:
+        """What the present episode has drawn: friction, start, anatomy and others."""
+        self._current()
+        return self.rollout.conditions()
 
     def contacts(self, physics) -> forces.Contacts:
         """Contacts with the wall in the last physics step."""

@@ -20,6 +20,7 @@ from cathsim_dmc.imaging.angiograph import Deviation
 from cathsim_dmc.physics.effects import Effect, Layout
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.conditions import Conditions, DrawnConditions
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors
 from cathsim_dmc.tasks.progress import Progress
@@ -92,6 +93,7 @@ class Restorable:
     _case_of: np.ndarray
     _cases: Sequence[Case]
     _description: Mapping[str, Any]
+    _drawn: DrawnConditions
     _layout: Layout
     _open: np.ndarray
     _random_states: list[RandomState] | None
@@ -108,6 +110,7 @@ class Restorable:
             "images": self._sensors,
             "sight": self._sensors.sight,
             "progress": self.progress,
+            "conditions": self._drawn,
             **effects,
         }
 
@@ -169,6 +172,7 @@ class Restorable:
             ValueError: if the snapshot is of another task.
             RuntimeError, NotImplementedError: as of `snapshot`.
         """
+        snapshot = self._drawn.completed(snapshot)
         snapshot.require(self.snapshot(indices))
         numbers = snapshot.arrays["rollout._case_of"]
         if not ((numbers >= 0) & (numbers < len(self._cases))).all():
@@ -208,6 +212,12 @@ class Restorable:
         planes = self._sensors.planes or [()] * len(self._case_of)
         found = [[plane.carm.matrix for plane in machine] for machine in planes]
         return np.array(found).reshape(len(planes), -1, 3, 4)
+
+    def conditions(self, index: int = 0) -> Conditions:
+        """What the episode of one simulation has drawn; RuntimeError before any."""
+        if self._random_states is None:
+            raise RuntimeError("no episode has begun; call reset() first")
+        return self._drawn.of(index, self.case(index).scene, self.effects)
 
     def case(self, index: int = 0) -> Case:
         """Anatomy and objective of the episode of one simulation."""

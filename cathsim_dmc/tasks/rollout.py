@@ -25,6 +25,7 @@ from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, Stepper
 from cathsim_dmc.tasks import observations, physics_errors
 from cathsim_dmc.tasks.cases import Case, objectives_of
 from cathsim_dmc.tasks.common_chain import CommonChain
+from cathsim_dmc.tasks.conditions import DrawnConditions
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import Exposure, ImageSensors
 from cathsim_dmc.tasks.objectives import (
@@ -120,7 +121,7 @@ class Rollout(Restorable):
         self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
-        self._goal_shift = np.zeros(count)
+        self._goal_shift, self._drawn = np.zeros(count), DrawnConditions(count)
         # Whether a reset or control step has begun and not ended.
         self._open = np.zeros(count, dtype=bool)
         self.deviations = [Deviation()] * count
@@ -131,8 +132,6 @@ class Rollout(Restorable):
         self._way, self._shortest = np.zeros(count), np.ones(count)
         self._errors: tuple[str | None, ...] = (None,) * count
         self._choose_objectives()
-
-    # The course of an episode.
 
     def begin(self, indices: np.ndarray, random_states: Sequence[RandomState]) -> None:
         """Draws new episodes and lays the devices in their start posture.
@@ -172,11 +171,12 @@ class Rollout(Restorable):
         if len(self._cases) > 1:
             self._load(index, number)
         case = self.case(index)
-        case.start.write(self._state.qpos[index], episode, random_state)
+        place = case.start.write(self._state.qpos[index], episode, random_state)
+        self._drawn.keep(index, episode, place)
         for effect in self.effects:
             effect.restart(index, episode, random_state)
-        (primary, secondary), kerma = episode.view, episode.kerma
-        self.deviations[index] = Deviation(primary, secondary, episode.gain, kerma)
+        view, gain, kerma = episode.view, episode.gain, episode.kerma
+        self.deviations[index] = Deviation(view[0], view[1], gain, kerma)
         self._place_machine(index)
         self._goal_shift[index] = episode.goal_shift or 0.0
 

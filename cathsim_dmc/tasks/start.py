@@ -57,6 +57,18 @@ class _Joints(NamedTuple):
     bends: np.ndarray
 
 
+class Started(NamedTuple):
+    """Where an episode starts, relative to the task's own start.
+
+    Attributes:
+        insertion: Further insertion, m.
+        displacement: (3,) of the head, frame of the inlet, m.
+    """
+
+    insertion: float
+    displacement: np.ndarray
+
+
 class StartPosture:
     """Joint positions of the device at the start of an episode.
 
@@ -109,8 +121,8 @@ class StartPosture:
 
     def write(
         self, qpos: np.ndarray, episode: Draw, random_state: np.random.RandomState
-    ) -> None:
-        """Writes the start configuration of one simulation.
+    ) -> Started:
+        """Writes the start configuration of one simulation; returns where it starts.
 
         A displacement that would press the device on the wall is reversed, then
         halved until it does not. If the posture then penetrates a wall or misses its
@@ -126,7 +138,7 @@ class StartPosture:
             number = random_state.randint(len(self._ahead))
             posture = self._ahead[number]
             posture.write(qpos, posture.joints(np.zeros(3), episode.roll))
-            return
+            return Started(posture.advance, np.zeros(3))
         wanted = self._scale * (episode.insertion or 0.0)
         posture = min(self._starts, key=lambda one: abs(one.advance - wanted))
         displacement = episode.displacement
@@ -137,8 +149,10 @@ class StartPosture:
                 break
             displacement = start_displacement(random_state, self._radius)
         else:
-            joints = posture.joints(np.zeros(3), episode.roll)
+            asked = np.zeros(3)
+            joints = posture.joints(asked, episode.roll)
         posture.write(qpos, joints)
+        return Started(posture.advance, asked)
 
 
 class _Posture:
