@@ -333,6 +333,29 @@ HANDED_ON = [
          "simulation_device": "cuda:1", "on_cluster": False, "start": None},
     ),
     (
+        "eval --anatomy type1 push --phantom OUT --goal lcca,bca --threads 1 "
+        "--access descending,",
+        "agents:evaluate",
+        {"task": "navigate",
+         "task_kwargs": {"anatomy": ["type1", "OUT"], "goal": ["lcca", "bca"],
+                         "access": ["descending", None]}},
+    ),
+    (
+        "demos navigate --out OUT --anatomy type1 --goal bca",
+        "agents:record_demonstrations",
+        {"task_kwargs": {"anatomy": "type1", "goal": "bca"}},
+    ),
+    (
+        "record push --task navigate --anatomy type1 --anatomy type2 --out OUT.rrd",
+        "suite:load",
+        {"task_kwargs": {"anatomy": ["type1", "type2"], "random": 1_000_000}},
+    ),
+    (
+        "play navigate --anatomy type1 --anatomy type2 --out OUT",
+        "play:play",
+        {"task_kwargs": {"anatomy": ["type1", "type2"]}},
+    ),
+    (
         "submit push --out OUT.json --task type1_bca --episodes 2 --threads 1",
         "agents.submission:submit",
         {"policy": "push", "task": "type1_bca", "episodes": 2, "num_threads": 1},
@@ -361,6 +384,11 @@ HANDED_ON = [
         "replay e.rrd --web --port 9191 --data-port 9292",
         "recording.viewer:open_viewer",
         {"path": Path("e.rrd"), "web": True, "port": 9191, "data_port": 9292},
+    ),
+    (
+        "dataset --anatomy type1 OUT --anatomy type2 --anatomies 1 0 1",
+        "cli.recordings:write",
+        {"options": ImageSetOptions(anatomy=("type1", "type2"), anatomies=(1, 0, 1))},
     ),
     (
         "dataset OUT --processes 2 --frames 5 --stride 3 --size 64 --seed 5",
@@ -457,6 +485,30 @@ TINY = (
     *("--num-envs", 4, "--threads", 1, "--steps-per-update", 64, "--epochs", 1),
     *("--normalisation-frames", 0, "--max-steps", 8, "--quiet"),
 )
+
+
+def test_a_training_draws_from_several_anatomies(cathsim, tmp_path, monkeypatch):
+    seen = []
+
+    def train(config, *arguments, **options):
+        seen.append(config.task_kwargs)
+        raise InterruptedError("enough")
+
+    monkeypatch.setattr(commands.agents, "train", train)
+    cathsim(
+        *("train", "navigate", "--out", tmp_path / "run", "--anatomy", "type1"),
+        *("--anatomy", "type2", "--goal", "lcca"),
+    )
+    assert seen == [{"anatomy": ["type1", "type2"], "goal": "lcca"}]
+
+
+def test_a_scene_of_several_anatomies_is_refused(cathsim, tmp_path):
+    code, _, err = cathsim(
+        *("export", "navigate", "--out", tmp_path / "scene", "--anatomy", "simple1"),
+        *("--anatomy", "type1", "--goal", "bca"),
+    )
+    assert code == 2 and "draws from 2 anatomies; give one anatomy" in err
+    assert not (tmp_path / "scene").exists()
 
 
 def test_every_setting_is_a_typed_option(cathsim, tmp_path):

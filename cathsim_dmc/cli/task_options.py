@@ -22,12 +22,15 @@ class TaskOptions:
     """Options of a task.
 
     Attributes:
-        anatomy: Directory of an anatomy, or name of an arch (`navigate`).
+        anatomy: Directory of an anatomy, or name of an arch (`navigate`), repeated for
+            several, of which each episode draws one.
         goal: Name of the goal in it, or a place x,y,z of the lumen in the unit and
             frame of the file that it was imported from (`navigate`). Of random arches
-            "any" for one branch after the other, or a name for each arch: lcca,any.
+            "any" for one branch after the other, or a name for each arch: lcca,any. Of
+            several anatomies a name for all, or one for each: lcca,bca.
         access: Way in: "ascending", from the ascending aorta, or "descending", from
-            the femoral artery (`navigate`).
+            the femoral artery (`navigate`). Of several anatomies one for all, or one
+            for each, none for a scan: ascending,,descending.
         arches: Set of random arches that episodes draw from: train, test,
             test_variants, neck or test_neck (`arch_…`, `femoral_arch_…`, `neck_…`).
         pool: Number of arches that episodes draw from (the same tasks).
@@ -37,7 +40,11 @@ class TaskOptions:
             several; the value is text or JSON.
     """
 
-    anatomy: Annotated[str | None, conf.arg(aliases=("--phantom",))] = None
+    anatomy: Annotated[
+        tuple[str, ...],
+        conf.UseAppendAction,
+        conf.arg(aliases=("--phantom",), metavar="ANATOMY"),
+    ] = ()
     goal: str | None = None
     access: str | None = None
     arches: str | None = None
@@ -52,8 +59,13 @@ class TaskOptions:
     def given(self) -> dict[str, Any]:
         """The options that were given, by name."""
         given = {name: one for name, one in vars(self).items() if one is not None}
+        chosen = given.pop("anatomy")
+        if chosen:
+            given["anatomy"] = list(chosen) if len(chosen) > 1 else chosen[0]
         if self.goal is not None and (several := _several(self.goal)):
             given["goal"] = several
+        if self.access is not None and "," in self.access:
+            given["access"] = [part.strip() or None for part in self.access.split(",")]
         for text in given.pop("option"):
             name, sign, value = text.partition("=")
             if not name or not sign or name in given:

@@ -77,8 +77,8 @@ def write_mjcf(
     env = suite.load(suite.DOMAIN, task, options)
     if env.task.num_anatomies > 1:
         raise ValueError(
-            f"{task} draws from {env.task.num_anatomies} anatomies; give pool=1 for "
-            "the scene of one"
+            f"{task} draws from {env.task.num_anatomies} anatomies; give one anatomy, "
+            "or pool=1 of random arches, for the scene of one"
         )
     env.reset()
     values = {"name": task, "seed": options["random"], **describe(env)}
