@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import types
 from pathlib import Path
 
@@ -383,6 +384,89 @@ def test_a_set_is_resumed_and_refused_where_it_must_be(tmp_path, monkeypatch, pa
         image_set.write(path.parent, OPTIONS, processes=1)
     with pytest.raises(FileNotFoundError, match="create it"):
         image_set.write(tmp_path / "a" / "b", OPTIONS, processes=1)
+
+
+def test_given_anatomies_are_dealt_out_in_their_order(tmp_path):
+    own = tmp_path / "own"
+    phantoms.load("simple2").save(own)
+    names = ("type1", str(own), "bovine", "simple1")
+    options = dataclasses.replace(OPTIONS, anatomies=(2, 1, 1), anatomy=names)
+    shards = image_set._shards(tmp_path, options)
+    assert [(one.split, one.number, one.anatomy) for one in shards] == [
+        ("train", 0, "type1"), ("train", 1, str(own)), ("val", 0, "bovine"),
+        ("test", 0, "simple1"),
+    ]  # fmt: skip
+    image_set._begin(tmp_path / "set", options)
+    about = json.loads((tmp_path / "set" / "dataset.json").read_text())
+    assert about["options"]["anatomy"] == list(names) and len(about["lumens"]) == 4
+    card = image_set._card(options, {"train": 2, "val": 1, "test": 1})
+    assert "train: type1, own; val: bovine; test: simple1." in card
+    assert "random aortic arches" not in card
+    image_set._begin(tmp_path / "set", options)
+    shutil.rmtree(own)
+    phantoms.load("type3").save(own)  # another anatomy in the same folder
+    with pytest.raises(ValueError, match="was begun with other options"):
+        image_set._begin(tmp_path / "set", options)
+
+
+def test_a_set_of_random_arches_is_described_as_before(tmp_path):
+    image_set._begin(tmp_path / "set", OPTIONS)
+    about = json.loads((tmp_path / "set" / "dataset.json").read_text())
+    assert "lumens" not in about and "anatomy" not in about["options"]
+    card = image_set._card(OPTIONS, {"train": 1, "val": 0, "test": 0})
+    assert "in two splits. Train and val hold random aortic arches of all" in card
+
+
+@pytest.mark.parametrize(
+    ("anatomies", "names", "message"),
+    [
+        ((8, 2, 2), ("type1", "type2", "bovine"), "add up to 3, such as .* 1 1 1"),
+        ((1, 0, 0), ("type1", "type2"), "add up to 2, such as --anatomies 2 0 0"),
+        ((1, 0, 1), "type1", "anatomy is 'type1'"),
+        ((1, 0, 1), ("type1", ""), "anatomy is ''"),
+    ],
+)
+def test_a_split_that_cannot_be_made_is_refused(anatomies, names, message):
+    with pytest.raises(ValueError, match=message):
+        ImageSetOptions(anatomies=anatomies, anatomy=names)
+
+
+def test_one_lumen_in_two_splits_is_refused(tmp_path):
+    phantoms.load("simple1", access="descending").save(tmp_path / "copy")
+    for names, message in (
+        (("simple1", "simple1"), "simple1 and simple1 are one lumen"),
+        (("simple1", str(tmp_path / "copy")), "simple1 and .*copy are one lumen"),
+        (("simple1", "nowhere"), "no anatomy at 'nowhere'"),
+    ):
+        options = ImageSetOptions(anatomies=(1, 0, 1), anatomy=names)
+        with pytest.raises(ValueError, match=message):
+            image_set.write(tmp_path / "set", options, processes=1)
+        assert not (tmp_path / "set").exists()
+
+
+def test_given_anatomies_have_the_same_labels(tmp_path, cathsim):
+    phantoms.load("simple2").save(tmp_path / "own")
+    code, out, err = cathsim(
+        *("dataset", tmp_path / "set", "--anatomies", 1, 0, 1, "--processes", 1),
+        *("--anatomy", "simple1", "--anatomy", tmp_path / "own", "--sequences", 1),
+        *("--frames", 2, "--views", 1, "--size", 64),
+    )
+    assert code == 0, err
+    assert "2 train, 0 val, 2 test images" in out
+    found = {}
+    for split in ("train", "test"):
+        with h5py.File(tmp_path / "set" / split / f"{split}_000.h5") as file:
+            attributes = dict(file.attrs)
+            found[split] = attributes["name"], attributes["access"]
+            assert set(file) == set(
+                "image mask keypoints keypoints_3d camera_matrix centreline wall_force "
+                "push_force load_cell angles iodine time sequence motion".split()
+            )
+            ostia = file["keypoints_3d"][0, len(sequences.DEVICE_KEYPOINTS) :, 0]
+            assert np.isfinite(ostia).any()
+        labels = json.loads((tmp_path / f"set/annotations/{split}.json").read_text())
+        assert len(labels["images"]) == 2 and len(labels["annotations"]) == 4
+    assert found["train"][0] == "simple1" and found["test"] == ("simple2", "own")
 
 
 @pytest.mark.parametrize(

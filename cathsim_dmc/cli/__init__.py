@@ -24,7 +24,7 @@ _LONGEST = 1500  # characters of an error
 COMMANDS = {
     "train": ("training:command", "Train an agent."),
     "list": ("listing:show", "List the tasks, or the devices with their properties."),
-    "dataset": ("recordings:dataset", "Write labelled fluoroscopy of random arches."),
+    "dataset": ("recordings:dataset", "Write labelled fluoroscopy with a split."),
     "eval": ("agents:evaluate", "Play episodes with a policy and report figures."),
     "table": ("result_tables:table", "Compare evaluations as a table in Markdown."),
     "submit": ("agents:submit", "Write a file for the leaderboard."),

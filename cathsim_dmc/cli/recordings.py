@@ -27,9 +27,11 @@ def dataset(
     ray: Ray = False,
     json: Json = False,
     *,
-    options: Annotated[ImageSetOptions, conf.arg(name="")],
+    options: Annotated[ImageSetOptions, conf.arg(name=""), conf.UseAppendAction],
 ) -> int:
-    """Write labelled fluoroscopy of random arches: images, masks, keypoints, forces.
+    """Write labelled fluoroscopy: images, masks, keypoints, forces.
+
+    Of random arches, or of the anatomies that are given.
 
     Args:
         out: Folder of the data set; an interrupted run goes on in it.

@@ -17,15 +17,18 @@ import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cathsim_dmc import __version__, bounds, cluster, extras, files
+from cathsim_dmc.anatomy import Anatomy, phantoms
+from cathsim_dmc.anatomy.builder import ACCESSES
 from cathsim_dmc.recording import coco, sequences
 from cathsim_dmc.recording.sequences import KEYPOINTS, KITS, ImageSetOptions
+from cathsim_dmc.tasks.anatomies import load_anatomy
 
 SPLITS = {"train": "train", "val": "train", "test": "test"}  # split: set of arches
 _TRIES = 8  # candidates that are tried in turn until a device fits
@@ -42,6 +45,7 @@ class _Shard:
     number: int
     candidates: tuple[int, ...]
     options: ImageSetOptions
+    anatomy: str | None = None  # given in place of the candidates, random arches
 
     @property
     def path(self) -> Path:
@@ -78,7 +82,8 @@ def write(
         "frames_per_processor_second", new images per second of either time.
 
     Raises:
-        ValueError: if an option is wrong, or the folder is that of other options.
+        ValueError: if an option is wrong, an anatomy does not exist or is given twice,
+            or the folder is that of other options.
         OSError: if the directory around `out` does not exist, or `out` is read-only.
         ModuleNotFoundError: if h5py is not installed.
     """
@@ -121,7 +126,11 @@ def _others(begun: str, asked: str) -> str:
 
 def _begin(out: Path, options: ImageSetOptions) -> None:
     """Makes the folders; ValueError if `out` has other content or other options."""
-    about = {"format": _FORMAT, "version": __version__, "options": vars(options)}
+    chosen = {name: one for name, one in vars(options).items() if name != "anatomy"}
+    about = {"format": _FORMAT, "version": __version__, "options": chosen}
+    if options.anatomy:  # a folder may be another anatomy when the run goes on
+        chosen["anatomy"] = list(options.anatomy)
+        about["lumens"] = _lumens(options.anatomy)
     text = json.dumps(about, indent=2) + "\n"
     files.require_folder(out if out.exists() else out.parent)
     described = out / "dataset.json"
@@ -139,9 +148,45 @@ def _begin(out: Path, options: ImageSetOptions) -> None:
         files.require_folder(out / name, make=True)
 
 
+def _lumens(given: Sequence[str]) -> list[list[str]]:
+    """Returns the digests of anatomies, one for each way into a phantom.
+
+    Raises:
+        ValueError: there is no such anatomy, it has no branch to go to, or two are one,
+            which would be in two splits.
+    """
+    found: dict[str, str] = {}
+    lumens = []
+    for name in given:
+        ways = ACCESSES if name in phantoms.PHANTOMS else (None,)
+        entered = [load_anatomy(name, way) for way in ways]
+        if not entered[0].goals:
+            raise ValueError(f"the anatomy {name} has no goal; import it with branches")
+        own = [one.digest for one in entered]
+        for digest in own:
+            if digest in found:
+                raise ValueError(
+                    f"the anatomies {found[digest]} and {name} are one lumen, which "
+                    "would be in two splits or twice in one; leave one of them out"
+                )
+        found |= dict.fromkeys(own, name)
+        lumens.append(own)
+    return lumens
+
+
 def _shards(out: Path, options: ImageSetOptions) -> list[_Shard]:
     from cathsim_dmc.anatomy.arch import arch
 
+    if options.anatomy:
+        places = [
+            (split, number)
+            for split, count in zip(SPLITS, options.anatomies, strict=True)
+            for number in range(count)
+        ]
+        return [
+            _Shard(out, split, number, (), options, _absolute(name))
+            for (split, number), name in zip(places, options.anatomy, strict=True)
+        ]
     shards, taken = [], dict.fromkeys(SPLITS.values(), 0)
     for (split, name), count in zip(SPLITS.items(), options.anatomies, strict=True):
         random, size = np.random.RandomState(options.seed), len(arch.arch_set(name))
@@ -155,6 +200,11 @@ def _shards(out: Path, options: ImageSetOptions) -> list[_Shard]:
     return shards
 
 
+def _absolute(name: str) -> str:
+    """Returns the name of a phantom, or a path that holds in all processes."""
+    return name if name in phantoms.PHANTOMS else str(Path(name).absolute())
+
+
 def _write_shard(shard: _Shard) -> tuple[int, str, Labels]:
     """Writes one anatomy if missing; returns new frames, a line of text, labels."""
     rows, line = (0, "") if shard.path.exists() else _simulate_shard(shard)
@@ -162,16 +212,13 @@ def _write_shard(shard: _Shard) -> tuple[int, str, Labels]:
 
 
 def _simulate_shard(shard: _Shard) -> tuple[int, str]:
-    from cathsim_dmc.anatomy.arch import arch
-    from cathsim_dmc.anatomy.builder import ACCESSES
-
     random, faults = np.random.RandomState(shard.seed), []
-    seeds = arch.arch_set(SPLITS[shard.split])
-    for place in shard.candidates:
+    for place in shard.candidates or (None,) * _TRIES:
         kit = list(KITS)[random.randint(len(KITS))]
         access = ACCESSES[random.randint(len(ACCESSES))]
-        anatomy = arch.build_seed(seeds[place], access=access)
+        anatomy, access = _entered(shard, place, access)
         branches = [goal for goal in anatomy.goals if goal != "descending"]
+        branches = branches or list(anatomy.goals)
         goal = branches[random.randint(len(branches))]
         drawn = [*shard.seed, random.randint(2**31)]
         try:
@@ -186,6 +233,18 @@ def _simulate_shard(shard: _Shard) -> tuple[int, str]:
         about = f"{anatomy.name}, {access}, {kit}, {rows} frames"
         return rows, f"{shard.path.name}: {about}"
     raise RuntimeError(f"{shard.path.name}: no device fits; the last: {faults[-1]}")
+
+
+def _entered(shard: _Shard, place: int | None, access: str) -> tuple[Anatomy, str]:
+    """Returns the anatomy of a file and its access, "own" for the inlet of a scan."""
+    from cathsim_dmc.anatomy.arch import arch
+
+    if shard.anatomy is None:
+        seeds = arch.arch_set(SPLITS[shard.split])
+        return arch.build_seed(seeds[place], access=access), access
+    if shard.anatomy in phantoms.PHANTOMS:
+        return load_anatomy(shard.anatomy, access), access
+    return load_anatomy(shard.anatomy), "own"
 
 
 def _over(work: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterable[Any]:
@@ -237,6 +296,14 @@ def _label(out: Path, shards: list[_Shard], labels: list[Labels]) -> dict[str, i
 def _card(options: ImageSetOptions, frames: dict[str, int]) -> str:
     counts = zip(frames.items(), options.anatomies, strict=True)
     rows = [f"| {name} | {some} | {n} |" for (name, n), some in counts]
+    held = """Train and val hold random aortic arches of all types, test
+normal arches of the types I and II of a set that nothing is trained on."""
+    if options.anatomy:
+        named = {split: "" for split in SPLITS}
+        for shard in _shards(Path(), options):
+            named[shard.split] += f", {Path(shard.anatomy or '').name}"
+        parts = (f"{split}: {names[2:] or 'none'}" for split, names in named.items())
+        held = f"The anatomies: {'; '.join(parts)}."
     return f"""# Simulated fluoroscopy of endovascular devices
 
 Written by `cathsim dataset` of cathsim_dmc {__version__}; the options are in
@@ -247,8 +314,7 @@ Licence: that of cathsim_dmc, Apache-2.0.
 |---|---|---|
 {chr(10).join(rows)}
 
-No anatomy is in two splits. Train and val hold random aortic arches of all types, test
-normal arches of the types I and II of a set that nothing is trained on.
+No anatomy is in two splits. {held}
 
 - Images: {options.size} x {options.size}, 8 bits, dark is opaque, quantum noise.
 - Keypoints: {", ".join(KEYPOINTS)}. Those outside the image are absent (0), ostia

@@ -70,9 +70,12 @@ class ImageSetOptions:
         stride: Control steps of 40 ms from frame to frame.
         size: Pixels along a side of an image.
         vessel: State of the vessel: rigid, silicone or living.
-        anatomies: Number of random arches in train, val and test.
+        anatomies: Number of random arches in train, val and test; or of the given
+            anatomies, which are dealt out in their order.
         pictures: Whether the images are also written as PNG, for tools of COCO.
         seed: Seed of all that is drawn.
+        anatomy: Directory of an anatomy, or name of a phantom, in place of random
+            arches; repeated for several.
     """
 
     sequences: int = 32
@@ -84,6 +87,7 @@ class ImageSetOptions:
     anatomies: tuple[int, int, int] = (8, 2, 2)
     pictures: bool = False
     seed: int = 0
+    anatomy: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         most = {"sequences": 1000, "frames": 1000, "views": 100, "stride": 100}
@@ -97,6 +101,18 @@ class ImageSetOptions:
         object.__setattr__(self, "anatomies", tuple(map(int, counts)))
         bounds.switch("pictures", self.pictures)
         bounds.seed("seed", self.seed)
+        if isinstance(self.anatomy, str):
+            bounds.refuse("anatomy", self.anatomy, "a list of names or directories")
+        given = tuple(bounds.text("anatomy", str(one)) for one in self.anatomy)
+        object.__setattr__(self, "anatomy", given)
+        if (count := len(given)) and sum(self.anatomies) != count:
+            few = max(count // 5, int(count > 2))
+            example = f"{count - 2 * few} {few} {few}"
+            raise ValueError(
+                f"{count} anatomies are given (--anatomy), and anatomies is "
+                f"{self.anatomies}; give the numbers of them in train, val and test, "
+                f"which add up to {count}, such as --anatomies {example}"
+            )
 
 
 class States(NamedTuple):
