@@ -147,6 +147,59 @@ print("drawn")
 """
 
 
+SEVERAL = """
+import sys
+import numpy as np
+from cathsim_dmc import suite
+from cathsim_dmc.simulation.batch import BatchSimulation
+
+pair = {"devices": ["wire_035_glide", "berenstein_5f"]}
+own = pair if sys.argv[1] == "pair" else {}
+options = {
+    "observation": ["rgb", "depth"], "goal": "bca", "working_length": 0.25, **own,
+    "cameras": {"names": ["top", "side", "tip"], "size": [40, 48]},
+}
+exact = {"start_radius": 0.0}
+if not own:  # friction and others differ between simulations
+    exact |= {"friction": [0.04, 0.04], "roll": [0.3, 0.3]}
+options["randomisation"] = exact
+names = ["simple1", "type1", "simple2"]
+
+def made(anatomy, seed=0):
+    return suite.make_task("navigate", random=seed, anatomy=anatomy, **options)
+
+batch = BatchSimulation(made(names), 6, num_threads=1)
+pool = suite.environment(made(names, 1))  # which does not draw the first one first
+alone = {name: BatchSimulation(made(name), 1, num_threads=1) for name in names}
+action = np.zeros(batch.num_actions)
+action[[0, 2] if own else -1] = 1.0
+visited = set()
+for episode in range(2):  # in which simulations change their anatomies
+    seen, single = batch.reset(), pool.reset()
+    for step in range(4):
+        told = [one.anatomy for one in batch.conditions]
+        visited |= {*told}
+        expected = {}
+        for name, one in alone.items():
+            state = one.reset() if not step else one.step(action[None])
+            expected[name] = state.observation
+        for number, name in enumerate(told):
+            for key, value in expected[name].items():
+                mine = seen.observation[key][number]
+                np.testing.assert_array_equal(mine, value[0], err_msg=(key, name))
+        here = pool.task.conditions.anatomy
+        assert episode or here == "type1"
+        for key, value in expected[here].items():
+            np.testing.assert_array_equal(single.observation[key], value[0])
+        seen = batch.step(np.tile(action, (6, 1)))
+        single = pool.step(action)
+assert visited == {*names}
+top = [one["depth"][0, ..., 0] for one in expected.values()]
+assert all((a != b).mean() > 0.02 for a, b in zip(top, top[1:]))
+print("several")
+"""
+
+
 @pytest.fixture(scope="module")
 def back_end():
     """Name of a back end of OpenGL that works here."""
@@ -185,6 +238,14 @@ def test_the_device_is_drawn_where_it_is(back_end):
     assert "drawn" in done.stdout, done.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("devices", ["single", "pair"])
+def test_cameras_show_the_anatomy_of_each_simulation(devices, back_end):
+    """As a task with this anatomy alone does, bit for bit."""
+    done = python(back_end, SEVERAL, devices)
+    assert "several" in done.stdout, done.stderr
+
+
 def test_without_opengl_the_message_says_what_to_do(shared_environment, monkeypatch):
     def fail(*_):
         raise OSError("no display")
@@ -203,10 +264,8 @@ def test_without_opengl_the_message_says_what_to_do(shared_environment, monkeypa
 
 
 def test_what_cameras_cannot_show_is_refused(shared_environment):
-    for options in ({"vessel": "living"}, {"arches": "test", "pool": 2}):
-        name = "arch_lcca" if "pool" in options else "simple1_bca"
-        with pytest.raises(ValueError, match="one anatomy at rest.*endoluminal"):
-            suite.make_task(name, observation="depth", **options)
+    with pytest.raises(ValueError, match="anatomies at rest.*endoluminal"):
+        suite.make_task("simple1_bca", observation="depth", vessel="living")
 
 
 @pytest.mark.parametrize("names", ["back", [], ["top", "top"], [1], 3, None])

@@ -5,7 +5,7 @@ import functools
 import os
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -23,6 +23,7 @@ KINDS = ("rgb", "depth")  # names of observations
 # Near and far clipping plane, m: a wall that the head touches is a radius of the device
 # away, and the top view 0.7 m.
 NEAREST, FARTHEST = 0.3e-3, 10.0
+_EXTENT = 1.0  # m, of the drawn model: the unit of `znear` and `zfar`
 # Values of MUJOCO_GL with which MuJoCo loads no OpenGL.
 _DISABLED = ("disable", "disabled", "off", "false", "0")
 # Fields of the model that, with `qpos`, decide how a device is drawn.
@@ -56,6 +57,14 @@ class CameraOptions:
         vars(self).update(names=tuple(named), size=size)
 
 
+class Meshes(Protocol):
+    """Shows one of several anatomies in a model, see `case_meshes.CaseMeshes`."""
+
+    def compiled(self, simulated: mujoco.MjModel) -> mujoco.MjModel: ...  # noqa: D102
+    def enter(self, model: mujoco.MjModel, number: int) -> None: ...  # noqa: D102
+    def draw(self, model: mujoco.MjModel, number: int) -> None: ...  # noqa: D102
+
+
 class Cameras:
     """MuJoCo's cameras of one compiled model, with their own OpenGL context.
 
@@ -72,25 +81,35 @@ class Cameras:
         options: CameraOptions,
         kinds: Sequence[str],
         written: Collection[str],
+        meshes: "Meshes | None" = None,
     ):
         """Prepares the model; the first image opens the context, or `open`.
 
         Args:
             kinds: Kinds of images, of `KINDS`.
             written: Fields of the model that differ between simulations.
+            meshes: Meshes of several anatomies; None for one.
 
         Raises:
             ValueError: if OpenGL is disabled.
         """
         if os.environ.get("MUJOCO_GL", "").lower().strip() in _DISABLED:
             raise ValueError(_no_opengl("it is disabled"))
-        self._size = rows, columns = options.size
+        self._size = options.size
         self._names, self._written = options.names, _DRAWN.intersection(written)
         self._kinds = tuple(kinds)
         self._links = set(world.index.geoms.tolist())
-        self._model = model = copy.copy(world.model)
+        self._simulated, self._meshes = world.model, meshes
+        self._number: int | None = None  # of the anatomy that is shown
+        if meshes is None:
+            self._take(copy.copy(world.model))
+
+    def _take(self, model: mujoco.MjModel) -> None:
+        """Takes the model that is drawn."""
+        rows, columns = self._size
+        self._model = model
         model.vis.global_.offheight, model.vis.global_.offwidth = rows, columns
-        model.stat.extent = 1.0  # unit of `znear` and `zfar`
+        model.stat.extent = _EXTENT
         model.vis.map.znear, model.vis.map.zfar = NEAREST, FARTHEST
         self._data, self._options = mujoco.MjData(model), mujoco.MjvOption()
         self._options.sitegroup[:] = 0
@@ -105,6 +124,8 @@ class Cameras:
         thread = render_thread()
         if self._renderer is not None:
             return
+        if self._meshes is not None:
+            self._take(self._meshes.compiled(self._simulated))
         try:
             self._renderer = thread.run(lambda: thread.open(self._model, self._size))
         except Exception as error:  # each back end fails in its own way
@@ -117,9 +138,19 @@ class Cameras:
             self._close()
 
     def see(
-        self, indices: np.ndarray, stepper: Stepper, readings: Readings
+        self,
+        indices: np.ndarray,
+        case_of: np.ndarray,
+        stepper: Stepper,
+        readings: Readings,
     ) -> dict[str, np.ndarray]:
         """Pictures of some simulations (K,).
+
+        Args:
+            indices: Numbers of these simulations.
+            case_of: (N,) number of the anatomy of each of all N simulations.
+            stepper: Stepper of all N simulations.
+            readings: State of the devices of all N simulations.
 
         Returns:
             "rgb": (K, rows, columns, 3 C) uint8 of C cameras; "depth": (K, rows,
@@ -130,7 +161,10 @@ class Cameras:
         """
         self.open()
         seen = render_thread().run(
-            lambda: [self._see(index, stepper, readings) for index in indices]
+            lambda: [
+                self._see(index, int(case_of[index]), stepper, readings)
+                for index in indices
+            ]
         )
         return {kind: np.stack([one[kind] for one in seen]) for kind in self._kinds}
 
@@ -144,11 +178,18 @@ class Cameras:
         return {kind: kinds[kind] for kind in self._kinds}
 
     def _see(
-        self, index: int, stepper: Stepper, readings: Readings
+        self, index: int, number: int, stepper: Stepper, readings: Readings
     ) -> dict[str, np.ndarray]:
-        """Pictures of one simulation."""
+        """Pictures of one simulation, which is in the anatomy of a number."""
+        meshes, anew = self._meshes, number != self._number
+        if meshes is not None and anew:
+            meshes.enter(self._model, number)
+            self._model.stat.extent = _EXTENT
+            self._number = number
         for name in self._written:
             getattr(self._model, name)[:] = stepper.field(index, name)
+        if meshes is not None and (anew or self._written):
+            meshes.draw(self._model, number)
         self._data.qpos[:] = stepper.arrays.qpos[index]
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)

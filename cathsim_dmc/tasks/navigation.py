@@ -23,7 +23,7 @@ from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.conditions import Conditions
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective
-from cathsim_dmc.tasks.observation_kind import OPENGL, FrameObservable, Sizes
+from cathsim_dmc.tasks.observation_kind import FrameObservable, Sizes
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.snapshot import NotCopied, Snapshot
@@ -76,9 +76,8 @@ class Navigation(composer.Task, NotCopied):
             name: Name of the task in texts; None for the name of the class.
 
         Raises:
-            ValueError: if the objective does not support the randomisation, the scenes
-                differ in more than their anatomies, or MuJoCo's cameras are observed in
-                several anatomies or a vessel that moves.
+            ValueError: if the objective does not support the randomisation, or the
+                scenes differ in more than their anatomies.
         """
         self.name = name or type(self).__name__
         self.options: dict[str, Any] = {}
@@ -96,14 +95,6 @@ class Navigation(composer.Task, NotCopied):
         self.observation_names = observations.resolve(
             config.observation, scene.catheter.coaxial, config.vessel.living
         )
-        changes = config.vessel.motion is not None or others is not None
-        if changes and observations.needs(self.observation_names, OPENGL):
-            raise ValueError(
-                f"the observation is {config.observation!r}: MuJoCo's cameras show one "
-                "anatomy at rest, and this task has several or moves it; observe "
-                "image, segmentation or endoluminal, or take a pool of 1 and a vessel "
-                "that does not move"
-            )
         self.set_timesteps(CONTROL_TIMESTEP, config.physics_timestep)
         self._cases: tuple[cases.Case, ...] = ()
         if others is not None:

@@ -117,7 +117,7 @@ class Rollout(Restorable):
         self.progress = Progress(names, cases, count, config.give_up)
         self._chain = CommonChain(scene.catheter, config.shaft_link)
         self._sensors = ImageSensors(names, self._cases, count, self._chain)
-        self.views = Views(names, config, world, self.effects)
+        self.views = Views(names, config, world, self.effects, self._cases)
         self._tracking = TrackingNoise(config.randomisation.tracking_noise)
         # None before the first episode.
         self._random_states: list[RandomState] | None = None
@@ -335,10 +335,8 @@ class Rollout(Restorable):
             )
             sensors.capture(rows, begins, exposure, random, self.around)
         if self.views.wanted and len(rows):
-            scenes = [self.case(index).scene for index in rows]
-            found = self.views.see(
-                rows, scenes, self._stepper, self.readings, self.moving, self.begun
-            )
+            state_of = self._stepper, self.readings, self.moving, self.begun
+            found = self.views.see(rows, self._case_of, *state_of)
             for name, view in found.items():
                 sensors.hold(name, view, rows)
         seen = self._at_rest(state) if self._tracking.deviation else self.resting

@@ -3,6 +3,8 @@
 import dataclasses
 from collections.abc import Sequence
 
+import numpy as np
+
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import devices
@@ -29,6 +31,10 @@ _TORSION_JOINTS = 4
 # Chains of up to this many links are faster with dense Jacobians: 1.1 to 1.4 times in
 # free motion, and as fast in a jam. MuJoCo's own limit is 60 degrees of freedom.
 _DENSE_LINKS = 50
+
+# Cameras and their axes, right and up: the published top view, and one from the side.
+# Seen from the front, the patient's left is on the right of the image.
+VIEWS = {"top": (1, 0, 0, 0, 0, 1), "side": (0, 1, 0, 0, 0, 1)}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,15 +116,13 @@ class Scene:
         return scene
 
     def _add_cameras(self, drawn: bool):
-        """Adds the published top view and one from the side."""
+        """Adds the cameras of `VIEWS`."""
         low, high = self.anatomy.lumen.box
         if drawn:
             vertices = self.anatomy.surface.vertices
             low, high = vertices.min(0), vertices.max(0)
-        centre, distance = (low + high) / 2, 2.6 * float((high - low).max())
-        # Seen from the front, the patient's left is on the right of the image.
-        self.arena.add_camera("top", centre, distance, (1, 0, 0, 0, 0, 1))
-        self.arena.add_camera("side", centre, distance, (0, 1, 0, 0, 0, 1))
+        for name, axes in VIEWS.items():
+            self.arena.add_camera(name, *_aimed(low, high), axes)
 
     def _attach(self, config: NavigationConfig):
         moving, own = config.vessel.motion is not None, config.effects_on(self.catheter)
@@ -146,6 +150,17 @@ class Scene:
         )
         if moving:
             add_clock(self.arena.mjcf_model)
+
+
+def _aimed(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
+    """Point that cameras look at, and their distance from it, m, for a box."""
+    return (low + high) / 2, 2.6 * float((high - low).max())
+
+
+def camera_position(name: str, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Position (3,) of a camera of `VIEWS` for a box with these corners, m."""
+    axes, (centre, distance) = VIEWS[name], _aimed(low, high)
+    return centre + distance * np.cross(axes[:3], axes[3:])
 
 
 def chosen_devices(config: NavigationConfig) -> tuple[devices.Device, ...]:

@@ -10,8 +10,9 @@ from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks.cameras import KINDS, Cameras
+from cathsim_dmc.tasks.case_meshes import CaseMeshes
+from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.scene import Scene
 
 
 class Views:
@@ -27,21 +28,24 @@ class Views:
         config: NavigationConfig,
         world: World,
         effects: Sequence[Effect],
+        cases: Sequence[Case],
     ):
         """Prepares the views for observations of these names.
 
         Args:
+            cases: Anatomies that the simulations may be in.
             effects: All effects, which may change the model of a simulation.
 
         Raises:
             ValueError: if a camera needs OpenGL, which is disabled.
         """
-        self._size = config.endoluminal_size
+        self._size, self._cases = config.endoluminal_size, cases
         self._inside = any(name.startswith("endoluminal") for name in names)
         self._cameras: Cameras | None = None
         if kinds := [kind for kind in KINDS if kind in names]:
             written = {name for effect in effects for name in effect.model_fields}
-            self._cameras = Cameras(world, config.cameras, kinds, written)
+            meshes = CaseMeshes(cases) if len(cases) > 1 else None
+            self._cameras = Cameras(world, config.cameras, kinds, written, meshes)
         self.wanted = self._inside or self._cameras is not None
         self._left_out = False
 
@@ -61,7 +65,7 @@ class Views:
     def see(
         self,
         rows: np.ndarray,
-        scenes: Sequence[Scene],
+        case_of: np.ndarray,
         stepper: Stepper,
         readings: Readings,
         moving: Moving | None,
@@ -71,7 +75,7 @@ class Views:
 
         Args:
             rows: (K,) numbers of these simulations, K > 0.
-            scenes: Their K scenes.
+            case_of: (N,) number of the case of each of all N simulations.
             stepper: Stepper of all N simulations.
             readings: State of the devices of all N simulations.
             moving: Effect that moves the vessels; None if they rest.
@@ -86,11 +90,11 @@ class Views:
         if self._cameras is not None and (self._left_out or not begun):
             seen = self._cameras.blank(len(rows))
         elif self._cameras is not None:
-            seen = self._cameras.see(rows, stepper, readings)
+            seen = self._cameras.see(rows, case_of, stepper, readings)
         if not self._inside:
             return seen
         grey, distance = endoluminal.views(
-            [scene.anatomy.lumen for scene in scenes],
+            [self._cases[int(case_of[i])].scene.anatomy.lumen for i in rows],
             [moving.warp(i) if moving else endoluminal.AT_REST for i in rows],
             readings.head[rows],
             readings.head_frame[rows],
