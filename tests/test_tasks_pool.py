@@ -101,7 +101,6 @@ def test_a_task_may_have_a_list_of_anatomies(monkeypatch, tmp_path):
         ({"anatomy": ["simple1", "none"]}, "no anatomy at 'none'"),
         ({"anatomy": ["simple1", 3]}, "anatomy is 3"),
         ({"goal": "spleen"}, "goal is 'spleen'"),
-        ({"observation": "rgb", "vessel": "living"}, "anatomies at rest"),
     ],
 )
 def test_wrong_lists_are_refused(wrong, message):

@@ -13,6 +13,7 @@ import numpy as np
 from cathsim_dmc import bounds
 from cathsim_dmc.imaging.options import VIEW_ANGLE
 from cathsim_dmc.physics.effects import World
+from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks.render_thread import render_thread
@@ -58,11 +59,14 @@ class CameraOptions:
 
 
 class Meshes(Protocol):
-    """Shows one of several anatomies in a model, see `case_meshes.CaseMeshes`."""
+    """Shows anatomies in a model, see `case_meshes.CaseMeshes`."""
 
     def compiled(self, simulated: mujoco.MjModel) -> mujoco.MjModel: ...  # noqa: D102
     def enter(self, model: mujoco.MjModel, number: int) -> None: ...  # noqa: D102
     def draw(self, model: mujoco.MjModel, number: int) -> None: ...  # noqa: D102
+    def reshape(  # noqa: D102
+        self, model: mujoco.MjModel, number: int, vertices: np.ndarray
+    ) -> int: ...
 
 
 class Cameras:
@@ -88,7 +92,8 @@ class Cameras:
         Args:
             kinds: Kinds of images, of `KINDS`.
             written: Fields of the model that differ between simulations.
-            meshes: Meshes of several anatomies; None for one.
+            meshes: Meshes of several anatomies, or of vessels that move; None for one
+                anatomy at rest.
 
         Raises:
             ValueError: if OpenGL is disabled.
@@ -143,6 +148,7 @@ class Cameras:
         case_of: np.ndarray,
         stepper: Stepper,
         readings: Readings,
+        moving: Moving | None = None,
     ) -> dict[str, np.ndarray]:
         """Pictures of some simulations (K,).
 
@@ -151,6 +157,7 @@ class Cameras:
             case_of: (N,) number of the anatomy of each of all N simulations.
             stepper: Stepper of all N simulations.
             readings: State of the devices of all N simulations.
+            moving: Effect that moves the vessels; None if they rest.
 
         Returns:
             "rgb": (K, rows, columns, 3 C) uint8 of C cameras; "depth": (K, rows,
@@ -162,7 +169,7 @@ class Cameras:
         self.open()
         seen = render_thread().run(
             lambda: [
-                self._see(index, int(case_of[index]), stepper, readings)
+                self._see(index, int(case_of[index]), stepper, readings, moving)
                 for index in indices
             ]
         )
@@ -178,7 +185,12 @@ class Cameras:
         return {kind: kinds[kind] for kind in self._kinds}
 
     def _see(
-        self, index: int, number: int, stepper: Stepper, readings: Readings
+        self,
+        index: int,
+        number: int,
+        stepper: Stepper,
+        readings: Readings,
+        moving: Moving | None,
     ) -> dict[str, np.ndarray]:
         """Pictures of one simulation, which is in the anatomy of a number."""
         meshes, anew = self._meshes, number != self._number
@@ -190,6 +202,10 @@ class Cameras:
             getattr(self._model, name)[:] = stepper.field(index, name)
         if meshes is not None and (anew or self._written):
             meshes.draw(self._model, number)
+        if meshes is not None and moving is not None:
+            vertices = moving.surface(index).vertices
+            mesh = meshes.reshape(self._model, number, vertices)
+            render_thread().upload(self._renderer, self._model, mesh)
         self._data.qpos[:] = stepper.arrays.qpos[index]
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)

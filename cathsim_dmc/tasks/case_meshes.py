@@ -1,8 +1,8 @@
-"""The meshes of several anatomies in one model, for MuJoCo's cameras.
+"""Meshes of several anatomies, or of vessels that move, for MuJoCo's cameras.
 
-The simulated model has the mesh of the first anatomy alone: a mesh is drawn and never
-touched. Cameras draw in a model of their own, which has all meshes, so that nothing
-changes in the simulations.
+The simulated model has the mesh of the first anatomy alone, at rest: a mesh is drawn
+and never touched. Cameras draw in a model of their own, which has all meshes, so that
+nothing changes in the simulations.
 """
 
 from collections.abc import Sequence
@@ -14,6 +14,9 @@ from cathsim_dmc.entities.phantom import mesh_file
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.scene import VIEWS, camera_position
 
+# Largest difference between normals computed here and by MuJoCo, which treats sharp
+# edges, as those of the caps, in a way of its own.
+_ALIKE = 1e-3
 # Fields that differ between models with other meshes.
 _OWN = ("_", "name", "path", "text", "mesh_", "bvh_")
 
@@ -24,6 +27,7 @@ class CaseMeshes:
     def __init__(self, cases: Sequence[Case]):
         """Takes the cases; the first one's scene is that of the simulated model."""
         self._cases = cases
+        self._smooth: dict[int, np.ndarray] = {}  # vertices (n,) bool of each case
 
     def compiled(self, simulated: mujoco.MjModel) -> mujoco.MjModel:
         """Returns a copy of the simulated model with the meshes of all cases."""
@@ -73,3 +77,39 @@ class CaseMeshes:
         model.geom_pos[self._geom] = model.mesh_pos[mesh]
         model.geom_quat[self._geom] = model.mesh_quat[mesh]
         model.geom_sameframe[self._geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+
+    def reshape(self, model: mujoco.MjModel, number: int, vertices: np.ndarray) -> int:
+        """Moves the vertices (n, 3), m, of the mesh of a case; returns its number.
+
+        The mesh must then be uploaded to the context that draws it.
+        """
+        mesh = self._meshes[number]
+        surface = self._cases[number].scene.anatomy.surface
+        start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        own = slice(start, start + count)
+        frame = np.empty(9)
+        mujoco.mju_quat2Mat(frame, model.mesh_quat[mesh])
+        frame = frame.reshape(3, 3)
+        start = model.mesh_normaladr[mesh]
+        there = slice(start, start + model.mesh_normalnum[mesh])
+        if number not in self._smooth:
+            rest = _normals(surface.vertices, surface.faces) @ frame
+            away = np.abs(rest - model.mesh_normal[there]).max(axis=1)
+            self._smooth[number] = away < _ALIKE
+        smooth = self._smooth[number]
+        model.mesh_vert[own] = (vertices - model.mesh_pos[mesh]) @ frame
+        turned = _normals(vertices, surface.faces) @ frame
+        model.mesh_normal[there][smooth] = turned[smooth]
+        return mesh
+
+
+def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals (n, 3) of vertices, means over their faces weighted by area."""
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+    across = np.cross(second - first, third - first)
+    total = np.zeros(vertices.shape)
+    for corner in range(3):
+        for axis in range(3):
+            weights = across[:, axis]
+            total[:, axis] += np.bincount(faces[:, corner], weights, len(vertices))
+    return total / np.linalg.norm(total, axis=1, keepdims=True)

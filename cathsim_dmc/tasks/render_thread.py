@@ -67,6 +67,13 @@ class RenderThread:
             self._closes_at_exit = True
         return renderer
 
+    def upload(
+        self, renderer: "mujoco.Renderer", model: mujoco.MjModel, mesh: int
+    ) -> None:
+        """Uploads a mesh of a model that has changed; called in this thread."""
+        renderer._gl_context.make_current()  # noqa: SLF001
+        mujoco.mjr_uploadMesh(model, renderer._mjr_context, mesh)  # noqa: SLF001
+
     def close(self, renderer: "mujoco.Renderer") -> None:
         """Closes a renderer, at once or after the present job; does not wait."""
         self._jobs.put(lambda: self._close(renderer))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cathsim_dmc.imaging import endoluminal
-from cathsim_dmc.physics.effects import Effect, World
+from cathsim_dmc.physics.effects import Effect, World, of_kind
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.stepper import Stepper
@@ -44,7 +44,8 @@ class Views:
         self._cameras: Cameras | None = None
         if kinds := [kind for kind in KINDS if kind in names]:
             written = {name for effect in effects for name in effect.model_fields}
-            meshes = CaseMeshes(cases) if len(cases) > 1 else None
+            moved = of_kind(effects, Moving) is not None
+            meshes = CaseMeshes(cases) if moved or len(cases) > 1 else None
             self._cameras = Cameras(world, config.cameras, kinds, written, meshes)
         self.wanted = self._inside or self._cameras is not None
         self._left_out = False
@@ -90,7 +91,7 @@ class Views:
         if self._cameras is not None and (self._left_out or not begun):
             seen = self._cameras.blank(len(rows))
         elif self._cameras is not None:
-            seen = self._cameras.see(rows, case_of, stepper, readings)
+            seen = self._cameras.see(rows, case_of, stepper, readings, moving)
         if not self._inside:
             return seen
         grey, distance = endoluminal.views(
