@@ -257,8 +257,7 @@ def advance(
     lost = np.where(outside & on, m.lost + 1, 0)
     hard_push = np.where(place.arc_length > m.last, s.deep_push, s.hard_push)
     pressed = np.where((push > hard_push) & on, m.pressed + 1, 0)
-    held = np.where(gained | m.retracting, np.minimum(insertion, m.held), m.held)
-    held = np.where(gained, insertion, held)
+    held = np.where(gained, insertion, m.held)
     recent = m.attempts % _GROWING
     more = np.where(np.isfinite(m.ostium), 0.0, s.slack_growth) * recent
     buckled = on & (insertion > held + s.slack * (1 + more))
