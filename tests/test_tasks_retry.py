@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+import types
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from test_tasks_snapshot import undeclared
 
 from cathsim_dmc import policies, suite
@@ -15,7 +17,7 @@ from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import progress, retry, take_offs
 from cathsim_dmc.tasks.objectives import Cannulation
 from cathsim_dmc.tasks.retry import COAXIAL, SINGLE, Memory
-from cathsim_dmc.tasks.route import Place, Route, locate
+from cathsim_dmc.tasks.route import Place, Route, locate, locate_each, look_ahead
 
 SHORT = retry.RetrySettings(patience=5)
 
@@ -26,11 +28,49 @@ def begun(arc_length, insertion, **values):
     return Memory.at(place, np.array(insertion))._replace(**values)
 
 
-def goes_on(memory, arc_length, insertion, *, excess=-0.5, push=0.0, settings=SINGLE):
+def goes_on(memory, arc_length, insertion, *, excess=-0.5, settings=SINGLE, **more):
     shape = memory.attempts.shape
     place = Place(np.full(shape, arc_length), np.full(shape, excess))
-    inserted, pushed = np.full(shape, insertion), np.full(shape, push)
-    return retry.advance(settings, memory, place, inserted, pushed)
+    inserted, pushed = np.full(shape, insertion), np.full(shape, more.pop("push", 0.0))
+    return retry.advance(settings, memory, place, inserted, pushed, **more)
+
+
+@pytest.mark.parametrize(
+    ("before", "step", "after"),
+    [
+        ({"lost": 3}, {"excess": 0.9 * SINGLE.tolerance}, {"lost": 0}),
+        ({"lost": 3}, {"excess": 1.1 * SINGLE.tolerance}, {"lost": 4}),
+        ({"stale": 3}, {"arc_length": 0.1 + 0.9 * SINGLE.progress}, {"stale": 4}),
+        ({"stale": 3}, {"arc_length": 0.1 + 1.1 * SINGLE.progress}, {"stale": 0}),
+        ({"pressed": 1}, {"push": 0.9 * SINGLE.hard_push}, {"pressed": 0}),
+        ({"pressed": 1}, {"push": 1.1 * SINGLE.hard_push}, {"pressed": 2}),
+        (  # A withdrawal counts its own steps alone.
+            {"retracting": True, "stale": 3, "lost": 3, "pressed": 1},
+            {"arc_length": 0.11, "excess": 1.0, "push": 1.0},
+            {"stale": 4, "lost": 0, "pressed": 0},
+        ),
+        (
+            {"stale": SINGLE.patience, "best": 0.12},
+            {},
+            {"attempts": 1, "retracting": True, "stale": 0, "best": 0.1},
+        ),
+        (
+            {"retracting": True, "turn": 0.08, "held": 0.05, "stale": 9},
+            {},
+            {"retracting": False, "held": 0.08, "stale": 0},
+        ),
+        # The barrier stays at the first hard push of several at one place.
+        ({"pressed": 2, "barrier": 0.097}, {"push": 1.0}, {"barrier": 0.097}),
+        ({"pressed": 2, "barrier": 0.093}, {"push": 1.0}, {"barrier": 0.1}),
+        ({}, {"narrow": True}, {"given_up": True}),
+        ({}, {"narrow": True, "excess": 1.0}, {"given_up": False}),
+    ],
+)
+def test_what_a_control_step_changes(before, step, after):
+    memory = begun([0.1], [0.08], **{name: [value] for name, value in before.items()})
+    memory = goes_on(memory, **{"arc_length": 0.1, "insertion": 0.08, **step})
+    found = {name: getattr(memory, name).item() for name in after}
+    assert found == pytest.approx(after, abs=1e-12)
 
 
 def test_a_head_that_stands_still_is_withdrawn_and_tried_again():
@@ -102,6 +142,8 @@ def test_a_shaft_that_buckles_is_taken_back_until_the_head_comes_with_it():
     assert memory.retracting[0] and memory.taking_up[0] and memory.attempts[0] == 1
     # The head springs forward: on; it comes back: the slack is gone.
     memory = goes_on(memory, 0.104, 0.055, settings=COAXIAL)
+    assert memory.retracting[0]
+    memory = goes_on(memory, 0.104 - 0.5 * COAXIAL.give, 0.054, settings=COAXIAL)
     assert memory.retracting[0]
     came_back = 0.104 - 2 * COAXIAL.give
     memory = goes_on(memory, came_back, 0.052, settings=COAXIAL)
@@ -180,8 +222,38 @@ def test_attempts_differ_in_what_policies_see():
     assert ways[:3].tolist() == [20e-3 * factor for factor in factors]
     leads = COAXIAL.close.leads * 4 + COAXIAL.pattern.leads
     assert retry.lead(COAXIAL, close).tolist() == list(leads)
-    seen = retry.shown(COAXIAL, close, insertion, insertion, True)
-    assert seen[0, 12] == pytest.approx(-1.0)
+    # Beyond the ostium by more than `held` the wire advances alone.
+    deep = begun([0.1, 0.1], [0.08] * 2, ostium=[0.08, 0.09])
+    assert retry.lead(COAXIAL, deep) == pytest.approx([0.04, COAXIAL.close.leads[0]])
+    # It depends on the lumen at the shortest look-ahead, not at the head.
+    narrows = Route(
+        np.zeros((4, 3)),
+        1e-3 * np.array([10, 10, 6, 6]),
+        np.array([0, 0.105, 0.106, 1]),
+    )
+    first = begun([0.1], [0.08])
+    way = retry.lookahead(SINGLE, first, narrows, first.arc_length)
+    assert way == pytest.approx(1.5 * 6e-3)
+
+
+def test_a_policy_sees_the_memory_in_its_scales():
+    """10 mm are left to withdraw of the first; the wire of the second leads by 80."""
+    memory = begun(
+        [0.1, 0.1], [0.08] * 2, retracting=[True, False], turn=[0.07] * 2,
+        stale=[30, 0], lost=[0, 30], attempts=[3, 2], taking_up=[True, False],
+        ostium=[np.inf, 0.04], given_up=[False, True],
+    )  # fmt: skip
+    insertion, push = np.full(2, 0.08), np.array([0.3, -0.2])
+    seen = retry.shown(COAXIAL, memory, insertion, push, True)
+    turned = COAXIAL.pattern.leads[3] / 20e-3, np.cos(0.7), np.sin(0.7)
+    expected = [
+        [1, 0.5, 0.5, 0, 0.75, 1, 0, 0, 1, 0.3, 0, 1, *turned],
+        [0, 0, 0, 2, 0.5, 0, 0, 1, 0, -0.2, 1, 0, 2, 1, 0],
+    ]
+    np.testing.assert_allclose(seen, expected, atol=1e-12)
+    single = retry.shown(SINGLE, memory, insertion, push, False)
+    assert single[0, 2:4] == pytest.approx([0.75, 0.0]) and single[1, 3] == 2.0
+    np.testing.assert_array_equal(memory.steady, [0.1, np.nan])
 
 
 def test_past_a_close_take_off_a_withdrawal_ends_in_the_middle_of_the_branch():
@@ -196,7 +268,7 @@ def test_past_a_close_take_off_a_withdrawal_ends_in_the_middle_of_the_branch():
     middle = COAXIAL.middle - 0.05
     assert ends(0.23, 0.14, middle) and not ends(0.23, 0.14, middle + 0.1)
     assert not ends(0.23, 0.12, 0.0) and ends(0.22, 0.12, 0.0)
-    assert not ends(0.22, 0.14, middle)
+    assert not ends(0.22, 0.14, middle) and not ends(0.222, 0.14, middle)
     # One that buckles takes the slack back.
     assert not ends(0.24, 0.14, middle, taking_up=[True], attempts=[1])
     assert ends(0.24, 0.12, middle, taking_up=[True], attempts=[1])
@@ -221,6 +293,32 @@ def test_a_head_stays_where_it_was_on_the_route_as_long_as_a_tube_reaches_it():
         assert place.arc_length == pytest.approx(expected)
     assert place.excess == pytest.approx((15 - 6 - 12) / 12)
     assert locate(route, head, np.array([np.nan])).arc_length == place.arc_length
+    # Elsewhere its nearest axis counts: not the widest room, nor what lies behind.
+    head = np.array([[20e-3, 4.5e-3, 0.0]])
+    for last, expected in ((np.nan, 20e-3), (112e-3, 20e-3), (95e-3, 95e-3)):
+        place = locate(route, head, np.array([last]))
+        assert place.arc_length == pytest.approx(expected)
+        wanted = -0.1 if expected < 0.05 else (10.5 - 12) / 12
+        assert place.excess == pytest.approx(wanted)
+
+
+def test_what_lies_ahead_is_seen_in_the_frame_of_each_tip():
+    """Routes along z and x, one of which ends ahead and goes straight on."""
+    s = 1e-3 * np.arange(101)
+    ways = np.eye(3)[[2, 0]]
+    routes = [Route(s[:, None] * way, 3e-3 + 0.01 * s, s) for way in ways]
+    chosen, along = np.array([1, 0, 1]), np.array([90e-3, 20e-3, 40e-3])
+    head = along[:, None] * ways[chosen] + 1e-3 * np.array([0.0, 2.0, 0.0])
+    frame = Rotation.random(3, random_state=0).as_matrix()
+    place = locate_each(routes, chosen, head)
+    np.testing.assert_allclose(place.arc_length, along)
+    np.testing.assert_allclose(place.excess, 2e-3 / (3e-3 + 0.01 * along) - 1)
+    ahead = look_ahead(routes, chosen, place, head, frame)
+    there = along[:, None] + 5e-3 * np.arange(8)
+    offset = there[..., None] * ways[chosen][:, None] - head[:, None]
+    np.testing.assert_allclose(ahead.points, offset @ frame, atol=1e-12)
+    np.testing.assert_allclose(ahead.radii, 3e-3 + 0.01 * np.minimum(there, 0.1))
+    np.testing.assert_array_equal(ahead.excess, place.excess)
 
 
 # In tasks.
@@ -357,6 +455,79 @@ def test_take_offs_close_to_the_one_before_follow_the_first(
     monkeypatch.setattr(take_offs, "take_offs", lambda route: places)
     assert take_offs.followed(None) == followed
     assert take_offs.last_apart(None) == last
+
+
+@pytest.mark.parametrize(
+    ("first", "steps", "expected"),
+    [
+        (7.0, [(60, 5.0, 1.0), (120, 3.4, 1.0)], [59, 119]),
+        (8.0, [(60, 5.5, 0.3), (120, 3.9, 1.0)], [119]),  # straight on
+        (8.0, [(60, 4.2, 1.0), (120, 2.5, 1.0)], [59]),  # narrow
+        (8.0, [(60, 5.6, 1.0), (72, 3.9, 1.0)], [59]),  # within 15 mm
+        (8.0, [(60, 7.0, 1.0), (120, 4.9, 0.2)], [119]),  # none, where it narrows
+    ],
+)
+def test_a_take_off_is_where_a_wide_lumen_narrows_at_a_bend(first, steps, expected):
+    found = take_offs.take_offs(stepped(first, steps))
+    assert found == pytest.approx(1e-3 * np.array(expected))
+
+
+def stepped(first, steps):
+    """A route that goes on at places (mm) with other radii (mm), turned (rad)."""
+    s, angle = np.arange(201), np.zeros(201)
+    radii = np.full(201, first)
+    for place, radius, turn in steps:
+        radii[s >= place], angle[s >= place] = radius, angle[-1] + turn
+    ways = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
+    return Route(1e-3 * np.cumsum(ways, axis=0), 1e-3 * radii, 1e-3 * s)
+
+
+def test_each_simulation_remembers_on_the_route_of_its_anatomy(monkeypatch):
+    """Take-offs of the first route are close; those of the second apart, and blunt."""
+    monkeypatch.setattr(progress.Route, "of", lambda objective: objective)
+    routes = (
+        stepped(7.0, [(40, 7.0, 0.5), (60, 5.0, 1.0), (80, 3.4, 1.0)]),
+        stepped(7.0, [(60, 5.0, 1.0), (120, 3.4, 1.0)]),
+    )
+    for route, end in zip(routes, (0.7e-3, 0.5e-3), strict=True):
+        route.radii[150:] = np.linspace(3.4e-3, end, 51)
+    devices = [types.SimpleNamespace(outer_radius=r) for r in (0.4e-3, 0.6e-3)]
+    chain = types.SimpleNamespace(coaxial=True, devices=devices)
+    scene = types.SimpleNamespace(catheter=chain)
+    cases = [types.SimpleNamespace(scene=scene, objective=route) for route in routes]
+    made = progress.Progress(["route_retry"], cases, 3, False)
+    chosen, every = np.array([0, 1, 0]), np.arange(3)
+
+    def seen(place, rows=every, begins=False):
+        head = np.array([routes[number].points[place] for number in chosen])
+        state = types.SimpleNamespace(
+            head=head, insertion=np.full(3, 0.1), push_force=np.zeros(3)
+        )
+        made.see(rows, begins, chosen, state, {})
+        made.restart(rows, chosen, state)  # leaves a memory of the state alone
+        return made.memory
+
+    begun = seen(20, begins=True)
+    assert begun.ostium.tolist() == pytest.approx([0.079, np.inf, 0.079])
+    assert begun.last.tolist() == pytest.approx([np.inf, 0.119, np.inf])
+    assert begun.first.tolist() == [0, len(COAXIAL.pattern.leads) - 1, 0]
+    # Only the second route becomes narrower than the leading device.
+    made.memory = begun._replace(attempts=np.ones(3, int))
+    assert seen(194).given_up.tolist() == [False, True, False]
+    assert made.memory.attempts.tolist() == [1, 1, 1]
+    np.testing.assert_array_equal(made.steady(every[1:2], True), [0.194, np.nan, 0.194])
+    chosen[1] = 0
+    again = seen(30, every[1:2], begins=True)
+    assert again.arc_length.tolist() == [0.194, 0.03, 0.194]
+    assert again.attempts.tolist() == [1, 0, 1] and again.ostium[1] == begun.ostium[0]
+    of_images = progress.Progress(["biplane_retry"], cases, 3, False)
+    images = {"biplane_place": np.full((3, 1), 0.1)}
+    images["biplane_deviation"] = np.full((3, 1), -0.4)
+    state = types.SimpleNamespace(insertion=np.zeros(3))
+    of_images.see(every, True, chosen, state, images)
+    assert (of_images.memory.arc_length == 0.1).all()
+    assert (of_images.memory.excess == -0.4).all()
+    assert progress.Progress([], cases, 3, True).state == ("memory",)
 
 
 @pytest.mark.parametrize(
