@@ -4,6 +4,7 @@ import json
 
 import export
 import judgement
+import numpy as np
 import pytest
 import synthetic_env
 
@@ -141,10 +142,11 @@ def test_all_policies_together_are_small():
 
 @pytest.mark.parametrize("name", SHIPPED[::3])  # the slow test plays the others
 def test_a_policy_that_ships_reaches_its_goal(name):
-    """On the first seed of its card on which it did."""
+    """On the seed of its card on which it did so fastest."""
     policy = load_policy(f"pretrained:{name}")
     evaluation = policy.card["evaluation"]
-    index = evaluation["episodes"]["success"].index(1)
+    episodes = evaluation["episodes"]
+    index = int(np.where(episodes["success"], episodes["length"], np.inf).argmin())
     played = agents.evaluate(policy, episodes=1, seed=evaluation["seed"] + index)
     assert played.successes == 1
     assert played.settings["task_kwargs"]["max_steps"] == MAX_STEPS

@@ -75,7 +75,10 @@ def test_fields_of_the_phantoms_come_with_the_package(name, access, folder, buil
     assert field.pages is not None and field.nbytes > 2e6
 
 
-@pytest.mark.parametrize(("name", "access"), [("type2", "ascending"), SECOND])
+@pytest.mark.parametrize(
+    ("name", "access"),
+    [pytest.param("type2", "ascending", marks=pytest.mark.slow), SECOND],
+)
 def test_a_field_that_ships_is_the_one_that_would_be_built(name, access, folder):
     anatomy = phantoms.load(name, access=access)
     shipped = field_cache.field_of(anatomy.tree, anatomy.ends)

@@ -14,6 +14,7 @@ from cathsim_dmc.anatomy.scan.ends import free_ends
 from cathsim_dmc.anatomy.scan.extract import plan_inlet, trunk
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.left_out import left_out
+from cathsim_dmc.anatomy.scan.naming import renamed
 from cathsim_dmc.anatomy.scan.places import (
     describe,
     opened_at_inlet,
@@ -193,7 +194,7 @@ def test_drawn_centrelines_are_renamed_and_what_has_none_is_noted(tmp_path):
     with pytest.raises(
         ValueError, match="no vessel 'lsa' to rename; there are.*vmtk_1"
     ):
-        import_scan(mesh, [curve], units="mm", rename={"lsa": "lcca"})
+        renamed(["aorta", "vmtk_1"], {"lsa": "lcca"})
 
 
 def test_an_import_without_a_goal_is_refused(tmp_path, monkeypatch):

@@ -445,12 +445,12 @@ def test_folds_that_noise_makes_in_a_coarse_surface_are_smoothed():
     assert moved and float(moved[1]) < 1.0
 
 
-def label_map(folder, kind, *, second=False):
-    """A label map of the Y tree in oblique voxels of 0.8 x 0.9 x 1.0 mm, RAS or LPS."""
+@pytest.fixture(scope="module")
+def labelled(y_mesh):
+    """Oblique voxels of 0.8 x 0.9 x 1.0 mm in the Y, matrix and origin (mm, LPS)."""
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
-    matrix = turn * (0.8, 0.9, 1.0)  # mm, LPS
-    points = marched(y_tree())[0]
-    inside = points @ np.linalg.inv(matrix).T
+    matrix = turn * (0.8, 0.9, 1.0)
+    inside = y_mesh[0] @ np.linalg.inv(matrix).T
     low = inside.min(axis=0) - 4
     size = np.ceil(np.ptp(inside, axis=0) + 8).astype(int)
     origin = matrix @ low
@@ -458,10 +458,13 @@ def label_map(folder, kind, *, second=False):
     places = (ijk @ matrix.T + origin) * 1e-3
     depth = np.max(list(y_tree().depths(places).values()), axis=0)
     voxels = np.where(depth > 0.0, 7, 0).astype(np.uint8)
-    if second:
-        voxels[0, 0, 0] = 3
-    path = folder / f"map{kind}"
-    if kind == ".nrrd":
+    voxels[0, 0, 0] = 3
+    return voxels, matrix, origin
+
+
+def label_map(path, voxels, matrix, origin):
+    """Writes a label map, in RAS or LPS."""
+    if path.suffix == ".nrrd":
         nrrd = pytest.importorskip("nrrd")
         header = {
             "space": "left-posterior-superior",
@@ -481,8 +484,8 @@ def label_map(folder, kind, *, second=False):
 
 
 @pytest.mark.parametrize("kind", [".nii.gz", ".nrrd"])
-def test_a_label_map_gives_the_surface_where_it_is(y_mesh, tmp_path, kind):
-    path = label_map(tmp_path, kind, second=True)
+def test_a_label_map_gives_the_surface_where_it_is(y_mesh, labelled, tmp_path, kind):
+    path = label_map(tmp_path / f"map{kind}", *labelled)
     with pytest.raises(ValueError, match=r"2 labels: 3 \(1 voxels\), 7.*--label"):
         read_lumen(path)
     with pytest.raises(ValueError, match="has no label 4; it has 2 labels: 3"):

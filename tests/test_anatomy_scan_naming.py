@@ -8,7 +8,12 @@ from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.scan.aorta import Bend
 from cathsim_dmc.anatomy.scan.arches import Arch
-from cathsim_dmc.anatomy.scan.naming import hypotheses, name_branches, neutral_names
+from cathsim_dmc.anatomy.scan.naming import (
+    _unlisted,
+    hypotheses,
+    name_branches,
+    neutral_names,
+)
 from cathsim_dmc.anatomy.scan.offshoots import Offshoot, leads, offshoots, third_limb
 
 FIRST, SPACE = 95e-3, 20e-3  # m of aorta up to the first ostium and between ostia
@@ -165,6 +170,30 @@ def test_subclavian_and_vertebral_arteries(bend):
     vertebral = (1.8, [*up, (-40, 0, 95), (-42, 8, 180)])
     names, _ = named(bend, (6.2, carotid, arm, vertebral), LCCA, LSA)
     assert names == ["rcca", "rsa", "rva", "lcca", "lsa"]
+
+
+def test_an_arm_that_the_scan_shows_no_turn_of_is_told_from_its_vertebral(bend):
+    """Its direction counts against its name, but only so much."""
+    stem = [(40, 0, 70)]
+    both = (5.0, (3.6, [*stem, (45, 0, 180)]), (1.9, [*stem, (55, 0, 180)]))
+    ways, (one,), _ = built(both)
+    found = leads(ways, bend, one, ("lsa", 1.0), 1.0, False)
+    assert [found[k][0] for k in (0, 1)] == ["lsa", "lva"]
+
+
+def test_branches_of_no_pattern_have_a_usual_distance():
+    """18 mm in a usual aorta; its logarithm deviates by 0.8."""
+
+    def weight(gap, scale=1.0):
+        rows = np.zeros((1, 3)), gap * np.arange(3), scale * 4.2e-3
+        seen = [Offshoot(rows[0], s, rows[2], (0,), None, ()) for s in rows[1]]
+        return _unlisted(seen, 0.003, scale)
+
+    far, near = (18e-3 * np.exp(0.8 * sign) for sign in (1, -1))
+    for gap in (far, near):
+        assert weight(18e-3) - weight(gap) == pytest.approx(2 * 0.5)
+    assert weight(1.3 * far, 1.3) == pytest.approx(weight(far))
+    assert np.isfinite(weight(0.0))
 
 
 def test_a_name_is_no_surer_than_its_branch(bend):
@@ -390,6 +419,8 @@ def test_branches_that_are_alike_do_not_tell_the_heart(bend):
     ("wide", "bottom", "top", "radius", "branch", "seen"),
     [
         (10, 13, 18, 3.0, -25, True),
+        (10, 13, 18, 3.0, (25, 33), True),
+        (10, 13, 18, 3.0, (25, 20), False),  # at the end of the aorta
         (60, 13, 18, 3.0, -33, False),  # along the aorta, as an aneurysm
         (10, 13, 13.4, 3.0, -25, False),  # too low
         (10, 13, 18, 1.1, -25, False),  # too thin
@@ -400,7 +431,14 @@ def test_branches_that_are_alike_do_not_tell_the_heart(bend):
 def test_a_bump_of_the_arch_is_a_branch_that_was_cut_short(
     bend, wide, bottom, top, radius, branch, seen
 ):
-    """Its points lie so far from the axis of an aorta of 10 mm radius (mm)."""
+    """Its points lie so far from the axis of an aorta of 10 mm radius (mm).
+
+    With a pair for its branch, the aorta begins so far before the bump.
+    """
+    if isinstance(branch, tuple):
+        branch, begin = branch
+        rest = bend.line[bend.apex - begin :]
+        bend = Bend(rest, begin, bend.turn, bend.up, bend.along)
     x, y = np.arange(-wide / 2, wide / 2 + 1, 1.0), np.arange(-2, 3, 1.0)
     away = np.arange(min(bottom, top), max(bottom, top) + 0.01, 0.3)
     z = 1e3 * bend.line[:, 2].max() + away

@@ -491,6 +491,26 @@ def test_branches_are_checked_against_radius_and_ostium():
         assert any(each.startswith("c runs") for each in said) == (ostium < 22e-3)
 
 
+@pytest.mark.parametrize(
+    ("volume", "radii", "words"),
+    [
+        (100, (46, 3, 3), ""),  # its own lumen begins at the ostium
+        (0.01, (9, 3, 3), "holds 0.01 ml .*: the unit is wrong"),
+        (3000, (9, 3, 3), "holds 3e.03 ml .*: the unit is wrong"),
+        (100, (9, 0.2, 0.2), r"b has a radius of 0.2 mm.*one \(--units\)"),
+        (100, (9, 31, 31), r"b has a radius of 31 mm.*one \(--units\)"),
+        (100, (9, 3, 46), r"b has a radius of 24.5 mm.*one \(--units\)"),
+    ],
+)
+def test_volume_and_radii_that_no_vessel_has_are_told(volume, radii, words):
+    points = np.linspace(0.0, 0.04, 3)[:, None] * (0, 0, 1)
+    line = Centreline(points, 1e-3 * np.array(radii, float))
+    tree = SimpleNamespace(vessels={"b": Vessel("b", line, "aorta", 10e-3)})
+    surface = SimpleNamespace(volume=1e-6 * volume)
+    said = "; ".join(check._sizes(SimpleNamespace(tree=tree, surface=surface)))
+    assert re.fullmatch(words, said) or (words and re.search(words, said)), said
+
+
 @pytest.mark.parametrize(("apart", "tells"), [(50, False), (70, True)])
 def test_arms_that_end_near_each_other_tell_no_sides(apart, tells):
     """The left one to the right of the other."""

@@ -255,12 +255,14 @@ def test_importing_the_suite_is_all_dm_control_needs_and_is_light():
         "peak = re.search(r'VmHWM:\\s+(\\d+) kB', open('/proc/self/status').read())\n"
         "print(peak[1])"
     )
-    run(code)  # the first run on a machine compiles loops, which takes more
-    done = run(code)
-    assert done.returncode == 0, done.stderr
-    imported_, loaded, kilobytes = (line.split() for line in done.stdout.splitlines())
     most = 300_000 if sys.version_info < (3, 13) else 350_000
-    assert 50_000 < int(*kilobytes) < most
+    for _ in range(2):  # the first run on a machine compiles loops, which takes more
+        done = run(code)
+        assert done.returncode == 0, done.stderr
+        imported_, loaded, (peak,) = map(str.split, done.stdout.splitlines())
+        if int(peak) < most:
+            break
+    assert 50_000 < int(peak) < most
     assert "dm_control" in imported_
     assert not {name.split(".")[0] for name in imported_} & set(LATE)
     # scikit-image draws the surface of an arch, numba runs its contact; the others

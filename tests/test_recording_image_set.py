@@ -296,14 +296,21 @@ def test_labels_are_those_of_coco(path, rows):
     labels = coco.labels(path, 3)
     by_image = {image["id"]: image for image in labels["images"]}
     assert len(by_image) == len(rows["image"])
+    names_of = {each["id"]: each["keypoints"] for each in coco.CATEGORIES}
+    # No two annotations have one id, nor those of another file of the split.
+    every = [labels["annotations"], coco.labels(path, 4)["annotations"]]
+    assert len({one["id"] for part in every for one in part}) == sum(map(len, every))
     for one in labels["annotations"]:
         image = by_image[one["image_id"]]
         bit = {1: sequences.DEVICE, 2: sequences.VESSEL}[one["category_id"]]
         mask = (rows["mask"][image["row"]] & bit) > 0
         text = one["segmentation"]["counts"]
         np.testing.assert_array_equal(decoded(mask.shape, text), mask)
-        names = coco.CATEGORIES[one["category_id"] - 1]["keypoints"]
-        assert len(one["keypoints"]) == 3 * len(names)
+        assert one["segmentation"]["size"] == list(mask.shape) and one["iscrowd"] == 0
+        names = names_of[one["category_id"]]
+        places = [sequences.KEYPOINTS.index(name) for name in names]
+        there = rows["keypoints"][image["row"], places]
+        assert one["keypoints"] == there.round(2).ravel().tolist()
         known = [state for state in one["keypoints"][2::3] if state > 0]
         assert one["num_keypoints"] == len(known)
 
@@ -493,7 +500,7 @@ def test_the_description_of_a_mask_is_that_of_its_pixels(share):
 def test_two_processes_may_write_the_pictures_of_a_data_set(tmp_path, monkeypatch):
     path, rows = tmp_path / "train" / "train_000.h5", 3
     path.parent.mkdir()
-    image = np.random.RandomState(0).randint(256, size=(rows, 16, 16)).astype("u1")
+    image = np.random.RandomState(0).randint(256, size=(rows, 12, 16)).astype("u1")
     shapes = {"sequence": (rows,), "camera_matrix": (rows, 3, 4)}
     shapes |= {"keypoints": (rows, len(sequences.KEYPOINTS), 3), "mask": image.shape}
     with h5py.File(path, "w") as file:
@@ -512,8 +519,12 @@ def test_two_processes_may_write_the_pictures_of_a_data_set(tmp_path, monkeypatc
     assert coco.labels(path, 0, pictures=True) == others[1]
     files = sorted((tmp_path / "train" / "train_000").iterdir())
     assert [file.name for file in files] == [f"{row:06d}.png" for row in range(rows)]
-    for file, wanted in zip(files, image, strict=True):
+    for label, file, wanted in zip(others[1]["images"], files, image, strict=True):
         assert np.array_equal(np.asarray(Image.open(file)), wanted)
+        assert (label["height"], label["width"]) == wanted.shape
+        assert (tmp_path / label["file_name"], tmp_path / label["hdf5"]) == (file, path)
+    sizes = [one["segmentation"]["size"] for one in others[1]["annotations"]]
+    assert sizes == [[12, 16]] * 2 * rows
     assert len(list((tmp_path / "train").iterdir())) == 2
 
 

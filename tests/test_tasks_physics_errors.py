@@ -3,6 +3,7 @@ import json
 import logging
 import types
 from pathlib import Path
+from unittest import mock
 
 import mujoco
 import numpy as np
@@ -64,6 +65,37 @@ def test_a_device_that_indents_a_compliant_wall_has_not_escaped():
 
     assert escaped() == [False, True, True, True]
     assert escaped(3e-3) == [False, False, False, True]
+
+
+def test_each_simulation_has_the_error_of_its_own(monkeypatch):
+    """A warning goes before a force; a device is looked for every 50 control steps."""
+
+    def escaped(anatomy, nodes, along, indentation):
+        return nodes[:, 0, 0] > anatomy
+
+    monkeypatch.setattr(physics_errors, "escaped", escaped)
+    placement = types.SimpleNamespace(direction=None)
+    # The anatomy is a limit here; a case is a key, as an object of its class is.
+    scenes = [mock.Mock(anatomy=limit, placement=placement) for limit in (1.0, 3.0)]
+    cases = [mock.Mock(scene=scene) for scene in scenes]
+    lost, exploded, warned = (
+        physics_errors.ESCAPED, physics_errors.EXPLODED, physics_errors.DIVERGED,
+    )  # fmt: skip
+    rows = [  # case, step, place, warned, force, error
+        (1, 50, 2.0, 0, 0.0, None),
+        (0, 50, 2.0, 0, 50.0, lost),
+        (0, 49, 2.0, 0, 0.0, None),
+        (1, 100, 4.0, 0, 0.0, lost),
+        (0, 50, 2.0, 0, 50.1, exploded),
+        (0, 1, 0.0, 0, np.nan, exploded),
+        (0, 50, 2.0, 1, 60.0, warned),
+    ]
+    number, steps, nodes, warnings, force, expected = zip(*rows, strict=True)
+    found = physics_errors.found(
+        lambda index: cases[number[index]], np.array(steps),
+        np.array(nodes)[:, None, None], np.array(warnings, bool), np.array(force),
+    )  # fmt: skip
+    assert found == expected
 
 
 @pytest.mark.parametrize(

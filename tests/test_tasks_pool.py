@@ -26,20 +26,20 @@ def options(tmp_path_factory):
 def test_an_episode_is_that_of_its_anatomy_alone_in_both_paths(options):
     both = {**options, "observation": SEEN}
     pooled = suite.load("cathsim", "navigate", both)
-    batch = BatchSimulation(suite.make_task("navigate", **both), 6, seeds=3)
+    batch = BatchSimulation(suite.make_task("navigate", **both), 3, seeds=1)
     start, length = batch.reset(), pooled.task.config.working_length
     assert length == batch.task.config.working_length is not None
-    drawn, action = {}, np.full(21, 0.3)
-    rows = [(start, None), *((batch.step(np.tile(action, (6, 1))), 0) for _ in "123")]
-    for number in range(6):
-        pooled.random_state.set_state(np.random.RandomState(3 + number).get_state())
+    drawn, action = set(), np.full(21, 0.3)
+    rows = [start, *(batch.step(np.tile(action, (3, 1))) for _ in "123")]
+    for number in range(3):
+        pooled.random_state.set_state(np.random.RandomState(1 + number).get_state())
         steps = [pooled.reset(), *(pooled.step(action) for _ in "123")]
-        source = np.random.RandomState(3 + number)
+        source = np.random.RandomState(1 + number)
         which = source.randint(3)
-        drawn[which] = number
+        drawn.add(which)
         goal = options["goal"][which]
         assert pooled.task.scene.goal.name == goal
-        for (row, _), step in zip(rows, steps, strict=True):
+        for row, step in zip(rows, steps, strict=True):
             for key, value in step.observation.items():
                 np.testing.assert_array_equal(row.observation[key][number], value)
         alone = {"anatomy": options["anatomy"][which], "goal": goal}
@@ -52,7 +52,7 @@ def test_an_episode_is_that_of_its_anatomy_alone_in_both_paths(options):
             assert step.reward == other.reward
             for key, value in other.observation.items():
                 np.testing.assert_array_equal(step.observation[key], value)
-    assert {0, 2} <= set(drawn)
+    assert drawn == {0, 1, 2}
 
 
 @pytest.mark.slow
