@@ -126,10 +126,23 @@ def test_only_a_pinned_commit_is_fetched(local, text, said):
     assert not local.made
 
 
-@pytest.mark.parametrize("text", ["hf:me", "me/nav", f"hf:me@{COMMIT}"])
-def test_an_upload_asks_for_no_commit(text):
-    with pytest.raises(ValueError, match="give hf:OWNER/NAME, without a commit"):
+@pytest.mark.parametrize(
+    "text", ["hf:me", "me/nav", f"hf:me@{COMMIT}", f"hf:me/nav@{COMMIT}"]
+)
+def test_an_upload_asks_for_no_commit(local, text):
+    words = "give hf:OWNER/NAME, without a commit|makes a commit of its own; leave @"
+    with pytest.raises(ValueError, match=words):
         sharing.upload("pretrained:navigator", text)
+    assert not local.made
+
+
+def test_weights_and_card_of_two_commits_are_refused(monkeypatch, tmp_path):
+    def download(repository, file, revision):
+        return tmp_path / file.rpartition(".")[2] / file
+
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
+    with pytest.raises(ValueError, match="weights and card are not of one commit"):
+        hub.policy(f"hf:me/nav@{COMMIT}")
 
 
 def test_episodes_of_a_hand_are_learnt_from_where_they_lie(local, by_hand, tmp_path):  # noqa: F811

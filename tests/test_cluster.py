@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+import types
 from pathlib import Path
 
 import cluster_plan
@@ -123,6 +124,90 @@ def test_the_plan_follows_from_the_measured_costs():
     worse = cluster_plan.independent(report["findings"], often, 10)
     assert jobs["jobs"] == 1_600 and 0.5 < jobs["of linear"] <= 1.0
     assert worse["again"] > 10 and worse["minutes"] >= jobs["minutes"]
+
+
+@pytest.fixture
+def fake_ray(monkeypatch, tmp_path):
+    """Takes the place of Ray: jobs run here, in another folder, the last one first."""
+
+    class RayError(Exception):
+        pass
+
+    class RayTaskError(RayError):
+        def __init__(self, cause):
+            super().__init__(cause)
+            self.cause = cause
+
+    class Ray(types.ModuleType):
+        cancelled, options = [], {}
+
+        def nodes(self):
+            given = (True, {"CPU": 2.0}), (False, {"CPU": 9.0}), (True, {"CPU": 3.0})
+            machines = *given, (True, {})
+            return [{"Alive": alive, "Resources": own} for alive, own in machines]
+
+        def remote(self, **options):
+            self.options.update(options)
+            return lambda work: types.SimpleNamespace(
+                remote=lambda *given: functools.partial(work, *given)
+            )
+
+        def wait(self, left):
+            return left[-1:], left[:-1]
+
+        def get(self, job):
+            os.chdir(tmp_path)
+            try:
+                return job()
+            except RayError:
+                raise
+            except Exception as error:
+                raise RayTaskError(error) from error
+
+        def cancel(self, job, force):
+            self.cancelled.append(job)
+
+    ray = Ray("ray")
+    ray.exceptions = types.SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setitem(sys.modules, "ray.exceptions", ray.exceptions)
+    monkeypatch.setattr(cluster, "connect", lambda: None)
+    monkeypatch.chdir(tmp_path)
+    return ray
+
+
+def test_the_room_of_a_cluster_is_that_of_its_live_machines(fake_ray):
+    assert cluster.processors() == [3, 2, 0]
+    assert [cluster.room(each) for each in (1, 2, 3, 4)] == [5, 2, 1, 0]
+    cluster.require_room(2, 2)
+    with pytest.raises(ValueError, match=r"3 x 2 .* \[3, 2, 0\], room for 2 x 2"):
+        cluster.require_room(3, 2)
+    with pytest.raises(ValueError, match="1 x 4 processors do not fit"):
+        next(cluster.over(abs, [1], 4))
+
+
+def test_each_job_of_a_cluster_has_its_result_and_those_left_are_cancelled(fake_ray):
+    def work(number):
+        if number == 11:
+            raise ArithmeticError("a fault of the task")
+        if number == 12:
+            raise fake_ray.exceptions.RayError("a machine\nis gone")
+        return number, os.getcwd()
+
+    Path("here").mkdir()
+    os.chdir("here")
+    said, here = [], os.getcwd()
+    jobs = cluster.over(work, range(10, 14), say=said.append, keep_going=True)
+    found = dict(jobs)
+    assert found[0] == (10, here) and found[3] == (13, here)
+    assert isinstance(found[1], ArithmeticError) and found[1].__cause__
+    assert str(found[2]) == "job 3 was lost 4 times, the last: a machine is gone"
+    assert said == [f"{count} of 4 jobs are done" for count in (1, 2, 3, 4)]
+    assert fake_ray.options == {"num_cpus": 1, "max_retries": 3}
+    assert not fake_ray.cancelled
+    with pytest.raises(ArithmeticError, match="a fault"):
+        list(cluster.over(work, [10, 11, 13]))
+    assert len(fake_ray.cancelled) == 1
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import gc
 import importlib.util
 import sys
+import types
 import weakref
 
 import mujoco
@@ -24,7 +25,8 @@ from cathsim_dmc import suite
 from cathsim_dmc.entities.contact import CONTACT_SOLREF
 from cathsim_dmc.physics import held
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.simulation.warp import contacts, devices
+from cathsim_dmc.simulation.warp import contacts, devices, worlds
+from cathsim_dmc.simulation.warp.reduction import Totals
 from cathsim_dmc.simulation.warp.simulation import WarpSimulation
 from cathsim_dmc.simulation.warp.worlds import Worlds
 
@@ -233,6 +235,100 @@ def test_devices_that_turn_take_part_in_a_pool():
     laws = stepper.contacts, stepper._passive
     made = Worlds(stepper._device, stepper._model, stepper._own, laws, 1)
     made.write_model(stepper._own, ["dof_length"])
+
+
+@pytest.fixture
+def bare_worlds():
+    """Four worlds on the CPU, without a scene: arrays of two fields and of a state."""
+    import warp
+
+    def zeros(*shape, kind=float):
+        return warp.zeros(shape, dtype=kind, device="cpu")
+
+    made = Worlds.__new__(Worlds)
+    made._warp, made._fields, made._staged, made.seconds = warp, set(), {}, {}
+    made._device = types.SimpleNamespace(name="cpu", is_cuda=False)
+    made._colliding = np.array([True, False])
+    made.model = types.SimpleNamespace(
+        jnt_stiffness=zeros(1, 3),
+        geom_pos=zeros(1, 2, kind=warp.vec3),
+        geom_priority=zeros(2, kind=int),
+        geom_rbound=zeros(1, 2),
+        opt=types.SimpleNamespace(disableflags=4, run_rne_postconstraint=None),
+    )
+    state = {name: zeros(4, 2) for name in worlds._WRITTEN if name != "time"}
+    made.data = types.SimpleNamespace(**state, time=zeros(4))
+    return made
+
+
+@needs_warp
+def test_fields_of_worlds_are_written_or_refused(bare_worlds):
+    random = np.random.RandomState(0)
+    own = {"jnt_stiffness": random.rand(4, 3), "geom_pos": random.rand(4, 2, 3)}
+    for name, values in own.items():
+        bare_worlds._expand(name, values)
+    for factor in (2.0, 3.0):  # the second by the memory of the first
+        twice = {name: factor * values for name, values in own.items()}
+        bare_worlds.write_model(twice, ["geom_pos"])
+        for name, values in (own | {"geom_pos": twice["geom_pos"]}).items():
+            found = getattr(bare_worlds.model, name).numpy()
+            np.testing.assert_allclose(found, values, rtol=1e-6)
+    # Fields that all worlds share may differ where Warp does not read them.
+    differ = np.ones((4, 2))
+    differ[1, 1] = 2.0
+    bare_worlds._expand("geom_priority", differ)
+    differ[1, 0] = 2.0
+    for name in ("geom_rbound", "none"):
+        bare_worlds._expand(name, differ)
+        bare_worlds.write_model({name: differ}, [name])
+    for write in (
+        lambda: bare_worlds._expand("geom_priority", differ),
+        lambda: bare_worlds.write_model({"geom_priority": differ}, ["geom_priority"]),
+    ):
+        with pytest.raises(NotImplementedError, match="geom_priority cannot differ"):
+            write()
+
+
+@needs_warp
+def test_states_of_worlds_are_copied_to_the_device_and_back(bare_worlds):
+    told, random = [], np.random.RandomState(0)
+    bare_worlds._passive = types.SimpleNamespace(write=told.append)
+    bare_worlds._contacts = types.SimpleNamespace(write=lambda: told.append("contacts"))
+    shapes = {name: getattr(bare_worlds.data, name).shape for name in worlds._WRITTEN}
+    arrays = {name: random.rand(*shape) for name, shape in shapes.items()}
+    for whole in (False, True):
+        bare_worlds.write(types.SimpleNamespace(**arrays), whole)
+        for name, values in arrays.items():
+            given = values if whole or name in worlds._ALWAYS else 0.0 * values
+            found = getattr(bare_worlds.data, name).numpy()
+            np.testing.assert_allclose(found, given, rtol=1e-6, err_msg=name)
+    assert told == [False, True, "contacts"]
+    bare_worlds._beside, beside = np.array([0, 3]), random.rand(4, 2)
+    totals = Totals(None, None, None, beside)
+    bare_worlds._reduction = types.SimpleNamespace(read=lambda: totals)
+    back = types.SimpleNamespace(qpos=np.zeros((4, 2)), sensordata=np.ones((4, 5)))
+    assert bare_worlds.read(back, ["qpos", "sensordata"]) is totals
+    np.testing.assert_allclose(back.qpos, arrays["qpos"], rtol=1e-6)
+    np.testing.assert_array_equal(back.sensordata[:, [0, 3]], beside)
+    assert (back.sensordata[:, [1, 2, 4]] == 1.0).all()
+
+
+@needs_warp
+def test_only_the_last_physics_step_computes_sensors(bare_worlds):
+    seen, option = [], bare_worlds.model.opt
+
+    def step(model, data):
+        seen.append((option.disableflags, option.run_rne_postconstraint))
+
+    bare_worlds._mjwarp, bare_worlds._substeps = types.SimpleNamespace(step=step), 3
+    bare_worlds._reduction = types.SimpleNamespace(add=lambda *at: seen.append(at))
+    bare_worlds._steps()
+    without = 4 | mujoco.mjtDisableBit.mjDSBL_SENSOR.value, False
+    assert seen == [without, (0, 2), without, (1, 2), (4, True), (2, 2)]
+    bare_worlds._mjwarp.step = lambda model, data: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        bare_worlds._step(0)
+    assert option.disableflags == 4
 
 
 @pytest.mark.slow
