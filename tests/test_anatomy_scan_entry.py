@@ -1,6 +1,7 @@
 """Where an import enters a lumen, where its goals lie, and what it leaves out."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from synthetic_scans import marched, write_markup, write_obj, y_tree
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Goal, Inlet, Surface
-from cathsim_dmc.anatomy.scan import importer
+from cathsim_dmc.anatomy.scan import extract, importer
 from cathsim_dmc.anatomy.scan.ends import free_ends
 from cathsim_dmc.anatomy.scan.extract import plan_inlet, trunk
 from cathsim_dmc.anatomy.scan.importer import import_scan
@@ -108,6 +109,38 @@ def test_a_trunk_whose_fork_is_beside_the_inlet_leads_on():
         end, leaving = trunk(ways, curves)
         assert len(leaving) == (2 if whole else 1)
         assert bool(end[2] < (length + 15) * 1e-3) is whole
+
+
+@pytest.mark.parametrize(
+    ("start", "ends", "widths", "chosen"),
+    [
+        (20, (0, 60, 200), (1, 3, 3), 0),  # the nearest end that is not ahead
+        (160, (0, 60, 200), (3, 1, 3), 0),  # far from all, the farthest wide one
+        (160, (0, 60, 200), (3, 2, 3), 0),
+        (160, (70, 60, 200), (1, 3, 3), 1),
+    ],
+)
+def test_the_inlet_lies_behind_the_start_of_a_drawn_curve(start, ends, widths, chosen):
+    """Nodes are a millimetre apart on one line; the curve leads to the last end."""
+    s = 1e-3 * np.arange(201)
+    line = SimpleNamespace(node=int, lengths_from=lambda node: np.abs(s - s[node]))
+    free, curve = np.array([True, True, False]), np.array([start, 200])
+    given = line, ends, np.array(ends), np.array(widths)
+    assert extract._chosen_by_curves(*given, free, [curve]) == chosen
+    end = SimpleNamespace(position=np.array([0.001, 0.002, 0.003]), radius=2e-3)
+    with pytest.raises(ValueError, match=r"inlet=.*: \(1, 2, 3\) mm, 4.0 mm wide"):
+        extract._chosen_by_curves(line, [end], *given[2:], 0 * free > 0, [curve])
+
+
+def test_a_branch_counts_as_far_as_the_device_passes():
+    """Depths in cells of the lattice, of which the device has a radius of four."""
+    depth = extract.CELL * np.array([0.1, 1.2, 4.0, 3.1, 2.9, 5.0])
+    ways = SimpleNamespace(depth=depth, device=4 * extract.CELL)
+    every = np.arange(6)
+    assert extract._passed(ways, every, from_inlet=True).tolist() == [2, 3]
+    assert extract._passed(ways, every[2:], from_inlet=False).tolist() == [2, 3]
+    assert extract._passed(ways, every, from_inlet=False).tolist() == []
+    assert extract._passed(ways, every[5:], from_inlet=False).tolist() == [5]
 
 
 def test_a_goal_is_not_in_the_ostium_of_another_vessel():

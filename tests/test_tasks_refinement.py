@@ -62,6 +62,54 @@ def test_the_way_of_a_link_that_swings_is_that_of_its_end():
     assert way[0] == pytest.approx(20.0 * timestep * chain.link_lengths[-1], rel=0.01)
 
 
+CHAIN = """
+<mujoco>
+  <default><geom type="capsule" size="1e-3 0.01" contype="0" conaffinity="1"/></default>
+  <worldbody>
+    <geom type="box" size="1 1 1" contype="1" conaffinity="0"/>
+    <body pos="0.1 0.2 0.3">
+      <joint type="slide" axis="0 0 1"/><joint axis="1 0 0"/><geom pos="0 0 0.01"/>
+      <body pos="0 0 0.02">
+        <joint axis="1 0 0"/><joint axis="0 1 0"/><geom pos="0 0 0.01"/>
+        <body pos="0 0 0.02"><geom pos="0 0 0.02"/></body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_way_of_a_chain_is_that_of_its_fastest_link(seed):
+    """Across the way to the next link, by the velocities that MuJoCo computes."""
+    model = mujoco.MjModel.from_xml_string(CHAIN)
+    data, random = mujoco.MjData(model), np.random.RandomState(seed)
+    data.qpos[:], data.qvel[:] = random.uniform(-1, 1, (2, model.nv))
+    mujoco.mj_forward(model, data)
+    speeds = []
+    for body, reach in zip((1, 2, 3), (0.02, 0.02, 0.03), strict=True):
+        found, kind = np.zeros(6), mujoco.mjtObj.mjOBJ_XBODY
+        mujoco.mj_objectVelocity(model, data, kind, body, found, 0)
+        turn, velocity = found[:3], found[3:]
+        if body < 3:
+            ahead = data.xpos[body + 1] - data.xpos[body]
+            velocity = velocity - velocity @ ahead / (ahead @ ahead) * ahead
+        speeds.append(np.linalg.norm(velocity) + reach * np.linalg.norm(turn))
+    links = deep_links.moving(model)
+    kept = (getattr(data, name)[None].copy() for name in deep_links.Motion._fields)
+    motion, way = deep_links.Motion._make(kept), np.zeros(1)
+    calm = np.zeros(1)
+    for timestep, hardest, deepest, doubt in (
+        (0.004, 1.0, np.inf, False),
+        (0.002, -1.0, np.inf, True),
+        (0.002, 1.0, 0.0021 * max(speeds), False),
+        (0.002, 1.0, 0.0019 * max(speeds), True),
+    ):
+        limits = hardest, deepest, timestep
+        found = deep_links.in_doubt(calm, calm, limits, motion, links, way)
+        assert found == doubt
+        assert way[0] == pytest.approx(timestep * max(speeds))
+
+
 @pytest.mark.parametrize(
     ("task", "options", "limit"),
     [
