@@ -4,6 +4,7 @@ import hashlib
 import importlib.util
 import json
 import shutil
+import sys
 import types
 from html import unescape
 from pathlib import Path
@@ -284,6 +285,24 @@ def test_the_page_lists_the_submissions(script):
     entry, _ = found[0]
     force = 1e3 * np.mean([one.forces.mean_sum.mean for one in entry.result.episodes])
     assert f"| {force:.1f} |" in script.table(found[:1])[2]
+
+
+def test_the_page_is_written_without_what_is_refused(
+    played, script, tmp_path, monkeypatch, capsys
+):
+    for name, task in (("a", "type1_lcca"), ("b", "type1_bca")):
+        submission.submit("push", tmp_path / f"{name}.json", task)
+    written = []
+    monkeypatch.setattr(script, "FOLDER", tmp_path)
+    monkeypatch.setattr(script.figures, "put", lambda page, **own: written.append(own))
+    monkeypatch.setattr(sys, "argv", ["leaderboard", "--no-replay"])
+    assert script.main() == 0
+    (tmp_path / "c.json").write_text("{}")
+    assert script.main() == 1 and "c.json is not listed" in capsys.readouterr().err
+    first, second = written
+    assert first == second
+    tasks = [row.split("|")[1].strip(" `") for row in first["leaderboard"][2:]]
+    assert tasks == ["type1_bca", "type1_lcca"]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Vessels that live: flow, wall and motion, in both paths, on any threads."""
 
 import dataclasses
+import types
 
 import mujoco
 import numpy as np
@@ -15,6 +16,7 @@ from cathsim_dmc.laws.compliance import Material, stiffness
 from cathsim_dmc.laws.contact import COMPLIANT
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY
 from cathsim_dmc.physics.vessel import VesselOptions
+from cathsim_dmc.physics.wall import Wall, WallOptions
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import vessel
 
@@ -250,6 +252,16 @@ def test_a_wall_of_a_thousand_times_the_modulus_is_the_rigid_one(rigid):
     soft, indented, _ = pushed({"wall": {"modulus": 0.1e6}})
     assert indented.max() > 1.5 * rigid[1].max()
     assert not np.array_equal(rigid[0], soft)
+
+
+def test_a_link_outside_the_lumen_keeps_the_wall_that_it_indents(monkeypatch):
+    """Its radius is 0 there, which stands for a link that has met no vessel."""
+    monkeypatch.setattr(Wall, "_write", lambda wall, rows: None)
+    blood = types.SimpleNamespace(radius=np.array([[0.0, 5e-3], [3e-3, 0.0]]))
+    wall = Wall(WallOptions(), blood)
+    wall._radius = np.array([[4e-3, 4e-3], [0.0, 0.0]])
+    wall.act(np.zeros(0), None)
+    assert wall._radius.tolist() == [[4e-3, 5e-3], [3e-3, 0.0]]
 
 
 def test_the_check_of_a_stiffened_wall_sees_one_that_is_not():
