@@ -147,7 +147,7 @@ def run(values):
     data, seen = mujoco.MjData(model), []
     data.userdata[:] = values
     data.xfrc_applied[1, 0] = 0.1
-    for _ in range(120):
+    for _ in range(300):
         mujoco.mj_step(model, data)
         seen += [data.qpos.copy(), data.xfrc_applied.ravel(), data.userdata.copy()]
     return np.concatenate(seen)
