@@ -74,6 +74,31 @@ def test_forces_are_those_of_the_task(pushed):
     assert len(readout.position) == len(readout.penetration) == len(readout)
 
 
+def test_within_a_control_step_forces_are_those_of_the_contacts():
+    env = suite.load("cathsim", TASK, {"random": 0, "physics_timestep": 0.001})
+    env.reset()
+    assert not cathsim_dmc.forces(env).wall_mean_sum
+    sums = []
+
+    def sample(physics, random_state):
+        with pytest.raises(RuntimeError, match="control step has begun and not ended"):
+            cathsim_dmc.forces(env)
+        sums.append(env.task.contacts(physics).magnitude.sum())
+
+    env.add_extra_hook("after_substep", sample)
+    for _ in range(65):
+        sums.clear()
+        env.step(np.eye(21)[-1])
+    readout = cathsim_dmc.forces(env)
+    assert (
+        len(sums) == 40
+        and max(sums) > 0.0
+        and sums[-1] == pytest.approx(readout.wall_sum, rel=1e-12)
+    )
+    assert sum(sums) == pytest.approx(40 * readout.wall_mean_sum, rel=1e-12)
+    assert max(sums) == pytest.approx(readout.wall_peak_sum, rel=1e-12)
+
+
 def test_contacts_that_bear_nothing_are_left_out(pushed, monkeypatch):
     env, _ = pushed
     task, number = env.task, len(cathsim_dmc.forces(env))

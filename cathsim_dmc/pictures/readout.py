@@ -84,10 +84,18 @@ def forces(env: Any) -> ForceReadout:
 
     Raises:
         TypeError: if it is no environment of this package.
-        RuntimeError: if no episode has begun.
+        RuntimeError: if no episode has begun, or within a control step, whose sums and
+            means are known at its end only.
     """
     task = begun_task_of(env)
-    readings, contacts = task.readings, task.contacts(env.physics)
+    readings = task.readings  # measures the start, if nothing has done so
+    if task.rollout.half_done.any():
+        raise RuntimeError(
+            "a control step has begun and not ended, so its forces are not known; call "
+            "forces(env) after env.step(action). In a hook of composer, "
+            "env.task.contacts(physics) has the contacts of the present physics step"
+        )
+    contacts = task.contacts(env.physics)
     there = contacts.present & (contacts.magnitude >= LEAST_FORCE)
     return ForceReadout(
         contacts.position[there],
