@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -37,19 +38,27 @@ def split(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 def as_texts(given: Mapping[str, Any]) -> dict[str, Any]:
     """Returns options as they are read from JSON, objects among them as texts."""
     plain, objects = split(given)
-    return plain | json.loads(json.dumps(objects, default=repr))
+    return plain | json.loads(json.dumps(objects, default=_as_text))
+
+
+def _as_text(value: Any) -> str:
+    """Returns the representation without addresses, which differ between processes."""
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))
 
 
 def _as_plain(value: Any) -> Any:
     """Returns plain values that make an option again; TypeError if none do.
 
-    A mapping makes options, whose fields all have defaults, but no device or anatomy.
+    A mapping makes options of this package, whose fields all have defaults, but no
+    device, no anatomy and no object of a user's class, such as an effect.
     """
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        raise TypeError
+    if type(value).__module__.partition(".")[0] != __package__:
         raise TypeError
     if any(
         field.default is field.default_factory is dataclasses.MISSING

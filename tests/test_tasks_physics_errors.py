@@ -1,4 +1,5 @@
 import contextlib
+import dataclasses
 import json
 import logging
 import types
@@ -14,6 +15,7 @@ from cathsim_dmc import json_options, suite
 from cathsim_dmc.agents.protocols import VARIED_RANGES
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.entities.devices import DEVICES
+from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.flow import FlowOptions
 from cathsim_dmc.physics.vessel import VesselOptions
 from cathsim_dmc.simulation import batch, error_files
@@ -304,6 +306,24 @@ def test_objects_among_the_options_are_named(tmp_path):
     assert not files._whole and "object" in files._options["effects"][0]
     files = error_files.ErrorFiles(tmp_path, "simple1_bca", {"rotation": True})
     assert files._whole and files._options == {"rotation": True}
+
+
+def test_objects_of_a_user_are_texts_without_addresses():
+    @dataclasses.dataclass
+    class Lag(Effect):
+        steps: int = 3
+
+    class Wind(Effect):
+        pass
+
+    given = {"effects": [Lag()], "max_steps": 3}
+    assert json_options.split(given) == (
+        {"max_steps": 3},
+        {"effects": given["effects"]},
+    )
+    given["effects"].append(Wind())
+    lag, wind = json_options.as_texts(given)["effects"]
+    assert lag.endswith("Lag(steps=3)") and wind.endswith("Wind object>")
 
 
 def test_numbers_of_numpy_are_options():

@@ -525,3 +525,23 @@ def test_a_state_that_cannot_be_kept_is_refused(value):
     environment.reset()
     with pytest.raises(TypeError, match="'numbers' of Odd is .*each of the 1 simul"):
         environment.snapshot()
+
+
+def test_a_state_that_an_effect_does_not_have_is_refused():
+    class Odd(Effect):
+        state = ("numbers",)
+
+    environment = suite.environment(suite.make_task("simple1_bca", effects=[Odd()]))
+    environment.reset()
+    with pytest.raises(TypeError, match="'numbers' of Odd is missing; it must be an"):
+        environment.snapshot()
+
+
+def test_effects_that_differ_are_named(task):
+    environment = suite.environment(task())
+    other = suite.environment(suite.make_task("simple1_bca", effects=[Counter()]))
+    environment.reset()
+    other.reset()
+    said = r"its effects from number \d on is \[\['Counter'\], .*, here it is \[\['Sing"
+    with pytest.raises(ValueError, match=said):
+        environment.restore(other.snapshot())

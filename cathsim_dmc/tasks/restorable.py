@@ -74,12 +74,14 @@ def _named(device: Device) -> str:
 
 def _check_state(holder: Any, name: str, value: Any, count: int) -> None:
     """Raise TypeError if a state that an effect names cannot be restored."""
+    missing = not hasattr(holder, name)
     wrong = isinstance(value, list) or (
         isinstance(value, np.ndarray) and value.shape[:1] != (count,)
     )
-    if isinstance(holder, Effect) and wrong:
+    if isinstance(holder, Effect) and (missing or wrong):
+        is_now = "missing" if missing else bounds.shown(value)
         raise TypeError(
-            f"the state {name!r} of {type(holder).__name__} is {bounds.shown(value)}; "
+            f"the state {name!r} of {type(holder).__name__} is {is_now}; "
             f"it must be an array with a row for each of the {count} simulations"
         )
 
@@ -143,7 +145,7 @@ class Restorable:
             for attribute in holder.state:
                 if attribute == "_random_states" and not random:
                     continue
-                value = getattr(holder, attribute)
+                value = getattr(holder, attribute, None)
                 _check_state(holder, attribute, value, len(self._open))
                 arrays |= packed(f"{name}.{attribute}", value, indices)
         fields = {name for effect in self.effects for name in effect.model_fields}

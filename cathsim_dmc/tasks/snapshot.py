@@ -99,10 +99,10 @@ class Snapshot:
         """
         for key, own in other.task.items():
             if self.task.get(key) != own:
+                mine, own, where = _apart(self.task.get(key), own)
                 raise ValueError(
-                    f"the snapshot is of another task: its {key} is "
-                    f"{bounds.shown(self.task.get(key))}, here it is "
-                    f"{bounds.shown(own)}"
+                    f"the snapshot is of another task: its {key}{where} is "
+                    f"{bounds.shown(mine)}, here it is {bounds.shown(own)}"
                 )
         if len(self) != len(other):
             raise ValueError(
@@ -213,6 +213,14 @@ def _digest(held: Arrays) -> str:
         total.update(f"{name} {array.dtype.str} {array.shape} ".encode())
         total.update(np.ascontiguousarray(array).tobytes())
     return total.hexdigest()
+
+
+def _apart(mine: Any, own: Any) -> tuple[Any, Any, str]:
+    """Returns two unequal values, of lists what follows their equal beginning."""
+    if not (isinstance(mine, list) and isinstance(own, list)):
+        return mine, own, ""
+    same = len(os.path.commonprefix([mine, own]))
+    return mine[same:], own[same:], f" from number {same} on" if same else ""
 
 
 def _shape(name: str, array: np.ndarray) -> tuple[np.dtype, tuple[int, ...]]:
