@@ -279,6 +279,37 @@ def test_what_is_given_is_played_or_refused():
         play(policy="push", protocol="varied", task_kwargs=options.given)
 
 
+def test_an_evaluation_is_written_at_its_end_and_says_what_it_replaces(
+    monkeypatch, tmp_path, capsys
+):
+    """A baseline that is interrupted leaves no file, which a study would skip."""
+    target, meanwhile = tmp_path / "out" / "evaluation.json", KeyboardInterrupt
+
+    def run(policy, **given):
+        if policy != "random":
+            where = {name: given[name] for name in given if name.endswith("_dir")}
+            return play(policy=expert, episodes=2, **where)
+        if meanwhile:
+            raise meanwhile
+        target.parent.mkdir()  # as another process does
+        target.write_text("of another process")
+        return play(policy=policy, episodes=2)
+
+    player = policies.load_policy(expert)
+    player.task = "type1_bca"
+    monkeypatch.setattr(commands.agents, "load_policy", lambda *_: player)
+    monkeypatch.setattr(commands.agents, "evaluate", run)
+    monkeypatch.setattr(evaluation.ContactLog, "draw", lambda *_: None)
+    given = {"out": target.parent, "options": task_options.task_kind()()}
+    with pytest.raises(KeyboardInterrupt):
+        commands.evaluate("mine", **given)
+    assert not target.parent.exists()
+    meanwhile = None
+    commands.evaluate("mine", **given)
+    assert f"{target}, which was there before, is replaced" in capsys.readouterr().err
+    assert list(json.loads(target.read_text())) == ["policy", "baseline", "seconds"]
+
+
 def test_the_randomisation_of_a_training_is_no_option_of_the_protocol(monkeypatch):
     """The leaderboard lists no evaluation with options of its own."""
     policy, seen = policies.FunctionPolicy(expert), []

@@ -334,7 +334,7 @@ HANDED_ON = [
         "--protocol varied --simulation-device cuda:1 --max-steps 7",
         "agents:evaluate",
         {"task": "simple1_bca", "episodes": 2, "seed": 5, "protocol": "varied",
-         "task_kwargs": {"max_steps": 7}, "num_threads": 1, "out_dir": OUT,
+         "task_kwargs": {"max_steps": 7}, "num_threads": 1, "error_dir": OUT / "errors",
          "simulation_device": "cuda:1", "on_cluster": False, "start": None},
     ),
     (

@@ -51,6 +51,7 @@ def evaluate(
     num_threads: int | None = None,
     simulation_device: str = "cpu",
     out_dir: str | Path | None = None,
+    error_dir: str | Path | None = None,
     observer: Observer | None = None,
     start: Snapshot | None = None,
     make_env: EnvFactory = environments.make_env,
@@ -77,8 +78,9 @@ def evaluate(
         simulation_device: Where the simulations run: "cpu", or "cuda" for MuJoCo Warp
             on a GPU, "cuda:1" on the second one (docs/gpu.md); the policy acts on the
             CPU.
-        out_dir: Directory for evaluation.json and, in errors/, the last physics errors;
-            None writes none.
+        out_dir: Directory for evaluation.json, written at the end; None writes none.
+        error_dir: Directory for files of the last physics errors; None takes errors/ in
+            `out_dir`, if that is given.
         observer: Function that is called after every step, before any reset.
         start: Snapshot of running episodes, as many as are played, which continue and
             are counted from there; None for the starts of the task.
@@ -111,7 +113,11 @@ def evaluate(
             )
         cluster.connect()
     make = functools.partial(make_env, **place)
-    groups = plan.groups(num_threads, out_dir, make, start)
+    if out_dir is not None:
+        # Checked first: an evaluation that cannot be written would be lost.
+        files.require_place(out_dir)
+        error_dir = error_dir or Path(out_dir) / "errors"
+    groups = plan.groups(num_threads, error_dir, make, start)
     if on_cluster:
         outcomes = _play_on_cluster(groups, observer)
     else:
@@ -174,17 +180,13 @@ class _Plan:
     def groups(
         self,
         num_threads: int | None,
-        out_dir: str | Path | None,
+        error_dir: str | Path | None,
         make_env: EnvFactory,
         start: Snapshot | None,
     ) -> list["_Group"]:
         """Returns a group for the episodes of each part."""
         bounds.option_threads(num_threads)
-        errors = None
-        if out_dir is not None:
-            # Checked first: an evaluation that cannot be written would be lost.
-            files.require_place(out_dir)
-            errors = Path(out_dir).absolute() / "errors"
+        errors = None if error_dir is None else Path(error_dir).absolute()
         make = functools.partial(make_env, self.task, observation=self.observation)
         varied = bool(protocols.get(self.protocol).task_kwargs)
         return [

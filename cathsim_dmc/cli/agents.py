@@ -105,19 +105,23 @@ def evaluate(
         "start": None if start is None else Snapshot.load(start),
     }  # fmt: skip
 
-    def play(who: Any, out_dir: Path | None = None) -> EvaluationResult:
+    def play(who: Any, error_dir: Path | None = None) -> EvaluationResult:
         log = contacts if who is player else None
         with _observer(who, log, ray) as observer:
-            return agents.evaluate(who, observer=observer, out_dir=out_dir, **asked)
+            return agents.evaluate(who, observer=observer, error_dir=error_dir, **asked)
 
-    written = [] if out is None else [out / "evaluation.json", out / "heatmap.png"]
-    with told_of_replaced(written):
-        results = {"policy": play(player, out)}
-        if baseline and policy != "random":
-            results["baseline"] = play("random")
-        values: dict[str, Any] = {name: one.to_dict() for name, one in results.items()}
-        values["seconds"] = round(time.monotonic() - began, 1)
-        if written:
+    if out is not None:
+        files.require_place(out)  # checked first: the evaluation would be lost
+    results = {"policy": play(player, None if out is None else out / "errors")}
+    if baseline and policy != "random":
+        results["baseline"] = play("random")
+    values: dict[str, Any] = {name: one.to_dict() for name, one in results.items()}
+    values["seconds"] = round(time.monotonic() - began, 1)
+    if out is not None:
+        # Another process may have written there meanwhile.
+        written = [out / "evaluation.json", out / "heatmap.png"]
+        with told_of_replaced(written):
+            files.require_folder(out, make=True)
             files.write_json(written[0], values)
             contacts.draw(results["policy"], written[1])
     if json:
