@@ -315,6 +315,12 @@ def test_labels_are_those_of_coco(path, rows):
         assert one["num_keypoints"] == len(known)
 
 
+def test_annotations_of_coco_have_ids_from_one_on(path):
+    """COCO's own evaluation takes an annotation of id 0 for an unmatched one."""
+    many = [each["id"] for n in (0, 1) for each in coco.labels(path, n)["annotations"]]
+    assert min(many) == 1 and len(set(many)) == len(many)
+
+
 def test_each_image_of_coco_has_its_camera_and_its_sequence(path, rows):
     images = coco.labels(path, 0)["images"]
     found = [image["camera_matrix"] for image in images]

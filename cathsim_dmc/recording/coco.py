@@ -99,8 +99,8 @@ def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[An
             flat = own.reshape(rows, -1).tolist()
             for row, mask in enumerate(masks):
                 image = first + row
-                annotations.append({
-                    "id": 2 * image + kind, "image_id": image, "category_id": kind + 1,
+                annotations.append({  # COCOeval takes an id of 0 for no match
+                    "id": 2 * image + kind + 1, "image_id": image, "category_id": kind + 1,
                     **described(mask, bit), "keypoints": flat[row],
                     "num_keypoints": known[row],
                 })  # fmt: skip
