@@ -68,6 +68,34 @@ def test_an_own_row_returns_what_it_declares(environment):
         table.row(entry)(own)
 
 
+def test_an_own_row_reads_images_that_the_task_does_not_observe(environment):
+    table, seen = observations.OBSERVATIONS, []
+    entry = Entry("darkest", 1, "grey level", "least grey level of the image", 0, 255)
+
+    def own(frame):
+        seen.append(frame.images["past_0"].copy())
+        return {"darkest": seen[-1].min(axis=(1, 2)).astype(float)}
+
+    try:
+        table.row(entry)(own)
+        task = twin(environment.task, observation="own")
+        with pytest.raises(ValueError, match="image 'past_0', which the task does not"):
+            suite.environment(task).reset()
+        del table["own"]
+        with pytest.raises(ValueError, match="images of 'own' is .* it must be of int"):
+            table.row(entry, images=("picture",))(own)
+        table.row(entry, images=("image", "endoluminal"))(own)
+        task = twin(environment.task, observation="own")
+        with_image = twin(environment.task, observation=["image", "own"])
+        first, image = suite.environment(task).reset(), seen[-1][0]
+        other = suite.environment(with_image).reset()
+        assert list(first.observation) == ["darkest"]
+        np.testing.assert_array_equal(image, other.observation["image"])
+        assert first.observation["darkest"] == other.observation["darkest"] < 255
+    finally:
+        table.pop("own", None)
+
+
 def test_the_page_is_what_the_specs_say(script):
     assert script.OUTPUT.read_text(encoding="utf-8") == script.page(), (
         "docs/observations.md is out of date; run docs/scripts/observations.py"

@@ -100,7 +100,8 @@ def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[An
             for row, mask in enumerate(masks):
                 image = first + row
                 annotations.append({  # COCOeval takes an id of 0 for no match
-                    "id": 2 * image + kind + 1, "image_id": image, "category_id": kind + 1,
+                    "id": 2 * image + kind + 1,
+                    "image_id": image, "category_id": kind + 1,
                     **described(mask, bit), "keypoints": flat[row],
                     "num_keypoints": known[row],
                 })  # fmt: skip

@@ -65,7 +65,8 @@ class ImageSensors:
             ValueError: if `biplane` is observed by a single plane, or by planes that do
                 not show inlet and goal of each case.
         """
-        self._names, self._chain, self._count = names, chain, num_simulations
+        self._names = names = observations.with_images(names)
+        self._chain, self._count = chain, num_simulations
         self.planes: list[angiographs.Planes] = []
         self.thirds: list[angiographs.Planes] = []
         self.sight, self._noise = BiplaneSight(num_simulations), False

@@ -139,17 +139,31 @@ class ObservationKind:
         needs: `FLUOROSCOPY`, `BIPLANE`, `ROUTE`, `OPENGL`, `COAXIAL`, `LIVING` or
             `COAXIAL_ROUTE`; empty for nothing.
         joined: names of the rows that coaxial devices add to it.
+        images: names of the rows whose images it reads in `Frame.images`, such as
+            ("image",), whether the task observes these or not.
     """
 
     observe: Callable[[Frame], Observation]
     entries: tuple[Entry, ...]
     needs: str = ""
     joined: tuple[str, ...] = ()
+    images: tuple[str, ...] = ()
 
 
 def flat(array: np.ndarray, axes: int) -> np.ndarray:
     """Flattens the last `axes` axes into one."""
     return array.reshape(array.shape[:-axes] + (-1,))
+
+
+class _Held(dict[str, np.ndarray]):
+    """Images by name; ValueError for one that the sensors do not hold."""
+
+    def __missing__(self, name: str):
+        raise ValueError(
+            f"an observation reads the image {name!r}, which the task does not render; "
+            "declare in its row the observations whose images it reads, such as "
+            f"images=('image',); rendered are {', '.join(self) or 'none'}"
+        )
 
 
 class ObservationTable(dict[str, ObservationKind]):
@@ -176,7 +190,12 @@ class ObservationTable(dict[str, ObservationKind]):
                     f"the {what} of observation {name!r} are taken by others with "
                     "another meaning; choose another"
                 )
-            self[name] = ObservationKind(function, entries, **options)
+            kind = ObservationKind(function, entries, **options)
+            if not all(one in self for one in kind.images):
+                bounds.refuse(
+                    f"images of {name!r}", kind.images, f"of {', '.join(self)}"
+                )
+            self[name] = kind
             return function
 
         return add
@@ -215,11 +234,18 @@ class ObservationTable(dict[str, ObservationKind]):
         return tuple(dict.fromkeys([*chosen, *joined]))
 
     def needs(self, names: Sequence[str], *what: str) -> bool:
-        """Whether any of the named rows has one of these needs."""
-        return any(self[name].needs in what for name in names)
+        """Whether any of the named rows, or one whose images it reads, has a need."""
+        return any(self[name].needs in what for name in self.with_images(names))
+
+    def with_images(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Names of rows, followed by those whose images they read."""
+        read = (one for name in names for one in self[name].images)
+        return tuple(dict.fromkeys([*names, *read]))
 
     def observe(self, names: Sequence[str], frame: Frame) -> Observation:
         """Computes the named rows; arrays may share memory with the frame."""
+        held = {} if frame.images is None else frame.images
+        frame = frame._replace(images=_Held(held))
         rows = [self[name].observe(frame) for name in names]
         return {key: value for row in rows for key, value in row.items()}
 

@@ -357,5 +357,5 @@ def devices(frame: Frame) -> Observation:
 
 
 resolve, observe, needs = OBSERVATIONS.resolve, OBSERVATIONS.observe, OBSERVATIONS.needs
-check = OBSERVATIONS.check
+check, with_images = OBSERVATIONS.check, OBSERVATIONS.with_images
 entries, entry_specs = OBSERVATIONS.entries, OBSERVATIONS.entry_specs

@@ -9,6 +9,7 @@ from cathsim_dmc.physics.effects import Effect, World, of_kind
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.stepper import Stepper
+from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cameras import KINDS, Cameras
 from cathsim_dmc.tasks.case_meshes import CaseMeshes
 from cathsim_dmc.tasks.cases import Case
@@ -39,6 +40,7 @@ class Views:
         Raises:
             ValueError: if a camera needs OpenGL, which is disabled.
         """
+        names = observations.with_images(names)
         self._size, self._cases = config.endoluminal_size, cases
         self._inside = any(name.startswith("endoluminal") for name in names)
         self._cameras: Cameras | None = None
