@@ -305,6 +305,7 @@ def test_names_must_differ(y_scan, tmp_path):
 
 def test_inlet_off_the_lumen(y_scan):
     far = r"inlet \(90, 0, 0\) mm is .* away from the lumen, whose middle is \(.*\) mm"
+    far += ".*mesh_frame, on the command line --units and --frame"
     with pytest.raises(ValueError, match=far):
         import_scan(*y_scan[:2], inlet=(90.0, 0.0, 0.0))
 

@@ -82,9 +82,10 @@ class Policy:
         """Choose the actions of the next control step.
 
         Args:
-            observation: Observations of the N simulations: a TensorDict with batch
-                size [N] from a TorchRL environment, arrays by name without the axis N
-                from a composer environment.
+            observation: Observations of the N simulations: in an evaluation a
+                TensorDict with batch size [N], whose entries are joined in the order
+                of their names (`VECTOR` and `PIXELS` of `simulation.environments`);
+                from a composer environment arrays by name without the axis N.
 
         Returns:
             (N, A) actions in [-1, 1].

@@ -230,6 +230,7 @@ def _placed(
             f"middle is {middle}; give a point in the lumen, or at most "
             f"{mm(NEAR_INLET):.2g} mm from the end "
             f"{'at the heart' if key == 'heart' else 'by which the device enters'}, in "
-            "the unit and frame of the mesh (units, mesh_frame)."
+            "the unit and frame of the mesh (units and mesh_frame, on the command line "
+            "--units and --frame)."
         )
     return place
