@@ -21,7 +21,10 @@ _BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 # Pages whose Python blocks run one after the other in one interpreter.
 SNIPPETS = [
     "README.md",
-    *(f"docs/{name}.md" for name in ("index", "concepts", "how-to", "gymnasium")),
+    *(
+        f"docs/{name}.md"
+        for name in ("index", "concepts", "how-to", "gymnasium", "forces")
+    ),
 ]
 
 
