@@ -12,7 +12,7 @@ from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.biplane_sight import BiplaneSight
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.common_chain import CommonChain
-from cathsim_dmc.tasks.observation_kind import BIPLANE, FLUOROSCOPY
+from cathsim_dmc.tasks.observation_kind import BIPLANE, FLUOROSCOPY, HeldImages
 
 _BIPLANE = ("biplane", "biplane_retry")
 _OF_IMAGES = ("image", "sequential", *_BIPLANE)
@@ -85,7 +85,7 @@ class ImageSensors:
                     )
                 for each in cases:
                     _check_in_view(each)
-        self.images: dict[str, np.ndarray] = {}
+        self.images = HeldImages()
 
     def capture(
         self,

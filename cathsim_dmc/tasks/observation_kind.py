@@ -155,7 +155,7 @@ def flat(array: np.ndarray, axes: int) -> np.ndarray:
     return array.reshape(array.shape[:-axes] + (-1,))
 
 
-class _Held(dict[str, np.ndarray]):
+class HeldImages(dict[str, np.ndarray]):
     """Images by name; ValueError for one that the sensors do not hold."""
 
     def __missing__(self, name: str):
@@ -244,8 +244,6 @@ class ObservationTable(dict[str, ObservationKind]):
 
     def observe(self, names: Sequence[str], frame: Frame) -> Observation:
         """Computes the named rows; arrays may share memory with the frame."""
-        held = {} if frame.images is None else frame.images
-        frame = frame._replace(images=_Held(held))
         rows = [self[name].observe(frame) for name in names]
         return {key: value for row in rows for key, value in row.items()}
 

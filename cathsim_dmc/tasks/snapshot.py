@@ -311,7 +311,8 @@ def restored(name: str, old: Any, arrays: Arrays, rows: np.ndarray) -> Any:
         return type(old)._make(values)
     if isinstance(old, Mapping):
         pairs = old.items()
-        return {k: restored(f"{name}.{k}", one, arrays, rows) for k, one in pairs}
+        new = {k: restored(f"{name}.{k}", one, arrays, rows) for k, one in pairs}
+        return type(old)(new)
     new = list(old)
     first = old[rows[0]]
     if isinstance(first, np.random.RandomState):
