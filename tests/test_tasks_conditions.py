@@ -1,5 +1,6 @@
 import json
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -52,19 +53,31 @@ def test_what_is_read_is_what_the_seed_draws(batch):
         assert found.effects == {}
 
 
-def test_the_displacement_is_that_of_the_head(batch):
-    """In the frame of the inlet; the posture is linear, so the miss is small."""
-    exact = suite.make_task("simple1_bca", randomisation={"start_radius": 0.0})
-    still = BatchSimulation(exact, 1, num_threads=1)
-    still.reset()
-    moved = suite.make_task("simple1_bca", randomisation={"start_radius": 0.004})
-    other = BatchSimulation(moved, 1, num_threads=1, seeds=5)
-    other.reset()
+def test_the_displacement_is_the_one_that_was_applied():
+    """Where the drawn one would press on the wall, it is reversed or reduced."""
+
+    def begun(radius, count):
+        task = suite.make_task("type2_lcca", randomisation={"start_radius": radius})
+        simulation = BatchSimulation(task, count, num_threads=1, seeds=5)
+        simulation.reset()
+        return simulation
+
+    still, moved = begun(0.0, 1), begun(0.01, 12)
     assert still.conditions[0].displacement == (0.0, 0.0, 0.0)
-    heads = [one.rollout.readings.head[0] for one in (still, other)]
-    told = np.linalg.norm(other.conditions[0].displacement)
-    assert told > 5e-4
-    assert np.linalg.norm(heads[1] - heads[0]) == pytest.approx(told, rel=0.1)
+    frame = np.empty(9)
+    mujoco.mju_quat2Mat(frame, moved.task.scene.placement.quaternion)
+    frame = frame.reshape(3, 3)
+    away = moved.rollout.readings.head - still.rollout.readings.head
+    told = np.array([one.displacement for one in moved.conditions])
+    asked = [drawn(5 + n, {"start_radius": 0.01})[1].displacement for n in range(12)]
+    changed = ~np.isclose(told, asked).all(axis=1)
+    assert 2 < changed.sum() < 12
+    # The posture is linear in the displacement, so the head misses a large one.
+    size = np.linalg.norm(told, axis=1)
+    miss = np.linalg.norm(away - told @ frame.T, axis=1) / size
+    other = np.linalg.norm(away - asked @ frame.T, axis=1) / size
+    assert np.median(miss) < 0.2
+    assert (miss[changed] < other[changed]).all()
 
 
 def test_composer_gymnasium_and_batch_read_the_same(batch):
