@@ -146,8 +146,10 @@ The channels of the cameras follow each other. "tip" looks from the head along i
 with a field of view of a right angle, as in endoluminal views, by its own lamp alone,
 and does not show the device. "top" and "side" show the vessel as translucent in `rgb`,
 but as solid in `depth`, where the wall hides the device. A batch renders its
-simulations one after the other. Tasks with several anatomies or a moving vessel are
-refused.
+simulations one after the other. In a task with several anatomies each image shows the
+anatomy of its simulation, as a task with this anatomy alone does; the first image
+compiles a model with all meshes. A vessel that moves is drawn where it has moved to;
+its mesh is computed and uploaded for each image, which takes longer.
 
 All cameras of a process render in one thread of their own, so `physics.render` and
 other uses of OpenGL do not disturb them. Such a process cannot be
@@ -165,6 +167,15 @@ All draws, including quantum noise, come from the environment's random state; si
 batched environments draw the same values.
 
 {table}
+
+What an episode has drawn is readable: `env.task.conditions` of a composer environment,
+`env.unwrapped.conditions` of a Gymnasium environment, and a list with one for each
+simulation, `conditions` of `BatchSimulation` and `CathSimVectorEnv`. It is a named
+tuple of the quantities above in their units, with the names of anatomy and goal, the
+insertion and the displacement of the start as they were applied, and, under `effects`,
+what a living vessel has drawn: phases and rates of heart and breathing, material of the
+wall. Quantities that are not randomised are None. Recorded episodes hold it as
+`meta["conditions"]`.
 """
 
 
