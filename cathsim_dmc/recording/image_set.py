@@ -213,7 +213,8 @@ def _write_shard(shard: _Shard) -> tuple[int, str, Labels]:
 
 def _simulate_shard(shard: _Shard) -> tuple[int, str]:
     random, faults = np.random.RandomState(shard.seed), []
-    for place in shard.candidates or (None,) * _TRIES:
+    # Of a given anatomy, which has no candidates, only kit, access and goal differ.
+    for place in shard.candidates or range(_TRIES):
         kit = list(KITS)[random.randint(len(KITS))]
         access = ACCESSES[random.randint(len(ACCESSES))]
         anatomy, access = _entered(shard, place, access)
@@ -235,7 +236,7 @@ def _simulate_shard(shard: _Shard) -> tuple[int, str]:
     raise RuntimeError(f"{shard.path.name}: no device fits; the last: {faults[-1]}")
 
 
-def _entered(shard: _Shard, place: int | None, access: str) -> tuple[Anatomy, str]:
+def _entered(shard: _Shard, place: int, access: str) -> tuple[Anatomy, str]:
     """Returns the anatomy of a file and its access, "own" for the inlet of a scan."""
     from cathsim_dmc.anatomy.arch import arch
 
