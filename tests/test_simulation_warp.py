@@ -25,7 +25,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.entities.contact import CONTACT_SOLREF
 from cathsim_dmc.physics import held
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.simulation.warp import contacts, devices, worlds
+from cathsim_dmc.simulation.warp import contacts, devices
 from cathsim_dmc.simulation.warp.reduction import Totals
 from cathsim_dmc.simulation.warp.simulation import WarpSimulation
 from cathsim_dmc.simulation.warp.worlds import Worlds
@@ -237,6 +237,10 @@ def test_devices_that_turn_take_part_in_a_pool():
     made.write_model(stepper._own, ["dof_length"])
 
 
+# What the host changes in every control step, and what else is the state of a world.
+EACH, MORE = ["qpos", "act", "ctrl", "qfrc_applied", "time"], ["qvel", "qacc_warmstart"]
+
+
 @pytest.fixture
 def bare_worlds():
     """Four worlds on the CPU, without a scene: arrays of two fields and of a state."""
@@ -256,8 +260,7 @@ def bare_worlds():
         geom_rbound=zeros(1, 2),
         opt=types.SimpleNamespace(disableflags=4, run_rne_postconstraint=None),
     )
-    state = {name: zeros(4, 2) for name in worlds._WRITTEN if name != "time"}
-    made.data = types.SimpleNamespace(**state, time=zeros(4))
+    made.data = types.SimpleNamespace(**{name: zeros(4, 2) for name in EACH + MORE})
     return made
 
 
@@ -281,6 +284,7 @@ def test_fields_of_worlds_are_written_or_refused(bare_worlds):
     for name in ("geom_rbound", "none"):
         bare_worlds._expand(name, differ)
         bare_worlds.write_model({name: differ}, [name])
+    assert bare_worlds.model.geom_rbound.shape == (1, 2)
     for write in (
         lambda: bare_worlds._expand("geom_priority", differ),
         lambda: bare_worlds.write_model({"geom_priority": differ}, ["geom_priority"]),
@@ -294,12 +298,11 @@ def test_states_of_worlds_are_copied_to_the_device_and_back(bare_worlds):
     told, random = [], np.random.RandomState(0)
     bare_worlds._passive = types.SimpleNamespace(write=told.append)
     bare_worlds._contacts = types.SimpleNamespace(write=lambda: told.append("contacts"))
-    shapes = {name: getattr(bare_worlds.data, name).shape for name in worlds._WRITTEN}
-    arrays = {name: random.rand(*shape) for name, shape in shapes.items()}
+    arrays = {name: random.rand(4, 2) for name in EACH + MORE}
     for whole in (False, True):
         bare_worlds.write(types.SimpleNamespace(**arrays), whole)
         for name, values in arrays.items():
-            given = values if whole or name in worlds._ALWAYS else 0.0 * values
+            given = values if whole or name in EACH else 0.0 * values
             found = getattr(bare_worlds.data, name).numpy()
             np.testing.assert_allclose(found, given, rtol=1e-6, err_msg=name)
     assert told == [False, True, "contacts"]
