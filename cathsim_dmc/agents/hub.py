@@ -40,7 +40,12 @@ def is_reference(text: str | Path) -> bool:
 
 
 def parse(text: str, pinned: bool = True) -> Reference:
-    """Parse a reference; ValueError for another form, or without a commit if pinned."""
+    """Parse a reference; ValueError for another form, or unless it is as `pinned`.
+
+    Args:
+        text: The reference.
+        pinned: Whether it must have a commit; otherwise it must have none.
+    """
     found = _FORM.fullmatch(text)
     if found is None:
         form = "hf:OWNER/NAME, without a commit, which the upload makes,"
@@ -57,6 +62,8 @@ def parse(text: str, pinned: bool = True) -> Reference:
             f"{text.partition('#')[0]}@ and the 40 digits that `cathsim upload` "
             "printed, or that its page shows under Files, History"
         )
+    if not pinned and parts["commit"] is not None:
+        raise ValueError(f"{text}: an upload makes a commit of its own; leave @… out")
     name = parts["name"] or parts["repository"].partition("/")[2]
     return Reference(parts["repository"], parts["commit"], name)
 
@@ -117,8 +124,6 @@ def upload(folder: Path, text: str, kind: str, private: bool = True) -> str:
         ModuleNotFoundError: the extra `hub` is not installed.
     """
     place = parse(text, pinned=False)
-    if place.commit is not None:
-        raise ValueError(f"{text}: an upload makes a commit of its own; leave @… out")
     extras.require("hub", "huggingface_hub")
     from huggingface_hub import HfApi
 
