@@ -114,10 +114,10 @@ def test_a_trunk_whose_fork_is_beside_the_inlet_leads_on():
 @pytest.mark.parametrize(
     ("start", "ends", "widths", "chosen"),
     [
-        (20, (0, 60, 200), (1, 3, 3), 0),  # the nearest end that is not ahead
-        (160, (0, 60, 200), (3, 1, 3), 0),  # far from all, the farthest wide one
-        (160, (0, 60, 200), (3, 2, 3), 0),
-        (160, (70, 60, 200), (1, 3, 3), 1),
+        (20, (0, 60, 200), (1, 3, 3), 0),
+        (175, (190, 150, 200), (3, 3, 3), 1),  # the nearest is ahead
+        (160, (60, 0, 200), (3, 1, 3), 0),  # far from all, the farthest wide one
+        (160, (60, 0, 200), (3, 2, 3), 1),
     ],
 )
 def test_the_inlet_lies_behind_the_start_of_a_drawn_curve(start, ends, widths, chosen):
