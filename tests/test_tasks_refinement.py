@@ -68,7 +68,7 @@ CHAIN = """
   <worldbody>
     <geom type="box" size="1 1 1" contype="1" conaffinity="0"/>
     <body pos="0.1 0.2 0.3">
-      <joint type="slide" axis="0 0 1"/><joint axis="1 0 0"/><geom pos="0 0 0.01"/>
+      <joint type="slide" axis="0 0 1"/><joint axis="1 1 0"/><geom pos="0 0 0.01"/>
       <body pos="0 0 0.02">
         <joint axis="1 0 0"/><joint axis="0 1 0"/><geom pos="0 0 0.01"/>
         <body pos="0 0 0.02"><geom pos="0 0 0.02"/></body>
@@ -78,12 +78,13 @@ CHAIN = """
 </mujoco>"""
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_way_of_a_chain_is_that_of_its_fastest_link(seed):
+@pytest.mark.parametrize(("seed", "fastest"), [(149, 0), (116, 1), (0, 2)])
+def test_the_way_of_a_chain_is_that_of_its_fastest_link(seed, fastest):
     """Across the way to the next link, by the velocities that MuJoCo computes."""
     model = mujoco.MjModel.from_xml_string(CHAIN)
     data, random = mujoco.MjData(model), np.random.RandomState(seed)
     data.qpos[:], data.qvel[:] = random.uniform(-1, 1, (2, model.nv))
+    data.qvel[0] *= 0.03
     mujoco.mj_forward(model, data)
     speeds = []
     for body, reach in zip((1, 2, 3), (0.02, 0.02, 0.03), strict=True):
@@ -94,6 +95,7 @@ def test_the_way_of_a_chain_is_that_of_its_fastest_link(seed):
             ahead = data.xpos[body + 1] - data.xpos[body]
             velocity = velocity - velocity @ ahead / (ahead @ ahead) * ahead
         speeds.append(np.linalg.norm(velocity) + reach * np.linalg.norm(turn))
+    assert np.argmax(speeds) == fastest
     links = deep_links.moving(model)
     kept = (getattr(data, name)[None].copy() for name in deep_links.Motion._fields)
     motion, way = deep_links.Motion._make(kept), np.zeros(1)
