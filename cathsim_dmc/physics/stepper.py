@@ -229,6 +229,9 @@ class Stepper(abc.ABC):
             control steps was too coarse, or may end too deep.
         """
         limits, way = (forces.HARDEST, limit, self._timestep), np.empty_like(depth)
+        if len(way) < rows.MANY:  # slices of all fields take longer than the work
+            motion, links = self._motion, self._links
+            return way, deep_links.in_doubt(peak, depth, limits, motion, links, way)
         doubt: list[bool] = []
 
         def measure(own: slice) -> None:

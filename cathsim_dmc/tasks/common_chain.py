@@ -95,7 +95,10 @@ class CommonChain:
             line, out = state.centreline[own], part(found, own)
             _continued(part(arrays, own), line, self._behind, out)
 
-        rows.each(len(force), extend)
+        if len(force) < rows.MANY:  # slices of all arrays take longer than the work
+            _continued(arrays, state.centreline, self._behind, found)
+        else:
+            rows.each(len(force), extend)
         return found
 
     def tracked(self, line: np.ndarray) -> np.ndarray:

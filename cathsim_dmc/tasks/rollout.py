@@ -299,13 +299,17 @@ class Rollout(Restorable):
     def _step(self, rows: np.ndarray, begins: bool = False) -> Step:
         """Judges and observes all simulations; captures images of those in `rows`."""
         distance = straight(self.resting.head, self.resting_goal)
-        failed = np.array([error is not None for error in self._errors])
+        failed = None
+        if any(self._errors):
+            failed = np.array([error is not None for error in self._errors])
         measured = Measurement(
             self.resting, self.wall_force, self._action, self._previous_action, distance
         )
         outcome = judge(self.objectives, measured, failed)
         observation = self._observe(rows, begins)
-        ended = outcome.success | self.progress.given_up | failed
+        ended = outcome.success | self.progress.given_up
+        if failed is not None:
+            ended |= failed
         ended &= self.steps > 0
         return Step(
             observation=observation,
