@@ -312,7 +312,8 @@ def restored(name: str, old: Any, arrays: Arrays, rows: np.ndarray) -> Any:
     if isinstance(old, Mapping):
         pairs = old.items()
         new = {k: restored(f"{name}.{k}", one, arrays, rows) for k, one in pairs}
-        return type(old)(new)
+        kind: Any = type(old)
+        return kind(new)
     new = list(old)
     first = old[rows[0]]
     if isinstance(first, np.random.RandomState):
