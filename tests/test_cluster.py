@@ -85,7 +85,7 @@ def test_episodes_played_apart_are_those_played_together(name):
     together = []
     for part in parts:
         whole = evaluation._Group(
-            part, range(len(part.seeds)), player, True, make_env, 1, 1, None
+            part, range(len(part.seeds)), player, True, make_env, None, 1, 1, None
         )
         together += evaluation._play(whole, logs[0])
         pieces = [(piece, evaluation.ContactLog()) for piece in whole.pieces(2)]

@@ -134,7 +134,7 @@ def test_a_device_beside_the_sheath_may_neither_escape_nor_settle(task):
         assert physics_errors.escaped(scene.anatomy, nodes, along) == outside
         expected = pytest.raises(ValueError, match="mm outside the lumen")
         with expected if outside else contextlib.nullcontext():
-            start._refuse_outside(scene, None, index, data)
+            start._refuse_outside(scene, index, data)
 
 
 def test_exploding_force_ends_the_episode_in_both_paths(

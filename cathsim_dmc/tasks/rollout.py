@@ -339,8 +339,10 @@ class Rollout(Restorable):
             )
             sensors.capture(rows, begins, exposure, random, self.around)
         if self.views.wanted and len(rows):
-            state_of = self._stepper, self.readings, self.moving, self.begun
-            found = self.views.see(rows, self._case_of, *state_of)
+            stepper, moving, begun = self._stepper, self.moving, self.begun
+            found = self.views.see(
+                rows, self._case_of, stepper, self.readings, moving, begun
+            )
             for name, view in found.items():
                 sensors.hold(name, view, rows)
         seen = self._at_rest(state) if self._tracking.deviation else self.resting
@@ -360,8 +362,6 @@ class Rollout(Restorable):
         self.resting = self._at_rest(self.readings)
         self.progress.restart(indices, self._case_of, self.resting)
         return self._step(indices[:0])
-
-    # State of the rollout.
 
     @property
     def memory(self) -> Memory:

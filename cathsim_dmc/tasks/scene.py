@@ -121,8 +121,9 @@ class Scene:
         if drawn:
             vertices = self.anatomy.surface.vertices
             low, high = vertices.min(0), vertices.max(0)
+        centre, distance = _aimed(low, high)
         for name, axes in VIEWS.items():
-            self.arena.add_camera(name, *_aimed(low, high), axes)
+            self.arena.add_camera(name, centre, distance, axes)
 
     def _attach(self, config: NavigationConfig):
         moving, own = config.vessel.motion is not None, config.effects_on(self.catheter)
