@@ -260,10 +260,22 @@ def python(back_end, *arguments):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", ["type1_bca", "type1_bca_pair"])
-def test_cameras_see_what_they_should(task, back_end):
-    done = python(back_end, SEEING, task)
-    assert "seen" in done.stdout, done.stderr
+@pytest.mark.parametrize(
+    ("script", "last", "arguments"),
+    [
+        pytest.param(SEEING, "seen", ["type1_bca"], id="what they should"),
+        pytest.param(SEEING, "seen", ["type1_bca_pair"], id="what they should, pair"),
+        # Randomisation rolls the base of the device, coaxial devices have other radii.
+        pytest.param(DRAWN, "drawn", [], id="the device where it is"),
+        # As a task with this anatomy alone does, bit for bit.
+        pytest.param(SEVERAL, "several", ["single"], id="the anatomy of each"),
+        pytest.param(SEVERAL, "several", ["pair"], id="the anatomy of each, pair"),
+        pytest.param(MOVING, "moving", [], id="a vessel where it has moved to"),
+    ],
+)
+def test_cameras_show(script, last, arguments, back_end):
+    done = python(back_end, script, *arguments)
+    assert last in done.stdout, done.stderr
 
 
 @pytest.mark.slow
@@ -275,27 +287,6 @@ def test_contexts_of_others_threads_forks_and_the_exit(back_end):
     assert done.returncode == 0
     # Contexts that are freed after the end of EGL say so.
     assert "Error" not in done.stderr, done.stderr
-
-
-@pytest.mark.slow
-def test_the_device_is_drawn_where_it_is(back_end):
-    """Randomisation rolls the base of the device, coaxial devices have other radii."""
-    done = python(back_end, DRAWN)
-    assert "drawn" in done.stdout, done.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("devices", ["single", "pair"])
-def test_cameras_show_the_anatomy_of_each_simulation(devices, back_end):
-    """As a task with this anatomy alone does, bit for bit."""
-    done = python(back_end, SEVERAL, devices)
-    assert "several" in done.stdout, done.stderr
-
-
-@pytest.mark.slow
-def test_cameras_show_a_vessel_where_it_has_moved_to(back_end):
-    done = python(back_end, MOVING)
-    assert "moving" in done.stdout, done.stderr
 
 
 def test_without_opengl_the_message_says_what_to_do(shared_environment, monkeypatch):

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc import bounds
+from cathsim_dmc.anatomy import Surface
 from cathsim_dmc.imaging.options import VIEW_ANGLE
 from cathsim_dmc.physics.effects import World
 from cathsim_dmc.physics.motion import Moving
@@ -65,7 +66,7 @@ class Meshes(Protocol):
     def enter(self, model: mujoco.MjModel, number: int) -> None: ...  # noqa: D102
     def draw(self, model: mujoco.MjModel, number: int) -> None: ...  # noqa: D102
     def reshape(  # noqa: D102
-        self, model: mujoco.MjModel, number: int, vertices: np.ndarray
+        self, model: mujoco.MjModel, number: int, surface: Surface
     ) -> int: ...
 
 
@@ -203,8 +204,7 @@ class Cameras:
         if meshes is not None and (anew or self._written):
             meshes.draw(self._model, number)
         if meshes is not None and moving is not None:
-            vertices = moving.surface(index).vertices
-            mesh = meshes.reshape(self._model, number, vertices)
+            mesh = meshes.reshape(self._model, number, moving.surface(index))
             render_thread().upload(self._renderer, self._model, mesh)
         self._data.qpos[:] = stepper.arrays.qpos[index]
         mujoco.mj_kinematics(self._model, self._data)

@@ -10,11 +10,13 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from cathsim_dmc.anatomy import Surface
 from cathsim_dmc.entities.phantom import mesh_file
 from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.placement import matrix_of
 from cathsim_dmc.tasks.scene import VIEWS, camera_position
 
-# Largest difference between normals computed here and by MuJoCo, which treats sharp
+# Largest difference between normals of a `Surface` and of MuJoCo, which treats sharp
 # edges, as those of the caps, in a way of its own.
 _ALIKE = 1e-3
 # Fields that differ between models with other meshes.
@@ -78,38 +80,23 @@ class CaseMeshes:
         model.geom_quat[self._geom] = model.mesh_quat[mesh]
         model.geom_sameframe[self._geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
-    def reshape(self, model: mujoco.MjModel, number: int, vertices: np.ndarray) -> int:
-        """Moves the vertices (n, 3), m, of the mesh of a case; returns its number.
+    def reshape(self, model: mujoco.MjModel, number: int, surface: Surface) -> int:
+        """Gives the mesh of a case its vertices as moved; returns the mesh's number.
 
         The mesh must then be uploaded to the context that draws it.
         """
         mesh = self._meshes[number]
-        surface = self._cases[number].scene.anatomy.surface
         start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         own = slice(start, start + count)
-        frame = np.empty(9)
-        mujoco.mju_quat2Mat(frame, model.mesh_quat[mesh])
-        frame = frame.reshape(3, 3)
+        frame = matrix_of(model.mesh_quat[mesh])
         start = model.mesh_normaladr[mesh]
         there = slice(start, start + model.mesh_normalnum[mesh])
         if number not in self._smooth:
-            rest = _normals(surface.vertices, surface.faces) @ frame
+            rest = self._cases[number].scene.anatomy.surface.normals @ frame
             away = np.abs(rest - model.mesh_normal[there]).max(axis=1)
             self._smooth[number] = away < _ALIKE
         smooth = self._smooth[number]
-        model.mesh_vert[own] = (vertices - model.mesh_pos[mesh]) @ frame
-        turned = _normals(vertices, surface.faces) @ frame
+        model.mesh_vert[own] = (surface.vertices - model.mesh_pos[mesh]) @ frame
+        turned = surface.normals @ frame
         model.mesh_normal[there][smooth] = turned[smooth]
         return mesh
-
-
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3) of vertices, means over their faces weighted by area."""
-    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
-    across = np.cross(second - first, third - first)
-    total = np.zeros(vertices.shape)
-    for corner in range(3):
-        for axis in range(3):
-            weights = across[:, axis]
-            total[:, axis] += np.bincount(faces[:, corner], weights, len(vertices))
-    return total / np.linalg.norm(total, axis=1, keepdims=True)
