@@ -60,6 +60,11 @@ def twin(task, seed=0, **changes):
     return other
 
 
+def slow(*values):
+    """The values of one argument with which a test is slow."""
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
+
+
 def pytest_collection_finish():
     """Leaves what the imports have made out of all later garbage collections.
 

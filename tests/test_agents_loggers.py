@@ -7,6 +7,7 @@ import sys
 import pytest
 import synthetic_env
 import torch
+from conftest import slow
 
 from cathsim_dmc.agents import ConfigError, make_config, train
 from cathsim_dmc.agents.checkpoint import Checkpoint
@@ -49,7 +50,7 @@ def from_tensorboard(out, name):
 READERS = {"csv": from_csv, "tensorboard": from_tensorboard}
 
 
-@pytest.mark.parametrize("logger", READERS)
+@pytest.mark.parametrize("logger", ["csv", *slow("tensorboard")])
 def test_a_logger_shows_metrics_csv_as_one_series_over_processes(tmp_path, logger):
     if logger in EXTRAS:
         pytest.importorskip(logger)

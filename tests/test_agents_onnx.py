@@ -100,6 +100,7 @@ def test_what_cannot_be_exported_is_said(exported, tmp_path, cathsim):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_policy_of_random_arches_plays_the_arch_of_a_number(tmp_path):
     folder = onnx_export.write_onnx(
         "pretrained:navigator", tmp_path / "a", task_kwargs={"numbers": [3], **SHORT}

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from conftest import slow
 from skimage.measure import marching_cubes
 from synthetic_scans import marched, write_obj, y_tree
 
@@ -106,7 +107,7 @@ def test_units_are_guessed_and_said(y_mesh, tmp_path, units, scale):
     )
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.3, 0.5])
+@pytest.mark.parametrize("noise", [0.3, *slow(0.0, 0.5)])
 def test_noise_does_not_change_the_unit(noise):
     vertices, faces = marched(y_tree(), 0.6e-3)
     radius = typical_radius(vertices, faces)
@@ -347,7 +348,7 @@ def test_many_triangles_are_decimated(tmp_path):
     assert lumen.surface.volume == pytest.approx(before, rel=5e-3)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *slow(1, 2)])
 def test_decimation_glues_nothing_together(seed):
     """Where noise folds the surface, edges would have three or more triangles."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=10e-3)
@@ -483,7 +484,7 @@ def label_map(path, voxels, matrix, origin):
     return path
 
 
-@pytest.mark.parametrize("kind", [".nii.gz", ".nrrd"])
+@pytest.mark.parametrize("kind", [".nii.gz", *slow(".nrrd")])
 def test_a_label_map_gives_the_surface_where_it_is(y_mesh, labelled, tmp_path, kind):
     path = label_map(tmp_path / f"map{kind}", *labelled)
     with pytest.raises(ValueError, match=r"2 labels: 3 \(1 voxels\), 7.*--label"):

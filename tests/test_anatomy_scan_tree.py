@@ -97,6 +97,7 @@ def computed(arch_scan):
     return import_scan(arch_scan[0], notes=notes), notes
 
 
+@pytest.mark.slow
 def test_computed_branches_get_their_anatomical_names(arch_scan, computed):
     tree = arch_scan[1]
     anatomy, notes = computed
@@ -169,6 +170,7 @@ def test_a_scan_that_does_not_stand_upright_is_told():
         assert ("front" in panels[0].get_title()) == (vessels is not lying)
 
 
+@pytest.mark.slow
 def test_vessels_differ_in_colour_and_are_listed_in_order():
     """Twelve vessels, and a legend that is filled by columns and read by rows."""
     vessels = {"aorta": Vessel("aorta", tube([(0, 0, 0), (0, 0, 250)], [8, 8]))}
@@ -267,6 +269,7 @@ def test_an_inlet_at_a_bulge_is_not_its_end(tmp_path):
     assert failed(cut) == {}
 
 
+@pytest.mark.slow
 def test_goals_beside_the_inlet_are_left_out_and_said(tmp_path):
     """A branch that leaves 7 mm past the inlet stays in the tree, without goals."""
     vessels = {

@@ -746,6 +746,7 @@ def test_bad_input(cathsim, tmp_path, monkeypatch, case):
     assert not list(tmp_path.iterdir()), "work was begun"
 
 
+@pytest.mark.slow
 def test_record_writes_the_formats_that_python_writes(tmp_path, capsys):
     arrays, film = tmp_path / "push.npz", tmp_path / "push.webp"
     for path in (arrays, film):

@@ -96,6 +96,7 @@ def test_episodes_played_apart_are_those_played_together(name):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_a_policy_draws_the_same_for_each_device():
     """What was played before leaves the numbers of an evaluation alone."""
     player = load_policy("random")

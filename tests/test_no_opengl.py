@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from conftest import slow
 
 CODE = """
 import sys
@@ -102,7 +103,7 @@ def run_broken(backend, *arguments):
     )
 
 
-@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+@pytest.mark.parametrize("backend", ["egl", *slow("osmesa")])
 def test_a_command_that_draws_nothing_needs_no_opengl(backend):
     done = run_broken(backend, "list", "--json")
     assert done.returncode == 0, done.stderr

@@ -184,6 +184,7 @@ def ended(script, *arguments, timeout=300):
     return done.stderr
 
 
+@pytest.mark.slow
 def test_other_models_are_left_alone_whatever_their_numbers():
     ended(_FOREIGN)
 

@@ -302,6 +302,7 @@ def by_hand(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_episodes_of_a_hand_are_demonstrations(by_hand, tmp_path, cathsim, monkeypatch):
     for missing in ("gymnasium", "minari"):  # of the extra gym, which hands lacks
         monkeypatch.setitem(sys.modules, missing, None)

@@ -457,6 +457,7 @@ def test_one_lumen_in_two_splits_is_refused(tmp_path):
         assert not (tmp_path / "set").exists()
 
 
+@pytest.mark.slow
 def test_given_anatomies_have_the_same_labels(tmp_path, cathsim):
     phantoms.load("simple2").save(tmp_path / "own")
     code, out, err = cathsim(

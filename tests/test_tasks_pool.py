@@ -23,6 +23,7 @@ def options(tmp_path_factory):
     return {"anatomy": ["simple1", folder, *arch], "goal": ["lcca", "bca", "lsa"]}
 
 
+@pytest.mark.slow
 def test_an_episode_is_that_of_its_anatomy_alone_in_both_paths(options):
     both = {**options, "observation": SEEN}
     pooled = suite.load("cathsim", "navigate", both)

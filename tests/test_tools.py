@@ -11,6 +11,7 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from conftest import slow
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -50,7 +51,10 @@ def test_scripts_answer_help_and_refuse_what_they_do_not_know():
 
 @pytest.mark.parametrize(
     "words",
-    [("docs/scripts/vessel.py", "costs"), ("tools/trajectories.py", "--only", "x")],
+    [
+        ("tools/trajectories.py", "--only", "x"),
+        *slow(("docs/scripts/vessel.py", "costs")),
+    ],
 )
 def test_scripts_refuse_parts_that_they_do_not_know(words):
     """Else they end in a traceback, or write pages and measure nothing."""

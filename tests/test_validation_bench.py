@@ -53,6 +53,7 @@ def write(path, marks, *rows):
     (path / WIRES).write_text(json.dumps({"wires": rows, "landmarks": marks}))
 
 
+@pytest.mark.slow
 def test_a_simulated_wire_is_found_again_from_another(folder, monkeypatch):
     path, _, _, lumen = folder
     # The same for every reading of the folder; it takes seconds to make.
