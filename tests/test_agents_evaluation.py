@@ -9,7 +9,7 @@ import torch
 from dm_control.composer.variation import distributions
 from tensordict import TensorDict
 
-from cathsim_dmc import suite
+from cathsim_dmc import __version__, suite
 from cathsim_dmc.agents import evaluate, evaluation, policies, protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.evaluation import EvaluationResult
@@ -173,6 +173,8 @@ def test_evaluation_repeats_and_is_json(tmp_path):
     assert written == json.loads(json.dumps(first.to_dict()))
     assert len(written["episodes"]) == written["summary"]["episodes"] == 5
     assert written["episodes"][1]["seed"] == first.seeds[1]
+    assert written["versions"]["cathsim-dmc"] == __version__
+    assert EvaluationResult.load(tmp_path).versions == written["versions"]
     forces = written["summary"]["forces"]
     sums = [episode["forces"]["sum"]["mean"] for episode in written["episodes"]]
     assert forces["sum"]["mean"]["mean"] == pytest.approx(np.mean(sums))

@@ -19,6 +19,7 @@ from cathsim_dmc.agents import (
     evaluation,
     pretrained,
     protocols,
+    results,
     submission,
 )
 from cathsim_dmc.agents.episodes import EpisodeOutcome
@@ -41,7 +42,9 @@ def played(monkeypatch):
         )
         settings = {"protocol": protocol, "task_kwargs": {}, "observation": "internal"}
         seeds = tuple(submission.protocol_seeds(task, {}, 100))
-        return evaluation.EvaluationResult(task, policy, seeds, outcomes, settings)
+        return evaluation.EvaluationResult(
+            task, policy, seeds, outcomes, settings, versions=results.versions()
+        )
 
     monkeypatch.setattr(evaluation, "evaluate", evaluate)
 

@@ -11,7 +11,7 @@ from cathsim_dmc import bounds, files, suite
 from cathsim_dmc.agents import evaluation, evaluation_files, protocols, submission
 from cathsim_dmc.agents.checkpoint import CheckpointError
 from cathsim_dmc.agents.episodes import EpisodeOutcome
-from cathsim_dmc.agents.evaluation import EvaluationResult
+from cathsim_dmc.agents.results import EvaluationResult, versions
 from cathsim_dmc.agents.submission import PROTOCOL, RECORDED, RecordedActions
 from cathsim_dmc.analysis.force_statistics import QUANTITIES
 from cathsim_dmc.tasks.config import MAX_STEPS
@@ -102,7 +102,7 @@ def replay(entry: Entry, num_threads: int | None = None) -> Replay | None:
         )  # fmt: skip
         pairs = zip(entry.result.episodes, result.episodes, strict=True)
         equal = [_same(one, other) for one, other in pairs]
-        if entry.values.get("versions") == submission.versions() and not all(equal):
+        if entry.result.versions == versions() and not all(equal):
             seeds = [s for s, one in zip(result.seeds, equal, strict=True) if not one]
             raise ValueError(
                 f"{len(seeds)} of its {len(equal)} episodes are others when they are "
@@ -156,7 +156,10 @@ def _result(values: Mapping[str, Any]) -> EvaluationResult:
     for name in ("commit", "policy_sha256"):
         if values[name] is not None:
             bounds.text(name, values[name])
-    result = EvaluationResult(task, values["policy"], tuple(seeds), episodes, settings)
+    made = values.get("versions", {})
+    result = EvaluationResult(
+        task, values["policy"], tuple(seeds), episodes, settings, versions=made
+    )
     if not _close(json.loads(json.dumps(result.summary())), values["summary"]):
         raise ValueError("its summary is not that of its episodes")
     return result

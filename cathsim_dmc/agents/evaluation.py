@@ -25,7 +25,7 @@ from cathsim_dmc.agents.policies import (
     task_and_options,
     view_of,
 )
-from cathsim_dmc.agents.results import EvaluationResult
+from cathsim_dmc.agents.results import EvaluationResult, versions
 from cathsim_dmc.agents.training_log import progress_bar
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
@@ -218,6 +218,7 @@ class _Plan:
             },
             distinct=started or protocols.distinct(self.task, first, count),
             conditions=tuple(drawn),
+            versions=versions(),
         )
 
 

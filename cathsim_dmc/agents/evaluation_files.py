@@ -72,6 +72,7 @@ def _attributes(values: Mapping[str, Any]) -> dict[str, Any]:
         "settings": settings,
         "distinct": bounds.switch("distinct", values["distinct"]),
         "conditions": tuple(bounds.instance("conditions", x, dict) for x in drawn),
+        "versions": bounds.instance("versions", values.get("versions", {}), dict),
     }
 
 

@@ -2,13 +2,14 @@
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from cathsim_dmc import bounds, json_options
+from cathsim_dmc import __version__, bounds, json_options
 from cathsim_dmc.agents import evaluation_files
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.protocols import count_distinct
@@ -17,6 +18,12 @@ from cathsim_dmc.analysis.intervals import success_interval
 
 # Largest sums of the force on the wall up to which success is called safe, N.
 SAFE_FORCES = (0.5, 1.0, 2.0)
+_DECIDING = ("mujoco", "dm-control", "numpy", "numba", "torch")
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions of the packages that determine the episodes."""
+    return {"cathsim-dmc": __version__, **{name: version(name) for name in _DECIDING}}
 
 
 @dataclass(frozen=True)
@@ -33,6 +40,8 @@ class EvaluationResult:
         distinct: Whether all episodes can differ by more than the jitter of the start.
             If not, no interval over them is given.
         conditions: What was drawn for each episode; empty without randomisation.
+        versions: Versions of the packages that determine the episodes, by name; empty
+            in files from before 0.3.
     """
 
     task: str
@@ -42,6 +51,7 @@ class EvaluationResult:
     settings: Mapping[str, Any]
     distinct: bool = True
     conditions: tuple[Mapping[str, Any], ...] = ()
+    versions: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def load(
@@ -176,6 +186,7 @@ class EvaluationResult:
             "policy": self.policy,
             "seed": self.seeds[0],
             "settings": {**self.settings, "task_kwargs": options},
+            "versions": dict(self.versions),
             "distinct": self.distinct,
             "summary": self.summary(),
             "episodes": episodes,

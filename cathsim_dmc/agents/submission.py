@@ -5,7 +5,6 @@ import hashlib
 import json
 import subprocess
 from collections.abc import Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from cathsim_dmc.tasks.config import MAX_STEPS
 
 PROTOCOL = "varied"
 RECORDED = ".npz"  # suffix of a file of actions
-_DECIDING = ("mujoco", "dm-control", "numpy", "numba", "torch")
 
 
 def submit(
@@ -73,7 +71,7 @@ def submit(
     )
     files.require_file(out, make=True)
     ours: dict[str, Any] = {"policy_sha256": weights, "package": __version__}
-    ours |= {"commit": _commit(), "versions": versions()}
+    ours["commit"] = _commit()
     if not isinstance(player, str):
         beside = out.with_suffix(RECORDED)
         if isinstance(player, _Recorder):
@@ -107,12 +105,6 @@ def ships(policy: str) -> bool:
     """Whether a policy ships with the package, under a name."""
     shipped = pretrained.pretrained_names()
     return policy in POLICIES or policy in [pretrained.PREFIX + n for n in shipped]
-
-
-def versions() -> dict[str, str]:
-    """Returns the versions of the packages that determine the episodes."""
-    others = {name: version(name) for name in _DECIDING}
-    return {"cathsim-dmc": __version__, **others}
 
 
 def protocol_seeds(task: str, options: Mapping[str, Any], episodes: int) -> list[int]:
