@@ -207,6 +207,7 @@ def signatures():
         contact.contact_law: (a_wall, *[REAL] * 4),
         contact.end_caps: (point, point, REAL, point),
         contact.sweep_of: (capsule, given, point, point),
+        contact.swept: (whole, two, one, types.int32, one, one, REAL),
         contact.world_contact: (one, given, point, point, one),
         moving_contact.moving_contacts: (
             *(a_wall, capsule, given, sweep, carried, moving, two),

@@ -7,7 +7,13 @@ import mujoco
 from cathsim_dmc.collision.native import data_field, model_field, numbers, word
 from cathsim_dmc.collision.table import MIDDLE
 from cathsim_dmc.compiled import compiled, inlined
-from cathsim_dmc.laws.contact import contact_law, end_caps, looks_ahead, sweep_of
+from cathsim_dmc.laws.contact import (
+    contact_law,
+    end_caps,
+    looks_ahead,
+    sweep_of,
+    swept,
+)
 from cathsim_dmc.laws.places import Capsule
 from cathsim_dmc.laws.vectors import into
 
@@ -79,33 +85,24 @@ def law_of(model, wall, geom, margin):
 
 @compiled
 def _swept(model, data, geom):
-    """Displacement (3) m of a geom's centre and rotation (3) rad in a physics step.
-
-    World frame, at the present velocity, which is summed over the degrees of freedom.
-    """
+    """Motion of a geom in this physics step; see `laws.contact.swept`."""
     body = model_field(model, "geom_bodyid")[geom]
     parents = model_field(model, "body_parentid")
     counts = model_field(model, "body_dofnum")
     while body > 0 and counts[body] == 0:
         body = parents[body]
-    a, b, c, x, y, z = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if body == 0:
-        return (x, y, z), (a, b, c)
-    ancestors = model_field(model, "dof_parentid")
-    velocities, motions = data_field(data, "qvel"), data_field(data, "cdof")
-    dof = model_field(model, "body_dofadr")[body] + counts[body] - 1
-    while dof >= 0:
-        motion, velocity = motions[dof], velocities[dof]
-        a, b = a + motion[0] * velocity, b + motion[1] * velocity
-        c, x = c + motion[2] * velocity, x + motion[3] * velocity
-        y, z = y + motion[4] * velocity, z + motion[5] * velocity
-        dof = ancestors[dof]
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     about = data_field(data, "subtree_com")[model_field(model, "body_rootid")[body]]
-    centre = data_field(data, "geom_xpos")[geom]
-    step = model_field(model, "opt.timestep")
-    u, v, w = centre[0] - about[0], centre[1] - about[1], centre[2] - about[2]
-    x, y, z = x + b * w - c * v, y + c * u - a * w, z + a * v - b * u
-    return (step * x, step * y, step * z), (step * a, step * b, step * c)
+    return swept(
+        model_field(model, "dof_parentid"),
+        data_field(data, "cdof"),
+        data_field(data, "qvel"),
+        model_field(model, "body_dofadr")[body] + counts[body] - 1,
+        data_field(data, "geom_xpos")[geom],
+        about,
+        model_field(model, "opt.timestep"),
+    )
 
 
 @inlined

@@ -130,6 +130,34 @@ def looks_ahead(law):
     return law.activation > 0.0 and not law.compliant
 
 
+@law
+def swept(parents, motions, velocities, dof, centre, about, step):
+    """Displacement (3) m of a point and rotation (3) rad of its body in a physics step.
+
+    World frame, at the present velocity, which is summed over the degrees of freedom.
+
+    Args:
+        parents: Parent of each degree of freedom, -1 for none.
+        motions: Axes (n, 6) of the degrees of freedom about `about`: rotation, then
+            translation, as MuJoCo's `cdof`.
+        velocities: Their velocities (n).
+        dof: Last degree of freedom that moves the body, -1 for none.
+        centre: The point (3) m.
+        about: Centre of mass (3) m of the body's tree.
+        step: Physics step, s.
+    """
+    a, b, c, x, y, z = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    while dof >= 0:
+        motion, velocity = motions[dof], float(velocities[dof])
+        a, b = a + motion[0] * velocity, b + motion[1] * velocity
+        c, x = c + motion[2] * velocity, x + motion[3] * velocity
+        y, z = y + motion[4] * velocity, z + motion[5] * velocity
+        dof = parents[dof]
+    u, v, w = centre[0] - about[0], centre[1] - about[1], centre[2] - about[2]
+    x, y, z = x + b * w - c * v, y + c * u - a * w, z + a * v - b * u
+    return (step * x, step * y, step * z), (step * a, step * b, step * c)
+
+
 @inlined
 def sweep_of(capsule, law, travel, turn):
     """`Sweep` of a capsule.

@@ -20,6 +20,7 @@ from cathsim_dmc.laws.contact import (
     end_caps,
     looks_ahead,
     sweep_of,
+    swept,
     world_contact,
 )
 from cathsim_dmc.laws.contact import Scratch as Memory
@@ -80,23 +81,16 @@ def vector(places, world, number):
 
 @compiled
 def _swept(links, motion, world, link, step):
-    """Displacement (3) m of a link's centre and rotation (3) rad in a physics step.
-
-    World frame; see `collision.links`.
-    """
-    a, b, c, x, y, z = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    dof = links.last_dof[link]
-    while dof >= 0:
-        way, velocity = motion.cdof[world, dof], float(motion.qvel[world, dof])
-        a, b = a + way[0] * velocity, b + way[1] * velocity
-        c, x = c + way[2] * velocity, x + way[3] * velocity
-        y, z = y + way[4] * velocity, z + way[5] * velocity
-        dof = links.parents[dof]
-    about = motion.subtree_com[world, links.roots[link]]
-    centre = motion.geom_xpos[world, links.geoms[link]]
-    u, v, w = centre[0] - about[0], centre[1] - about[1], centre[2] - about[2]
-    x, y, z = x + b * w - c * v, y + c * u - a * w, z + a * v - b * u
-    return (step * x, step * y, step * z), (step * a, step * b, step * c)
+    """Motion of a link in a physics step; see `laws.contact.swept`."""
+    return swept(
+        links.parents,
+        motion.cdof[world],
+        motion.qvel[world],
+        links.last_dof[link],
+        motion.geom_xpos[world, links.geoms[link]],
+        motion.subtree_com[world, links.roots[link]],
+        step,
+    )
 
 
 class Pair(NamedTuple):
