@@ -20,9 +20,10 @@ import tyro
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.analysis.intervals import success_interval
-from cathsim_dmc.cli.options import EVALUATION_SEED, say, show
+from cathsim_dmc.cli.options import say, show
 from cathsim_dmc.simulation import episodes
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.config import EVALUATION_SEED
 from cathsim_dmc.validation.checks import Check, Report
 
 OBSERVED = ("internal", "tracking", "force")

@@ -25,9 +25,10 @@ import tyro
 from cathsim_dmc import files, policies, suite
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, ForceTracker
 from cathsim_dmc.analysis.intervals import success_interval
-from cathsim_dmc.cli.options import BAD_INPUT, EVALUATION_SEED, say, show
+from cathsim_dmc.cli.options import BAD_INPUT, say, show
 from cathsim_dmc.simulation import episodes
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.config import EVALUATION_SEED
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.validation.checks import Check, Report
 

@@ -187,6 +187,7 @@ def change(path, value):
     [
         (change(["units"], "m"), "units is 'm'"),
         (change(["version"], 2), "version is 2"),
+        (change(["version"], True), "version is True; it must be 1"),
         (change(["frame"], "LAS"), "one of LPS, RAS"),
         (change(["colour"], "red"), "some of format, version"),
         (change(["vessels"], {}), "at least one vessel"),

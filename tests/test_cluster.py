@@ -26,6 +26,7 @@ from cathsim_dmc.agents.policies import FunctionPolicy
 from cathsim_dmc.recording import image_set
 from cathsim_dmc.recording.image_set import ImageSetOptions
 from cathsim_dmc.simulation import environments
+from cathsim_dmc.tasks.config import EVALUATION_SEED
 
 TASK = "type1_lcca"
 VARIED = {"task": TASK, "protocol": "varied", "task_kwargs": {"max_steps": 12}}
@@ -76,7 +77,7 @@ def observation(rows):
 def test_episodes_played_apart_are_those_played_together(name):
     player, logs = load_policy(name, 7), [evaluation.ContactLog() for _ in range(2)]
     parts = protocols.parts(
-        protocols.get("varied"), TASK, {"max_steps": 12}, 7, evaluation.EVALUATION_SEED
+        protocols.get("varied"), TASK, {"max_steps": 12}, 7, EVALUATION_SEED
     )
     make_env = functools.partial(
         environments.make_env, TASK, observation=player.observation or "internal"

@@ -136,9 +136,9 @@ def test_settings_of_the_expert_are_checked(kind, given, words):
     assert kind() == dataclasses.replace(kind())
 
 
-@pytest.mark.parametrize("goal", [[1, [2]], [[1, 8, 4], [1]], ["1", 2, 3], (1, 2), {}])
+@pytest.mark.parametrize("goal", [[1, [2]], [[1, 8, 4], [1]], ["1", 2, 3], "1,2,3", {}])
 def test_a_goal_that_is_no_place_is_refused(goal):
-    with pytest.raises(ValueError, match="^goal is .*the name of a goal, a Goal, or"):
+    with pytest.raises(ValueError, match="^goal is .*bca.*, a Goal, or a position"):
         suite.make_task("navigate", goal=goal)
 
 

@@ -29,13 +29,12 @@ from cathsim_dmc.agents.results import EvaluationResult, versions
 from cathsim_dmc.agents.training_log import progress_bar
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
+from cathsim_dmc.tasks.config import EVALUATION_SEED
 from cathsim_dmc.tasks.snapshot import Snapshot
 
 EnvFactory = Callable[..., EnvBase]
 # Called after every step with the environment and which episodes (n,) bool still run.
 Observer = Callable[[EnvBase, np.ndarray], None]
-
-EVALUATION_SEED = 1_000_000  # apart from the seeds of training
 
 
 def evaluate(

@@ -35,7 +35,7 @@ from cathsim_dmc.agents.policies import (
 from cathsim_dmc.policies import in_environment
 from cathsim_dmc.simulation.environments import PIXELS
 from cathsim_dmc.simulation.episodes import play_alone
-from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, EVALUATION_SEED
 from cathsim_dmc.tasks.interface import action_table, observation_table
 
 FORMAT = 1
@@ -72,7 +72,7 @@ def write_onnx(
     *,
     task: str | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
-    seed: int = 1_000_000,
+    seed: int = EVALUATION_SEED,
 ) -> Path:
     """Write a trained policy as ONNX and compare it with the policy over an episode.
 

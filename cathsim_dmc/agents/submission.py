@@ -15,7 +15,7 @@ from cathsim_dmc.agents import evaluation, pretrained, protocols
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.policies import PolicyLike, load_policy
 from cathsim_dmc.policies import POLICIES, Policy, View
-from cathsim_dmc.tasks.config import MAX_STEPS
+from cathsim_dmc.tasks.config import EVALUATION_SEED, MAX_STEPS
 
 PROTOCOL = "varied"
 RECORDED = ".npz"  # suffix of a file of actions
@@ -64,7 +64,7 @@ def submit(
             raise ValueError(f"{policy} holds actions of {player.task}, not of {task}")
         player.require(bounds.choice("task", player.task, suite.SUITE), episodes)
     elif not ships(policy):
-        player = _Recorder(load_policy(policy, evaluation.EVALUATION_SEED))
+        player = _Recorder(load_policy(policy, EVALUATION_SEED))
     files.require_file(out, later=True)
     result = evaluation.evaluate(
         player, task, episodes, protocol=PROTOCOL, num_threads=num_threads
@@ -114,7 +114,7 @@ def protocol_seeds(task: str, options: Mapping[str, Any], episodes: int) -> list
 
 @functools.lru_cache(256)
 def _protocol_seeds(task: str, options: str, episodes: int) -> tuple[int, ...]:
-    conditions, seed = protocols.get(PROTOCOL), evaluation.EVALUATION_SEED
+    conditions, seed = protocols.get(PROTOCOL), EVALUATION_SEED
     parts = protocols.parts(conditions, task, json.loads(options), episodes, seed)
     return tuple(seed for part in parts for seed in part.seeds)
 
@@ -251,7 +251,7 @@ def record_actions(
     Returns:
         Result of the evaluation.
     """
-    recorder = _Recorder(load_policy(policy, evaluation.EVALUATION_SEED))
+    recorder = _Recorder(load_policy(policy, EVALUATION_SEED))
     if files.require_file(out).suffix != RECORDED:
         raise ValueError(f"the actions are to be written to {out}; give a .npz file")
     result = evaluation.evaluate(recorder, task, protocol=PROTOCOL, **options)

@@ -65,7 +65,7 @@ def parse_tree(content: Any) -> TreeFile:
     _entries("the file", content, needed, ("note", "inlets", "goals"))
     fixed = {"format": FORMAT, "version": FORMAT_VERSION}
     for key, value in {**fixed, "units": "mm"}.items():
-        if content[key] != value:
+        if content[key] is True or content[key] != value:  # True equals 1
             bounds.refuse(key, content[key], repr(value))
     signs = np.array(_FRAMES[bounds.choice("frame", content["frame"], _FRAMES)])
     curves: dict[str, Curve] = {}

@@ -38,6 +38,7 @@ from cathsim_dmc.pictures.films import SUFFIXES, check_film
 from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.tasks.config import EVALUATION_SEED
 from cathsim_dmc.tasks.snapshot import Snapshot
 
 _POLICY = (
@@ -58,7 +59,7 @@ def evaluate(
     /,
     task: PolicysTask = None,
     episodes: int | None = None,
-    seed: int = evaluation.EVALUATION_SEED,
+    seed: int = EVALUATION_SEED,
     protocol: Literal["published", "varied"] = "published",
     out: Path | None = None,
     baseline: bool = True,
@@ -190,7 +191,7 @@ def record(
     out: Path | None = None,
     gif: Annotated[Path | None, conf.arg(aliases=("--mp4", "--film"))] = None,
     task: PolicysTask = None,
-    seed: int = evaluation.EVALUATION_SEED,
+    seed: int = EVALUATION_SEED,
     fluoroscopy: bool = True,
     modules: Modules = (),
     *,
@@ -270,7 +271,7 @@ def film_checkpoint(checkpoint: Path, folder: Path, suffix: str) -> Path:
         folder: Directory of the films; the file has the name of the checkpoint.
         suffix: Ending of the file, of `pictures.films.SUFFIXES`.
     """
-    seed = evaluation.EVALUATION_SEED
+    seed = EVALUATION_SEED
     player = agents.load_policy(str(checkpoint), seed)
     task, task_kwargs = task_and_options(player, None, {})
     episode, env = _played(player, task, task_kwargs, seed)

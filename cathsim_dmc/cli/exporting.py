@@ -11,10 +11,11 @@ from cathsim_dmc import agents  # isort: skip
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.agents.onnx_export import write_onnx
-from cathsim_dmc.cli.options import EVALUATION_SEED, Modules
+from cathsim_dmc.cli.options import Modules
 from cathsim_dmc.cli.task_options import TaskOptions, task_kind
 from cathsim_dmc.policies import POLICIES
 from cathsim_dmc.simulation.mjcf import write_mjcf
+from cathsim_dmc.tasks.config import EVALUATION_SEED
 
 _WHAT = (
     "Task of `cathsim list`, for its scene; or a policy, for its network: directory of "

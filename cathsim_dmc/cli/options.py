@@ -13,7 +13,6 @@ from cathsim_dmc import files
 
 # Exit codes beside 0: a check has failed; the input cannot be used; Ctrl-C.
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
-EVALUATION_SEED = 1_000_000  # apart from the seeds of training
 
 _TASK = "Task of `cathsim list`."
 Task = Annotated[str, conf.Positional, conf.arg(help=_TASK)]

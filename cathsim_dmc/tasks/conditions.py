@@ -15,6 +15,9 @@ from cathsim_dmc.tasks.start import Started
 class Conditions(NamedTuple):
     """Values that an episode has drawn; None where the task keeps its own value.
 
+    Without `randomisation` `delay`, `view`, `gain` and `kerma` are not None: they are
+    0, (0, 0), 1 and 1, which change nothing.
+
     Attributes:
         anatomy: Name of the anatomy.
         goal: Name of the goal in it.

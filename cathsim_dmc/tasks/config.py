@@ -27,6 +27,7 @@ from cathsim_dmc.physics.vessel import VesselOptions
 from cathsim_dmc.tasks.cameras import CameraOptions
 
 MAX_STEPS = 2000  # published
+EVALUATION_SEED = 1_000_000  # of the first episode; apart from those of training
 WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
 _FRICTION = (0.0, MOST_FRICTION, "")  # Coulomb coefficient
 # Allowed ranges (low, high, unit). A link of the shaft is longer than its radius and

@@ -82,13 +82,16 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal | Sequence[float]") -> Goal
     The position has unit and frame of the anatomy's file, see `Anatomy.goal_at`.
     ValueError if it is outside the lumen, or a device would start past it.
     """
+    allowed = f"one of {', '.join(anatomy.goals)}, a Goal, or a position (x, y, z)"
     if isinstance(goal, str):
+        if goal not in anatomy.goals:
+            bounds.refuse("goal", goal, allowed)
         goal = anatomy.goal(goal)
     elif not isinstance(goal, Goal):
         try:
             goal = bounds.vector("goal", goal, 3)
         except ValueError:
-            bounds.refuse("goal", goal, "the name of a goal, a Goal, or (x, y, z)")
+            bounds.refuse("goal", goal, allowed)
         goal = anatomy.goal_at(goal)
         alone = dataclasses.replace(anatomy, goals={goal.name: goal})
         for where in unreachable(alone):
