@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from tqdm import tqdm
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.parts import Surface
@@ -29,6 +30,7 @@ _DPI, _NARROWEST = 100, 64  # px
 # X-ray image would be too small to see.
 _WIDEST = 1.6
 _MARGIN = 8e-3  # around the vessel, m
+_LONG_S = 2.0  # after which the progress is shown
 _FORCE_COLOUR = "#b3202c"
 # A film shows the noise of fluoroscopy, at a multiple of the usual dose.
 _NOISE = {"noise": True, "kerma": 4e-7}
@@ -116,7 +118,8 @@ def _frames(
     beside = figure.add_axes((share + 0.01, 0.34, 0.98 - share, 0.64))
     below = figure.add_axes((share + 0.09, 0.1, 0.89 - share, 0.19))
     cursor, window = _draw_force(below, episode), None
-    for step in steps.tolist():
+    shown = {"unit": " pictures", "delay": _LONG_S, "disable": None}  # on a terminal
+    for step in tqdm(steps.tolist(), "film", **shown):
         moment = Moment.of_episode(episode, surface, step)
         scene.clear()
         scene.axis("off")

@@ -1,10 +1,12 @@
-"""A vessel as translucent glass, drawn by numpy: no OpenGL, no window.
+"""A vessel as translucent glass, drawn by loops over triangles: no OpenGL, no window.
 
 All hits of a pixel are sorted by depth, because translucent triangles painted one over
 the other would show their seams. Glass is more opaque at the outline, where the line of
 sight runs along the wall.
 """
 
+import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -12,10 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.compiled import compiled
 
 # Colour of the wall, RGB in [0, 1], as lit from the left above the viewer's eye.
 WALL_COLOUR = np.array([0.80, 0.36, 0.33])
 LIGHT = np.array([-0.35, 0.55, 0.76])
+_LIGHT = LIGHT / np.linalg.norm(LIGHT)
 # Opacity of one layer of the wall: seen straight on, and along the surface.
 FACING, GRAZING = 0.08, 0.70
 # Opacity of the nearest wall over a device inside, as a share of the wall's opacity.
@@ -99,72 +103,104 @@ class Glass(NamedTuple):
 def glass(surface: Surface, projection: ParallelProjection) -> Glass:
     """Draw a closed surface as translucent glass."""
     fine = replace(projection, pixels=projection.pixels * _SAMPLES)
-    rows, columns = (_SAMPLES * n for n in projection.shape)
-    pixel, depth, normal = _hits(surface, fine, (rows, columns))
-    order = np.lexsort((depth, pixel))  # within a pixel, the farthest first
-    pixel, normal = pixel[order], normal[order]
-    slant = 1.0 - np.abs(normal[:, 2:])
-    opacity = FACING + (GRAZING - FACING) * slant**2.5
-    # Colours are premultiplied with opacity until the end.
-    hits = np.hstack([_lit(normal) * opacity, opacity])
-    first = np.flatnonzero(np.diff(pixel, prepend=-1))
-    count = np.diff(np.append(first, len(pixel)))
-    behind, glaze = np.zeros((2, rows * columns, 4))
-    drawn = np.minimum(count, _LAYERS)
-    farthest = first + count - drawn
-    for layer in range(int(drawn.max(initial=0))):
-        deep = drawn > layer
-        where, over = pixel[first[deep]], hits[farthest[deep] + layer]
-        behind[where] = over + (1.0 - over[:, 3:]) * behind[where]
-    glaze[pixel[first]] = GLAZE * hits[first + count - 1]
-    shape = projection.shape
-    return Glass(_smaller(behind, shape), _smaller(glaze, shape))
+    rows, columns = projection.shape
+    pixel, depth, normal = _hits(surface, fine, (_SAMPLES * rows, _SAMPLES * columns))
+    order = np.lexsort((depth, pixel))  # within a sample, the farthest first
+    both = behind, glaze = np.zeros((2, rows, columns, 4))
+    _blend(pixel[order], normal[order], behind, glaze)
+    both[..., :3] /= np.maximum(both[..., 3:], 1e-9)
+    behind, glaze = np.clip(both, 0.0, 1.0)
+    return Glass(behind, glaze)
 
 
 def _hits(surface: Surface, projection: ParallelProjection, shape: tuple[int, int]):
     """Pixels (H,), depths (H,) towards the viewer and unit normals (H, 3) of hits."""
-    vertices, faces = surface.vertices, surface.faces
     frame = np.stack([projection.right, projection.up, projection.towards], axis=1)
+    points = np.column_stack(
+        [projection.pixel(surface.vertices), surface.vertices @ projection.towards]
+    )
     normals = surface.normals @ frame
-    flat = projection.pixel(vertices)[faces]  # (F, 3, 2)
-    depth = (vertices @ projection.towards)[faces]
-    # Pixels of the boxes around the triangles.
-    low = np.maximum(np.ceil(flat.min(1) - 0.5).astype(int), 0)
-    high = np.floor(flat.max(1) - 0.5).astype(int)
-    size = np.maximum(np.minimum(high, np.array(shape)[::-1] - 1) - low + 1, 0)
-    boxes = size.prod(1)
-    face = np.repeat(np.arange(len(faces)), boxes)
-    number = np.arange(len(face)) - np.repeat(np.cumsum(boxes) - boxes, boxes)
-    pixel = low[face] + np.stack(np.divmod(number, size[face, 0])[::-1], axis=1)
-    a, b, c = flat.transpose(1, 0, 2)
-    area = _cross(b - a, c - a)
-    # Triangles seen edge on cover nothing.
-    area = np.where(np.abs(area) > 1e-12, area, np.nan)[face]
-    point = pixel + 0.5 - a[face]
-    second = _cross(point, (c - a)[face]) / area
-    third = _cross((b - a)[face], point) / area
-    inside = (second >= 0) & (third >= 0) & (second + third <= 1)
-    face, second, third = face[inside], second[inside], third[inside]
-    share = np.stack([1 - second - third, second, third], axis=1)
-    normal = np.einsum("hi,hij->hj", share, normals[faces[face]])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    return pixel[inside] @ [1, shape[1]], np.vecdot(share, depth[face]), normal
+    cover = functools.partial(_cover, points, normals, surface.faces, shape)
+    count = cover(np.empty(0, np.int64), np.empty(0), np.empty((0, 3)))
+    pixel, depth = np.empty(count, np.int64), np.empty(count)
+    normal = np.empty((count, 3))
+    cover(pixel, depth, normal)
+    return pixel, depth, normal
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+@compiled
+def _cover(points, normals, faces, shape, pixel, depth, normal):
+    """Write the hits of triangles, as far as there is room; return their number.
+
+    Args:
+        points: Vertices (V, 3): column, row and depth.
+        normals: Their normals (V, 3).
+        faces: Triangles (F, 3).
+        shape: (rows, columns) of the picture.
+        pixel: Written (H,): number of the pixel, row by row.
+        depth: Written (H,).
+        normal: Written (H, 3): unit normals.
+    """
+    count = 0
+    for f in range(len(faces)):
+        i, j, k = faces[f]
+        a, b, c = points[i], points[j], points[k]
+        ux, uy, vx, vy = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
+        area = ux * vy - uy * vx
+        if abs(area) <= 1e-12:
+            continue  # seen edge on, it covers nothing
+        left = max(math.ceil(min(a[0], b[0], c[0]) - 0.5), 0)
+        right = min(math.floor(max(a[0], b[0], c[0]) - 0.5), shape[1] - 1)
+        top = max(math.ceil(min(a[1], b[1], c[1]) - 0.5), 0)
+        bottom = min(math.floor(max(a[1], b[1], c[1]) - 0.5), shape[0] - 1)
+        for row in range(top, bottom + 1):
+            for column in range(left, right + 1):
+                x, y = column + 0.5 - a[0], row + 0.5 - a[1]
+                second, third = (x * vy - y * vx) / area, (ux * y - uy * x) / area
+                if second < 0.0 or third < 0.0 or second + third > 1.0:
+                    continue
+                if count < len(pixel):
+                    first = 1.0 - second - third
+                    pixel[count] = row * shape[1] + column
+                    depth[count] = first * a[2] + second * b[2] + third * c[2]
+                    n, total = normal[count], 0.0
+                    for axis in range(3):
+                        n[axis] = first * normals[i, axis] + second * normals[j, axis]
+                        n[axis] += third * normals[k, axis]
+                        total += n[axis] ** 2
+                    n /= max(math.sqrt(total), 1e-9)
+                count += 1
+    return count
 
 
-def _lit(normal: np.ndarray) -> np.ndarray:
-    """Colours (H, 3) of glass lit from both sides."""
-    facing = np.where(normal[:, 2:] < 0, -normal, normal)
-    light = np.clip(facing @ (LIGHT / np.linalg.norm(LIGHT)), 0, 1)[:, None]
-    return np.clip(WALL_COLOUR * (0.55 + 0.55 * light) + 0.5 * light**24, 0, 1)
+@compiled
+def _blend(pixel, normal, behind, glaze):
+    """Draw the hits of each sample, the farthest first; a pixel is their mean.
 
-
-def _smaller(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Means over the samples of every pixel, colours not premultiplied."""
-    rows, columns = shape
-    image = image.reshape(rows, _SAMPLES, columns, _SAMPLES, 4).mean((1, 3))
-    image[..., :3] /= np.maximum(image[..., 3:], 1e-9)
-    return np.clip(image, 0, 1)
+    Args:
+        pixel: Number of the sample of each hit (H,), in order.
+        normal: Unit normals (H, 3).
+        behind: Added to (R, C, 4): all walls, colours premultiplied with opacity.
+        glaze: Added to (R, C, 4): the nearest wall, likewise.
+    """
+    columns, share = _SAMPLES * behind.shape[1], 1.0 / _SAMPLES**2
+    over, under, start = np.zeros(4), np.zeros(4), 0
+    for end in range(1, len(pixel) + 1):
+        if end < len(pixel) and pixel[end] == pixel[start]:
+            continue
+        under[:] = 0.0
+        for hit in range(max(start, end - _LAYERS), end):
+            n = normal[hit]
+            opacity = FACING + (GRAZING - FACING) * (1.0 - abs(n[2])) ** 2.5
+            # The wall is lit from both sides.
+            light = n[0] * _LIGHT[0] + n[1] * _LIGHT[1] + n[2] * _LIGHT[2]
+            light = min(max(-light if n[2] < 0.0 else light, 0.0), 1.0)
+            over[3] = opacity
+            for k in range(3):
+                colour = WALL_COLOUR[k] * (0.55 + 0.55 * light) + 0.5 * light**24
+                over[k] = min(colour, 1.0) * opacity
+            under[:] = over + (1.0 - opacity) * under
+        row, column = divmod(pixel[start], columns)
+        behind[row // _SAMPLES, column // _SAMPLES] += share * under
+        glaze[row // _SAMPLES, column // _SAMPLES] += share * GLAZE * over
+        start = end
