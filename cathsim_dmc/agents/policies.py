@@ -175,8 +175,9 @@ def _require(policy: Policy, what: str, own: Any, given: Any) -> None:
         kind = " numbers" if isinstance(own, int) else " as (channels, height, width)"
         raise ValueError(
             f"{policy.name} {what} {own}{kind}, the task gives {given}: play it with "
-            "the device and the options that it was trained with, "
-            f"{policy.task} with {policy.task_kwargs}"
+            "the device, the observation and the options that it was trained with, "
+            f"{policy.task} with observation {policy.observation!r} and "
+            f"{policy.task_kwargs}"
         )
 
 
