@@ -115,7 +115,7 @@ def test_metrics_that_cannot_be_read_stop_a_run(tmp_path, trained, content):
 
 def test_a_policy_names_a_device_and_an_observation_of_another_size(trained):
     policy = load_policy(trained / "ppo")
-    with pytest.raises(ValueError, match="21 numbers, the task gives 2:.*reach with obs"):
+    with pytest.raises(ValueError, match="21 numbers, the task gives 2:.*h with obs"):
         policy.reset(types.SimpleNamespace(num_actions=2), None)
     for entries in ({}, {environments.VECTOR: torch.zeros(1, 3)}):
         with pytest.raises(ValueError, match="reads 20 numbers, the task gives [03]:"):
