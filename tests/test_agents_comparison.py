@@ -133,6 +133,25 @@ def test_rows_under_other_rules_are_marked(tmp_path):
     assert "ules" not in "".join(alike.markdown())
 
 
+def test_the_notes_tell_rules_apart_that_differ_late_in_a_long_value(tmp_path):
+    friction, stiff, soft = [0.02, 0.02], [1.3, 1.3], [0.7, 0.7]
+    wire = "Device(name='own', " + 80 * "-" + " EI={}, source='bench')"
+    for name, stiffness, device in (
+        ("a", soft, wire.format(1)),
+        ("b", stiff, wire.format(1)),
+        ("c", stiff, wire.format(2)),
+    ):
+        drawn = {"friction": friction, "stiffness": stiffness, "start_radius": 0.004}
+        one = result(policy=name, randomisation=drawn, device=device)
+        written(tmp_path / name, one)
+    lines = comparison.Comparison.of([tmp_path]).markdown()
+    notes = [line.partition(": ")[2] for line in lines if line.startswith("- rules")]
+    assert len(set(notes)) == 3
+    assert [f"randomisation.stiffness: {stiff}" in one for one in notes] == [0, 1, 1]
+    assert not any("friction" in one for one in notes)
+    assert ["EI=2" in one for one in notes] == [False, False, True]
+
+
 def test_an_episode_that_began_at_a_snapshot_has_other_rules():
     one = result()
     again = dataclasses.replace(one, settings={**one.settings, "started": True})

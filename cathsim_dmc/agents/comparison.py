@@ -116,9 +116,11 @@ class Comparison:
         if len(self.rules) < 2:
             return []
         notes = ["", "**Rows with different rules cannot be compared.**", ""]
-        for number, one in enumerate(self.differences(), 1):
-            told = "; ".join(f"{name}: {_told(value)}" for name, value in one.items())
-            notes.append(f"- rules {number}: {told}")
+        columns = _columns(self.differences())
+        texts = {name: _texts(values) for name, values in columns.items()}
+        for number in range(len(self.rules)):
+            told = "; ".join(f"{name}: {own[number]}" for name, own in texts.items())
+            notes.append(f"- rules {number + 1}: {told}")
         return notes
 
     def as_dict(self) -> dict[str, Any]:
@@ -211,6 +213,31 @@ def _line(cells: Iterable[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def _columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Returns the values of each entry, of mappings those of entries that differ."""
+    columns: dict[str, list[Any]] = {}
+    for name in rows[0]:
+        values = [row[name] for row in rows]
+        if all(isinstance(value, Mapping) for value in values):
+            parts = dict.fromkeys(part for value in values for part in value)
+            for part in parts:
+                own = [value.get(part, "not given") for value in values]
+                if any(one != own[0] for one in own):
+                    columns[f"{name}.{part}"] = own
+        else:
+            columns[name] = values
+    return columns
+
+
+def _texts(values: Sequence[Any]) -> list[str]:
+    """Returns the texts of an entry, whole where shortening makes two of them equal."""
+    whole = [_told(value) for value in values]
+    short = [
+        text if len(text) <= 60 else f"{text[:40]} … {text[-15:]}" for text in whole
+    ]
+    return short if len(set(short)) == len(set(whole)) else whole
+
+
 def _told(value: Any) -> str:
     """Returns the text of a rule; of seeds the ends, if they count up."""
     if value is None:
@@ -218,5 +245,4 @@ def _told(value: Any) -> str:
     whole = isinstance(value, list) and all(isinstance(one, int) for one in value)
     if whole and len(value) > 2 and value == list(range(value[0], value[-1] + 1)):
         return f"{value[0]} to {value[-1]}"
-    text = str(value)
-    return text if len(text) <= 60 else f"{text[:40]} … {text[-15:]}"
+    return str(value)
