@@ -281,7 +281,7 @@ def test_an_evaluation_reports_each_episode(cathsim):
 @pytest.mark.parametrize(
     ("kind", "end"),
     [("success", "goal reached"), ("physics_error", "physics error"),
-     ("given_up", "given up"), (None, "out of time")],
+     ("given_up", "given up or failed"), (None, "out of time")],
 )  # fmt: skip
 def test_a_report_says_how_an_episode_ended(kind, end):
     states = {name: name == kind for name in ("success", "physics_error")}

@@ -1,5 +1,6 @@
 """An objective of one's own means the same in composer and in the batch."""
 
+import dataclasses
 import importlib.util
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import twin
 
+import cathsim_dmc
 from cathsim_dmc import suite
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.config import NavigationConfig
@@ -109,6 +111,48 @@ def test_an_objective_without_relatives():
     assert step.outcome.success.all()
 
 
+@dataclasses.dataclass(frozen=True)
+class Limited(Cannulation):
+    """Fails above a load on the wall."""
+
+    limit: float = 0.01  # N
+
+    def failure(self, measurement):
+        return measurement.wall_force.mean_sum > self.limit
+
+    TERMS = {**Cannulation.TERMS, "failure": failure}
+
+
+def limited(**options):
+    task = suite.make_task("type1_bca", **options)
+    reward = {"distance": -1.0, "success": 10.0, "failure": -5.0}
+    anatomy, goal = task.scene.anatomy, task.scene.goal
+    return Navigation(task.scene, Limited.to(anatomy, goal, reward=reward), task.config)
+
+
+def test_an_objective_ends_an_episode_as_failed_in_both_paths():
+    rewards, step = assert_equal_rewards(limited())
+    over = step.wall_force.mean_sum > Limited.limit
+    assert over.any() and min(rewards) < -5
+    assert (step.outcome.failed == over).all() and not step.outcome.success.any()
+    environment = suite.environment(limited())
+    episode = cathsim_dmc.record(environment, "push", seed=0, max_steps=30)
+    assert episode.termination == "failed" and not episode.success
+    assert episode.meta["discount"] == 0.0
+    loads = np.array(episode.meta["wall_force_mean_sum"])
+    assert loads[-1] > Limited.limit and (loads[:-1] <= Limited.limit).all()
+
+
+def test_a_failure_outweighs_the_success_of_a_cannulation():
+    objective = dataclasses.replace(limited().objective, limit=-1.0, goal_radius=0.5)
+    task = limited()
+    batch = BatchSimulation(Navigation(task.scene, objective, task.config), 1)
+    batch.reset()
+    step = batch.step(pushing(0)[0][:1])
+    assert step.terminated.all() and not step.outcome.success.any()
+    assert "success" in step.outcome.terms and step.outcome.terms["success"] == 0
+
+
 def test_what_the_batch_cannot_honour_is_refused():
     class Shaped(Navigation):
         def get_reward(self, physics):
@@ -165,6 +209,8 @@ def judged():
         ({"reward": np.zeros(7)}, r"reward of shape \(7,\).*\(2,\)"),
         ({"terms": {"near": np.zeros((2, 1))}}, r"near of shape \(2, 1\).*\(2,\)"),
         ({"success": np.bool_(True)}, "success"),
+        ({"failed": True}, "failed True"),
+        ({"failed": NUMBERS}, "failed array"),
         ({"success": NUMBERS}, "success"),
         ({"reward": None}, "reward None"),
         ({"reward": [0.0, 0.0]}, "reward"),

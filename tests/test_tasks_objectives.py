@@ -16,7 +16,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.randomisation import start_displacement
-from cathsim_dmc.tasks import objectives
+from cathsim_dmc.tasks import judging, objectives
 from cathsim_dmc.tasks.objectives import PUBLISHED_REWARD, Cannulation
 
 PATH_REWARD = {"path": -1.0, "success": 10.0}
@@ -327,6 +327,6 @@ def test_a_simulation_that_has_diverged_does_not_keep_others_from_beginning():
 
     head = np.array([[3.0, 4.0, 0.0], [np.nan, 0.0, 0.0]])
     groups = [(Far(), slice(None))]
-    assert objectives.path_distances(groups, head, np.array([0]))[0] == 5.0
+    assert judging.path_distances(groups, head, np.array([0]))[0] == 5.0
     with pytest.raises(ValueError, match="finite"):
-        objectives.path_distances(groups, head, np.array([1]))
+        judging.path_distances(groups, head, np.array([1]))

@@ -37,7 +37,7 @@ class EpisodeOutcome:
 
     @property
     def given_up(self) -> bool:
-        """Whether it ended because the task gave up, see its option `give_up`."""
+        """Whether the task ended it: by its option `give_up`, or as failed."""
         return self.terminated and not (self.success or self.physics_error)
 
 

@@ -82,7 +82,7 @@ def print_episodes(result: EvaluationResult) -> None:
 def _outcome(
     seed: int, conditions: Mapping[str, Any], episode: EpisodeOutcome
 ) -> dict[str, str]:
-    missed = "given up" if episode.given_up else "out of time"
+    missed = "given up or failed" if episode.given_up else "out of time"
     end = "goal reached" if episode.success else missed
     forces = episode.forces
     largest = forces.largest_sum

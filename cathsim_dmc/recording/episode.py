@@ -17,7 +17,7 @@ from cathsim_dmc.files import atomic_path, read_arrays, refused, require_source
 FORMAT = "cathsim-episode"
 FORMAT_VERSION = 1
 SUFFIX = ".npz"
-TERMINATIONS = ("success", "truncated", "physics_error", "given_up")
+TERMINATIONS = ("success", "truncated", "physics_error", "given_up", "failed")
 # 5F diagnostic catheter, 1.67 mm outer diameter; used when the record has no radii.
 CATHETER_RADIUS = 0.835e-3
 # Leading axis of every array: "state" has T+1 rows, "step" has T, "contact" has K.

@@ -75,7 +75,8 @@ class CathSimEnv(gymnasium.Env):
 
     `reset(seed=s)` starts the same episode as the suite's `random=s`. The observation
     is always a dictionary. `terminated` is success, a physics error
-    (`info["physics_error"]`) or `give_up`; `truncated` is the time limit.
+    (`info["physics_error"]`), `give_up`, or a failure by the objective; `truncated` is
+    the time limit.
 
     Attributes:
         environment: The composer environment.

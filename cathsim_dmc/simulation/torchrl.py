@@ -23,8 +23,9 @@ class BatchedEnv(EnvBase):
     """N simulations of a task of the suite; batch size [N], on one device.
 
     Keys: the task's observations (float32, images uint8), "action" (N, A), "reward",
-    "terminated" (success, physics error or `give_up`), "truncated", and under "info"
-    the figures of `tasks.step.Step.info` (float32 or bool), all (N, 1).
+    "terminated" (success, physics error, `give_up`, or a failure by the objective),
+    "truncated", and under "info" the figures of `tasks.step.Step.info` (float32 or
+    bool), all (N, 1).
 
     Attributes:
         simulation: The simulations underneath.

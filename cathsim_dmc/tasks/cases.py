@@ -21,7 +21,8 @@ from cathsim_dmc.physics.chain_fields import write_still
 from cathsim_dmc.physics.randomisation import Randomisation
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.objectives import Cannulation, Groups, Objective, Shiftable
+from cathsim_dmc.tasks.judging import Groups
+from cathsim_dmc.tasks.objectives import Cannulation, Objective, Shiftable
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.start import StartPosture
 

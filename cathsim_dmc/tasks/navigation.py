@@ -281,7 +281,7 @@ class Navigation(composer.Task, NotCopied):
         return float(self._current().outcome.reward[0])
 
     def get_discount(self, physics) -> float:
-        """0 at success, physics error or `give_up`; 1 otherwise, also at time-out."""
+        """0 where the task ends the episode; 1 otherwise, also at time-out."""
         del physics
         return 0.0 if self._current().terminated[0] else 1.0
 
@@ -347,7 +347,9 @@ class Navigation(composer.Task, NotCopied):
         if step.errors[0] is not None:
             return "physics_error"
         if step.terminated[0]:
-            return "success" if step.outcome.success[0] else "given_up"
+            if step.outcome.success[0]:
+                return "success"
+            return "failed" if np.any(step.outcome.failed) else "given_up"
         return "truncated" if step.truncated[0] else None
 
     @property

@@ -28,12 +28,8 @@ from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.conditions import DrawnConditions
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import Exposure, ImageSensors
-from cathsim_dmc.tasks.objectives import (
-    Measurement,
-    judge,
-    path_distances,
-    straight,
-)
+from cathsim_dmc.tasks.judging import judge, path_distances
+from cathsim_dmc.tasks.objectives import Measurement, straight
 from cathsim_dmc.tasks.observation_kind import Frame, Observation
 from cathsim_dmc.tasks.progress import Progress
 from cathsim_dmc.tasks.restorable import Restorable, describe
@@ -307,9 +303,7 @@ class Rollout(Restorable):
         )
         outcome = judge(self.objectives, measured, failed)
         observation = self._observe(rows, begins)
-        ended = outcome.success | self.progress.given_up
-        if failed is not None:
-            ended |= failed
+        ended = outcome.success | outcome.failed | self.progress.given_up
         ended &= self.steps > 0
         return Step(
             observation=observation,

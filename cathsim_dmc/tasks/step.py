@@ -32,7 +32,8 @@ class Step(NamedTuple):
             returns copies of both.
         outcome: reward, success and reward terms, arrays (N,); the reward is 0 and
             there is no success where the physics failed.
-        terminated: (N,) bool, success, a physics error, or given up (option `give_up`).
+        terminated: (N,) bool, success, a physics error, given up (option `give_up`), or
+            failed by the objective (`Outcome.failed`).
         truncated: (N,) bool, out of time.
         errors: N reasons, None where the physics went well.
         readings: state of the devices.
