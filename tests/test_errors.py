@@ -275,6 +275,7 @@ def test_a_spec_has_bounds_for_each_action(environment):
     [
         ("outer_radius", 0.889 / 2, "outer_radius of device 'own'.*at most 0.01 m"),
         ("linear_density", 4.0, "linear_density of device 'own'.*1e-3 kg/m"),
+        ("tip_length", 2.0, "tip_length of device 'own' is 2.0.*at most 1 m"),
     ],
 )
 def test_a_device_in_other_units_is_refused(field, value, words):

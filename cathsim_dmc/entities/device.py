@@ -10,6 +10,7 @@ from cathsim_dmc.imaging import materials
 from cathsim_dmc.imaging.device import Shadow
 
 _MOST_LINKS = 200
+_LONGEST_TIP = 1.0  # m; a longer one is taken for one given in millimetres
 THICKEST = 10e-3  # m, outer radius; sheaths of aortic valves have half of it
 DENSEST = 22.6e3  # kg/m³, osmium
 # Frequency at which a damper has the loss factor of the material, Hz; that of the first
@@ -115,8 +116,9 @@ class Device:
     def __post_init__(self):
         bounds.instance("name", self.name, str)
         of_device = f"of device {self.name!r}"
-        for name in ("linear_density", "tip_length"):
-            bounds.number(f"{name} {of_device}", getattr(self, name), positive=True)
+        density, tip = f"linear_density {of_device}", f"tip_length {of_device}"
+        bounds.number(density, self.linear_density, positive=True)
+        bounds.number(tip, self.tip_length, 0.0, _LONGEST_TIP, "m", positive=True)
         radius = f"outer_radius {of_device}"
         bounds.number(radius, self.outer_radius, 0.0, THICKEST, "m", positive=True)
         bounds.whole(f"tip_links {of_device}", self.tip_links, 1, _MOST_LINKS)
