@@ -49,6 +49,26 @@ def test_a_named_policy_plays_the_same_in_composer(name):
     assert batched.episodes[0].reward != batched.episodes[1].reward
 
 
+def test_a_policy_begins_anew_after_a_restored_snapshot():
+    """Another episode in between leaves nothing in its memory."""
+    env = suite.load("cathsim", TASK, {"random": 0})
+    env.reset()
+    for _ in range(20):
+        env.step(np.eye(21)[-1])
+    snapshot, found = env.snapshot(), []
+    for _ in range(2):
+        act = in_environment(make_policy("expert"), env)
+        for _ in range(2):
+            timestep, actions = env.restore(snapshot), []
+            for _ in range(8):
+                actions.append(act(timestep))
+                timestep = env.step(actions[-1])
+            found.append(actions)
+            for _ in range(3):
+                timestep = env.step(act(timestep))
+    assert all(np.array_equal(found[0], other) for other in found[1:])
+
+
 class Backwards(Policy):
     """Pulls, and counts how often it was told of a new episode."""
 

@@ -12,6 +12,7 @@ from test_recording_rerun_log import Recording
 from cathsim_dmc import suite
 from cathsim_dmc.analysis.force_statistics import recorded_forces
 from cathsim_dmc.anatomy.arch.arch import ARCHES, build_arch
+from cathsim_dmc.pictures import record
 from cathsim_dmc.recording import recorder
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
@@ -40,6 +41,47 @@ def bend_and_push(timestep):
 def episode(env):
     made = EpisodeRecorder(env, "navigate", {"goal": "bca"})
     return made.record_episode(bend_and_push, seed=2, max_steps=STEPS)
+
+
+def test_a_record_from_a_snapshot_is_the_rest_of_the_episode(env, episode, tmp_path):
+    env.random_state.seed(2)
+    timestep = env.reset()
+    for _ in range(10):
+        timestep = env.step(bend_and_push(timestep))
+    start = env.snapshot()
+    path, given = tmp_path / "rest.rrd", {"start": start, "max_steps": STEPS - 10}
+    rest = record(env, lambda seen: bend_and_push(None), path, seed=9, **given)
+    assert rest.seed is None and rest.meta["started"] and path.exists()
+    for name in ("time", "qpos", "head"):
+        assert np.array_equal(getattr(rest, name), getattr(episode, name)[10:])
+    assert np.array_equal(rest.reward, episode.reward[10:])
+    assert np.array_equal(rest.push_force, episode.push_force[10:])
+    assert "started" not in episode.meta
+    with pytest.raises(ValueError, match="seed is 2, but start has the random state"):
+        EpisodeRecorder(env).record_episode(bend_and_push, 2, start=start)
+
+
+def test_a_snapshot_of_an_ended_episode_is_not_recorded():
+    env = suite.load("cathsim", "simple1_bca", {"max_steps": 1})
+    env.reset()
+    env.step(np.zeros(21))
+    with pytest.raises(ValueError, match=r"start has ended \(truncated\)"):
+        record(env, "push", start=env.snapshot())
+
+
+def test_the_command_records_from_a_snapshot(tmp_path, cathsim):
+    env = suite.load("cathsim", "simple1_bca", {"max_steps": 8})
+    env.reset()
+    for _ in range(3):
+        env.step(np.zeros(21))
+    env.snapshot().save(tmp_path / "start.npz")
+    code, out, err = cathsim(
+        *("record", "expert", "--task", "simple1_bca", "--max-steps", 8),
+        *("--start", tmp_path / "start.npz", "--out", tmp_path / "rest.npz"),
+    )
+    assert code == 0 and "5 steps, truncated" in out, err
+    rest = Episode.load(tmp_path / "rest.npz")
+    assert rest.time[0] == pytest.approx(0.12) and rest.seed is None
 
 
 def test_contacts_make_up_the_forces_of_the_task(env, episode):

@@ -192,6 +192,7 @@ def record(
     gif: Annotated[Path | None, conf.arg(aliases=("--mp4", "--film"))] = None,
     task: PolicysTask = None,
     seed: int = EVALUATION_SEED,
+    start: Path | None = None,
     fluoroscopy: bool = True,
     modules: Modules = (),
     *,
@@ -207,7 +208,9 @@ def record(
             film as `gif`.
         gif: Path of a film for slides, .gif, .webp or, with the extra `video`, .mp4;
             needs no OpenGL.
-        seed: Seed of the episode.
+        seed: Seed of the episode; with --start of the policy alone.
+        start: File of a snapshot (`snapshot().save`) of a running episode, from which
+            the policy goes on.
         fluoroscopy: Whether an .rrd file has X-ray images.
         options: Options of the task, over those that the policy was trained with.
     """
@@ -231,7 +234,8 @@ def record(
     # Checked first: an episode that cannot be written would be lost.
     for path in targets:
         files.require_file(path, later=True)
-    episode, env = _played(player, task, task_kwargs, seed)
+    begin = None if start is None else Snapshot.load(start)
+    episode, env = _played(player, task, task_kwargs, seed, begin)
     for path in targets:
         files.require_file(path, make=True)
     with told_of_replaced(targets):
@@ -252,7 +256,11 @@ def record(
 
 
 def _played(
-    player: Any, task: str, task_kwargs: Mapping[str, Any], seed: int
+    player: Any,
+    task: str,
+    task_kwargs: Mapping[str, Any],
+    seed: int,
+    start: Snapshot | None = None,
 ) -> tuple[Episode, Any]:
     """Plays an episode of a policy; returns it and its environment."""
     require_actions(player, task, task_kwargs)
@@ -260,8 +268,9 @@ def _played(
     if player.observation is not None:
         options["observation"] = player.observation
     env = suite.load(suite.DOMAIN, task, {**options, "random": seed})
-    recorder = EpisodeRecorder(env, task, options)
-    return recorder.record_episode(in_environment(player, env), seed), env
+    recorder, act = EpisodeRecorder(env, task, options), in_environment(player, env)
+    drawn = seed if start is None else None
+    return recorder.record_episode(act, drawn, start=start), env
 
 
 def film_checkpoint(checkpoint: Path, folder: Path, suffix: str) -> Path:

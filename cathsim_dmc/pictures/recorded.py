@@ -16,6 +16,7 @@ from cathsim_dmc.pictures.moment import on_screen
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
 from cathsim_dmc.recording.records import MESH_EVERY, VesselRecord, XRayRecord
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 # A name of `policies.POLICIES`, a policy, or a function from the observation (a
 # dictionary of arrays) to the action (A,).
@@ -33,6 +34,7 @@ def record(
     seed: int | None = None,
     max_steps: int | None = None,
     task_name: str | None = None,
+    start: Snapshot | None = None,
 ) -> Episode:
     """Play one episode and keep it.
 
@@ -42,9 +44,12 @@ def record(
             observation to the action.
         path: File to write: `.rrd` (Rerun), `.npz` (arrays), `.gif`, `.webp` or
             `.mp4` (moving picture); None writes none.
-        seed: Seed of the episode; None continues the environment's random state.
+        seed: Seed of the episode; None continues the environment's random state. With
+            `start` it seeds the policy alone.
         max_steps: Number of control steps after which the episode is cut off.
         task_name: Name of the task in the record; that of the environment otherwise.
+        start: Snapshot of a running episode, which the policy goes on with; the record
+            begins there. None for a new episode.
 
     Returns:
         The episode.
@@ -52,14 +57,16 @@ def record(
     Raises:
         TypeError: `env` is no environment of this package, or `policy` no policy.
         ValueError: the policy's name or the file's kind does not exist, or the policy
-            returns no action of the environment.
+            returns no action of the environment, or `start` is of another task or of
+            an episode that has ended.
         OSError: the file's folder does not exist or is read-only.
         ImportError: an MP4 is asked for without the extra `video`.
     """
     if path is not None:
         _checked(path)
     recorder = EpisodeRecorder(env, task_name or navigation_of(env).name)
-    episode = recorder.record_episode(as_function(policy, env, seed), seed, max_steps)
+    act, drawn = as_function(policy, env, seed), seed if start is None else None
+    episode = recorder.record_episode(act, drawn, max_steps, start)
     if path is not None:
         write(episode, env, path)
     return episode

@@ -96,12 +96,18 @@ class Policy:
 def in_environment(
     policy: Policy, environment: composer.Environment
 ) -> Callable[[dm_env.TimeStep], np.ndarray]:
-    """Returns a function from a composer environment's time step to an action (A,)."""
-    view = View(environment)
+    """Returns a function from a composer environment's time step to an action (A,).
+
+    The policy is reset where an episode begins, and after a restored snapshot.
+    """
+    view, known = View(environment), None
 
     def act(timestep: dm_env.TimeStep) -> np.ndarray:
-        if timestep.first():
+        nonlocal known
+        restored = getattr(environment, "restored", 0)  # of composer's own: none
+        if timestep.first() or known != restored:
             policy.reset(view, np.ones(1, dtype=bool))
+            known = restored
         # Rounded to single precision, as TorchRL environments do.
         action = np.asarray(policy.act(timestep.observation), dtype=np.float32)[0]
         return action.astype(np.float64)

@@ -23,6 +23,7 @@ from cathsim_dmc.recording.records import (
     x_ray_meta,
 )
 from cathsim_dmc.simulation.episodes import play_alone
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 Policy = Callable[[Any], np.ndarray]
 _TERM = "reward_"  # before the names of reward terms
@@ -87,7 +88,11 @@ class EpisodeRecorder:
         self._task_kwargs = bounds.options("task_kwargs", task_kwargs)
 
     def record_episode(
-        self, policy: Policy, seed: int | None = None, max_steps: int | None = None
+        self,
+        policy: Policy,
+        seed: int | None = None,
+        max_steps: int | None = None,
+        start: Snapshot | None = None,
     ) -> Episode:
         """Reset the environment, run one episode and return the record.
 
@@ -100,25 +105,40 @@ class EpisodeRecorder:
                 random state continues, and the episode cannot be repeated.
             max_steps: Ends the episode as truncated; by default only the environment
                 ends it.
+            start: Snapshot of a running episode, of which the record holds what
+                follows, in place of a reset; it has a random state of its own.
 
         Raises:
             ValueError: if the policy returns an action of a wrong shape or with
-                values that are not finite, or ``max_steps`` is not positive.
+                values that are not finite, ``max_steps`` is not positive, or
+                ``start`` does not fit or comes with a seed.
         """
+        if start is not None and seed is not None:
+            raise ValueError(
+                f"seed is {bounds.shown(seed)}, but start has the random state of its "
+                "episode; leave the seed out"
+            )
         if max_steps is not None:
             bounds.whole("max_steps", max_steps, 1)
         if seed is not None:
             self._env.random_state.seed(bounds.seed("seed", seed))
         choose = functools.partial(self._action, policy)
-        turns = play_alone(self._env, choose)
+        turns = play_alone(self._env, choose, start)
         next(turns)
         rows = _Rows(list)
         rows.add(**self._state())
         steps, end = 0, {"termination": None, "discount": 1.0}
+        if start is not None:
+            if self._task.termination is not None:
+                raise ValueError(
+                    f"the episode of start has ended ({self._task.termination}); give "
+                    "a snapshot from before its end"
+                )
+            end |= {"started": True}
         try:
             for action, timestep in itertools.islice(turns, max_steps):
                 termination = self._task.termination
-                end = {"termination": termination, "discount": timestep.discount}
+                end |= {"termination": termination, "discount": timestep.discount}
                 # The environment itself ends an episode at diverged physics, discount
                 # 0, or composer's time limit, discount 1; the task knows of neither.
                 alone = timestep.last() and termination in (None, "truncated")

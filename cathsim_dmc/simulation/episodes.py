@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import dm_env
 import numpy as np
-from dm_control import composer
 
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.tasks.step import Step
 
 
@@ -62,18 +62,21 @@ def play(
 
 
 def play_alone(
-    environment: composer.Environment, choose: Callable[[dm_env.TimeStep], np.ndarray]
+    environment: Any,
+    choose: Callable[[dm_env.TimeStep], np.ndarray],
+    start: Snapshot | None = None,
 ) -> Iterator[tuple[np.ndarray | None, dm_env.TimeStep]]:
     """Play an episode of a composer environment.
 
     Args:
         choose: Function from the present time step to the action. It may raise
             StopIteration to end the episode.
+        start: Snapshot of a running episode, which goes on; None for a reset.
 
     Yields:
         The start, with None, then the action and time step of every control step.
     """
-    timestep = environment.reset()
+    timestep = environment.reset() if start is None else environment.restore(start)
     yield None, timestep
     while not timestep.last():
         try:

@@ -14,7 +14,12 @@ class Environment(composer.Environment, NotCopied):
 
     Composer compiles at construction and once more at the first reset. The second
     compilation is skipped if no hook changes the MJCF model.
+
+    Attributes:
+        restored: Number of restored snapshots; a policy begins anew after each.
     """
+
+    restored = 0
 
     def reset(self):
         """Starts an episode.
@@ -115,6 +120,7 @@ class Environment(composer.Environment, NotCopied):
         if not task.rollout.begun or task.rollout.half_done.any():
             self.reset()
         task.restore(physics, snapshot, self._random_state)
+        self.restored += 1
         self._observation_updater.reset(physics, self._random_state)
         observation = self._observation_updater.get_observation()
         if not task.rollout.steps[0]:
