@@ -16,6 +16,7 @@ import types
 from pathlib import Path
 
 import pytest
+import tyro
 from conftest import TASKS
 from recording_samples import make_episode
 
@@ -294,6 +295,23 @@ def test_a_report_says_how_an_episode_ended(kind, end):
     assert (row["seed"], row["arch"], row["device"]) == ("7", "3", "wire")
     assert (row["end"], row["time, s"], row["path ratio"]) == (end, "2.0", "1.50")
     assert (row["mean force, mN"], row["largest sum, N"]) == ("100", "0.75")
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        ("tracking,force", ["tracking", "force"]),
+        ("tracking, force", ["tracking", "force"]),
+        ('["tracking","force"]', ["tracking", "force"]),
+        ("tracking", "tracking"),
+    ],
+)
+def test_the_command_line_takes_several_names_as_a_list(text, meant):
+    kind = task_options.task_kind(())
+    given = tyro.cli(kind, args=["--observation", text, "--device", "a,b"]).given
+    assert given == {"observation": meant, "device": "a,b"}
+    devices = tyro.cli(kind, args=["--devices", "wire_035_glide,berenstein_5f"]).given
+    assert devices == {"devices": ["wire_035_glide", "berenstein_5f"]}
 
 
 def test_an_evaluation_keeps_the_options_that_a_policy_was_trained_with(monkeypatch):

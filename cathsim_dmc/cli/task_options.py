@@ -14,6 +14,7 @@ from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import Cannulation
 
 _OWN = " Text or JSON; by default, and with null, as the task or policy has it."
+_LISTS = {"observation", "devices"}  # options that take several names, as a,b
 _CONSTANTS = {"True": "true", "False": "false", "None": "null"}  # Python to JSON
 
 
@@ -66,6 +67,9 @@ class TaskOptions:
             given["goal"] = several
         if self.access is not None and "," in self.access:
             given["access"] = [part.strip() or None for part in self.access.split(",")]
+        for name in _LISTS & given.keys():
+            if isinstance(given[name], str) and "," in given[name]:
+                given[name] = [part.strip() for part in given[name].split(",")]
         for text in given.pop("option"):
             name, sign, value = text.partition("=")
             if not name or not sign or name in given:
@@ -117,13 +121,17 @@ def task_kind(omitted: Iterable[str] = ("observation",)) -> type[TaskOptions]:
     helps |= {name: _helps(Cannulation.to)[name] for name in ("reward", "goal_radius")}
     # Effects are objects, which no text can name.
     fields: list[tuple[str, Any, Any]] = [
-        (name, Annotated[Any, _VALUE, conf.arg(help=text + _OWN)], None)
+        (name, Annotated[Any, _VALUE, conf.arg(help=_help(name, text))], None)
         for name, text in helps.items()
         if name not in {*omitted, "effects"}
     ]
     return dataclasses.make_dataclass(
         "TaskOptions", fields, bases=(TaskOptions,), kw_only=True, frozen=True
     )
+
+
+def _help(name: str, text: str) -> str:
+    return f"{text}{' Several as a,b.' if name in _LISTS else ''}{_OWN}"
 
 
 def field_helps(kind: type) -> dict[str, str]:
