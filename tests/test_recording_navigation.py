@@ -1,5 +1,7 @@
 """The recorder on the navigation task."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -12,8 +14,9 @@ from test_recording_rerun_log import Recording
 from cathsim_dmc import suite
 from cathsim_dmc.analysis.force_statistics import recorded_forces
 from cathsim_dmc.anatomy.arch.arch import ARCHES, build_arch
+from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.pictures import record
-from cathsim_dmc.recording import recorder
+from cathsim_dmc.recording import dataset, recorder
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.recording.rerun_log import write_rrd
@@ -82,6 +85,23 @@ def test_the_command_records_from_a_snapshot(tmp_path, cathsim):
     assert code == 0 and "5 steps, truncated" in out, err
     rest = Episode.load(tmp_path / "rest.npz")
     assert rest.time[0] == pytest.approx(0.12) and rest.seed is None
+
+
+def test_a_record_names_the_options_that_are_objects(episode, tmp_path):
+    """Without them the task is another one, which repeats nothing."""
+    assert set(episode.meta["objects"]) == {"anatomy"}
+    own = dataclasses.replace(DEVICES["steerable_4f"], name="own")
+    env = suite.load("cathsim", "simple1_bca", {"device": own, "max_steps": 9})
+    bent = record(env, lambda seen: bend_and_push(None), seed=2, max_steps=2)
+    assert bent.meta["task_kwargs"] == {"max_steps": 9}
+    assert list(bent.meta["objects"]) == ["device"]
+    assert "name='own'" in bent.meta["objects"]["device"]
+    bent.save(tmp_path / "own.npz")
+    options = {"task": "simple1_bca", "max_steps": 9}
+    with pytest.raises(dataset.DatasetError, match="without device, which no file"):
+        next(iter(dataset.repeat_episodes(tmp_path, "tracking", **options)))
+    plain = suite.load("cathsim", "simple1_bca", {"max_steps": 9})
+    assert "objects" not in record(plain, "push", seed=2, max_steps=1).meta
 
 
 def test_contacts_make_up_the_forces_of_the_task(env, episode):

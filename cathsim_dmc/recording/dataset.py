@@ -376,9 +376,10 @@ def _repeated(
 
 def _difference(episode: Episode, step: int, reward: float, moved: float) -> str:
     """Returns the text on a step that does not repeat; `moved` in m or rad."""
+    objects = ", ".join(episode.meta.get("objects", ())) or "effects and other objects"
     return (
         f"episode with seed {episode.seed} does not repeat: reward {reward} instead of "
         f"{episode.reward[step]}, positions {moved:.2g} apart, at step {step}; it was "
         f"recorded with {episode.meta.get('versions')} and the options "
-        f"{episode.meta.get('task_kwargs')}, without effects and other objects"
+        f"{episode.meta.get('task_kwargs')}, without {objects}, which no file holds"
     )

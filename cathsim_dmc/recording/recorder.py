@@ -72,7 +72,8 @@ class EpisodeRecorder:
         task_name: Registered name to write into episodes; the class name of the task
             otherwise.
         task_kwargs: Options of the task, for ``meta``; None for those that
-            `suite.make_task` was given, without objects such as effects.
+            `suite.make_task` was given. Objects among these, such as an own device,
+            are kept as texts, in ``meta["objects"]``: without them the task is another.
     """
 
     def __init__(
@@ -83,8 +84,10 @@ class EpisodeRecorder:
     ) -> None:
         self._env, self._task = env, navigation_of(env)
         self._task_name = task_name or type(env.task).__name__
+        plain, objects = json_options.split(self._task.options)
+        self._objects = json_options.as_texts(objects)
         if task_kwargs is None:
-            task_kwargs, _ = json_options.split(self._task.options)
+            task_kwargs = plain
         self._task_kwargs = bounds.options("task_kwargs", task_kwargs)
 
     def record_episode(
@@ -220,6 +223,7 @@ class EpisodeRecorder:
             **end,
             "termination": termination,
             "task_kwargs": self._task_kwargs,
+            **({"objects": self._objects} if self._objects else {}),
             "versions": {
                 "python": platform.python_version(),
                 "cathsim-dmc": __version__,
