@@ -596,6 +596,12 @@ def test_tasks_and_anatomies_say_what_they_are(pushed):
     assert len(repr(anatomy)) < 300
     for text in ("simple1", "bca, lcca", "inlet in aorta"):
         assert text in repr(anatomy)
+    saved = env.snapshot()
+    done = f"of 3 simulations after {3 * saved.arrays['rollout.steps'].tolist()} "
+    for text in (done, "goal 'bca'", "'steerable_5f'", "['simple1 "):
+        assert text in repr(saved.repeat(3)) and len(repr(saved.repeat(3))) < 400
+    assert len(repr(saved.repeat(1000))) < 400
+    assert repr(dataclasses.replace(saved, task={})).startswith("<Snapshot of 1 sim")
 
 
 def test_a_figure_shows_forces_along_themselves_and_tells_them(pushed):

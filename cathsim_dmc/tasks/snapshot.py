@@ -57,6 +57,16 @@ class Snapshot:
     arrays: Arrays
     versions: Mapping[str, str] = dataclasses.field(default_factory=lambda: versions())
 
+    def __repr__(self) -> str:
+        """Number of simulations, control steps done, goal, devices and anatomies."""
+        steps = np.ravel(self.arrays.get("rollout.steps", ())).tolist()
+        told = {name: self.task.get(name) for name in ("goal", "devices")}
+        told["anatomies"] = [*self.task.get("anatomies", ())]
+        text = ", ".join(f"{name} {bounds.shown(one)}" for name, one in told.items())
+        done = f"after {bounds.shown(steps)} control steps"
+        plural = "s" if len(self) > 1 else ""
+        return f"<Snapshot of {len(self)} simulation{plural} {done}, {text}>"
+
     def __len__(self) -> int:
         """Number K of simulations."""
         return len(next(iter(self.arrays.values())))
