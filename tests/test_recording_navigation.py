@@ -62,6 +62,8 @@ def test_a_record_from_a_snapshot_is_the_rest_of_the_episode(env, episode, tmp_p
     assert "started" not in episode.meta
     with pytest.raises(ValueError, match="seed is 2, but start has the random state"):
         EpisodeRecorder(env).record_episode(bend_and_push, 2, start=start)
+    with pytest.raises(ValueError, match=r"snapshot is 'a.npz'; .*Snapshot\.load"):
+        record(env, bend_and_push, start="a.npz")
 
 
 def test_a_snapshot_of_an_ended_episode_is_not_recorded():

@@ -174,6 +174,11 @@ class Restorable:
             ValueError: if the snapshot is of another task.
             RuntimeError, NotImplementedError: as of `snapshot`.
         """
+        if not isinstance(snapshot, Snapshot):
+            kind = (
+                "a Snapshot; read a file by Snapshot.load of cathsim_dmc.tasks.snapshot"
+            )
+            bounds.refuse("the snapshot", snapshot, kind)
         snapshot = self._drawn.completed(snapshot)
         snapshot.require(self.snapshot(indices))
         numbers = snapshot.arrays["rollout._case_of"]
