@@ -376,6 +376,8 @@ def test_small_bodies_in_the_lumen_are_dropped_though_wide(where):
     off = {"inside": 0.0, "in the wall": 12e-3, "outside": 30e-3}[where]
     points = np.concatenate([vertices, ball.vertices + (off, 0.0, 0.2)])
     both = np.concatenate([faces, ball.faces + len(vertices)])
+    wide = topology.widths(points, both, topology.parts(both))
+    assert wide[1] == pytest.approx(np.linalg.norm(ball.extents))
     if where == "outside":
         with pytest.raises(ValueError, match="2 separate parts"):
             mend("tube", points, both)
@@ -388,9 +390,10 @@ def test_small_bodies_in_the_lumen_are_dropped_though_wide(where):
 def test_corners_that_hardly_differ_are_one(y_mesh):
     vertices, faces = 1e-3 * y_mesh[0], y_mesh[1]
     soup = vertices[faces].reshape(-1, 3)
+    soup = np.concatenate([soup, soup[2::-1]])  # a triangle given twice, once turned
     soup = soup + np.random.default_rng(0).normal(0.0, 1e-8, soup.shape)
     surface, notes, _ = mend("soup", soup, np.arange(len(soup)).reshape(-1, 3))
-    assert not any("hole" in note or "open" in note for note in notes)
+    assert not any(each in note for note in notes for each in ("hole", "open", "share"))
     clean = mend("y", vertices, faces)[0]
     assert surface.volume == pytest.approx(clean.volume, rel=1e-4)
     # A surface whose corners are apart stays as it is.

@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 import cathsim_dmc.gym  # noqa: E402
 from cathsim_dmc import suite  # noqa: E402
 from cathsim_dmc.simulation.gymnasium import CathSimEnv, CathSimVectorEnv  # noqa: E402
+from cathsim_dmc.tasks import physics_errors  # noqa: E402
 
 TASK = "cathsim/simple1_bca-v0"
 EXAMPLE = Path(__file__).parents[1] / "examples" / "sb3_ppo.py"
@@ -85,7 +86,11 @@ def test_time_truncates_and_does_not_terminate():
         env.step(env.action_space.sample())
 
 
-def test_an_episode_that_had_ended_waits_for_a_reset_when_it_is_restored():
+@pytest.mark.parametrize("end", [2, 3], ids=["terminated", "truncated"])
+def test_an_episode_that_had_ended_waits_for_a_reset_when_it_is_restored(
+    monkeypatch, end
+):
+    """By an error of the physics, or by the time limit."""
     single = CathSimEnv("simple1_bca", max_steps=2)
     many = CathSimVectorEnv(
         2, "simple1_bca", num_threads=1, max_steps=2, autoreset_mode="Disabled"
@@ -94,12 +99,19 @@ def test_an_episode_that_had_ended_waits_for_a_reset_when_it_is_restored():
         env.reset(seed=1)
         env.step(env.action_space.sample())
         running = env.snapshot()
-        assert np.all(env.step(env.action_space.sample())[3])
+        with monkeypatch.context() as patch:
+            if end == 2:
+                patch.setattr(physics_errors, "MAX_FORCE", -1.0)
+            assert np.all(env.step(env.action_space.sample())[end])
         ended = env.snapshot()
         env.reset()
         env.restore(ended)
         with pytest.raises(gymnasium.error.ResetNeeded):
             env.step(env.action_space.sample())
+        if env is many:  # one that is left waits on
+            env.reset(options={"reset_mask": np.array([True, False])})
+            with pytest.raises(gymnasium.error.ResetNeeded, match=r"of \[1\] have"):
+                env.step(env.action_space.sample())
         env.restore(running)
         assert np.all(env.step(env.action_space.sample())[3])
 
@@ -172,7 +184,11 @@ def assert_alike(found, expected, path=""):
         np.testing.assert_array_equal(found, expected, err_msg=path, strict=True)
 
 
-LIVELY = {"randomisation": True, "observation": ["internal", "force"], "max_steps": 4}
+LIVELY = {
+    "randomisation": {"friction": (0.5, 1.5), "delay": (0, 2), "tracking_noise": 1e-3},
+    "observation": ["internal", "force", "tracking"],
+    "max_steps": 4,
+}
 
 
 @pytest.mark.parametrize("mode", list(gymnasium.vector.AutoresetMode))
@@ -243,9 +259,13 @@ def test_wrong_arguments_of_a_vector_are_refused(options, word):
 
 
 def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
-    many = CathSimVectorEnv(
-        2, "simple1_bca", "rgb_array", fluoroscopy={"size": 32, "biplane": "LATERAL"}
-    )
+    # Two anatomies, which breathe in different phases.
+    options = {
+        "fluoroscopy": {"size": 32, "biplane": "LATERAL"},
+        "vessel": {"motion": {"breath_phase": (0, 1)}},
+        "numbers": [10, 11],
+    }
+    many = CathSimVectorEnv(2, "arch_any", "rgb_array", **options)
     with pytest.raises(RuntimeError, match="reset"):
         many.step(many.action_space.sample())
     with pytest.raises(gymnasium.error.ResetNeeded):
@@ -258,10 +278,13 @@ def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
             many.reset(options={"reset_mask": mask})
     first = many.reset(seed=1)[0]["position"]
     assert not np.array_equal(first, many.reset()[0]["position"])
-    view = {"size": 32, "biplane": "LATERAL"}
-    one = CathSimEnv("simple1_bca", "rgb_array", fluoroscopy=view)
+    one = CathSimEnv("arch_any", "rgb_array", **options)
     many.reset(seed=4)
     one.reset(seed=5)
+    assert len({each.anatomy for each in many.conditions}) == 2
+    for _ in range(15):  # until the motion has its full amplitude
+        many.step(np.zeros_like(many.action_space.low))
+        one.step(np.zeros_like(one.action_space.low))
     shown = many.render()
     assert len(shown) == 2 and shown[0].shape == (32, 64, 3)
     np.testing.assert_array_equal(shown[1], one.render())
@@ -286,6 +309,7 @@ def test_a_vector_takes_the_seed_of_its_task():
     seen = start()(seed=5)[0]["position"]
     for random in (5, np.int64(5), [5, 6]):
         np.testing.assert_array_equal(start(random=random)()[0]["position"], seen)
+    assert not np.array_equal(*(start()()[0]["position"] for _ in range(2)))
     with pytest.raises(ValueError, match="random is 1.5"):
         start(random=1.5)
 
