@@ -32,7 +32,7 @@ SCRIPTS = Path(__file__).parents[1] / "docs/scripts"
 def played(monkeypatch):
     """Evaluations are not played; every second episode succeeds, with 0.6 N."""
 
-    def evaluate(policy, task, episodes, *, protocol, num_threads):
+    def evaluate(policy, task, episodes=None, *, protocol, num_threads, **options):
         assert protocol == "varied"
         statistics = Statistics(mean=0.1, mean_in_contact=0.2, maximum=0.6)
         forces = EpisodeForces(*[statistics] * 4)
@@ -92,26 +92,28 @@ def test_a_submission_holds_hashes_and_every_episode(played, script, tmp_path):
     assert found["versions"]["mujoco"] == mujoco.__version__
     assert len(found["episodes"]) == 100 and found["summary"]["success"] == 0.5
     assert found["summary"]["safe_success"] == {"0.5 N": 0, "1 N": 0.5, "2 N": 0.5}
+    # The digests of those that were submitted before are still computed alike.
+    entries.read(min(script.FOLDER.glob("*.json")))
     *_, row = script.table([(entry, None)])
     assert "| 50 (40–60) | 0 | 2.0 | 100.0 |" in row and card["sha256"][:12] in row
     assert row.endswith("| no |")
 
 
 def copied(values):
-    values["episodes"] = [
-        {**values["episodes"][0], "seed": row["seed"]} for row in values["episodes"]
-    ]
+    """One episode has the outcome of another."""
+    first, second, *others = values["episodes"]
+    values["episodes"] = [first, {**first, "seed": second["seed"]}, *others]
 
 
 # What a forger changes, beside the digest, and what is said of it.
 FORGERIES = {
-    "its summary is not": lambda v: v["summary"].update(success=1.0),
+    "its summary is not": lambda v: v["summary"].update(success=0.5 + 1e-6),
     "summary is not that": lambda v: v["episodes"][1].update(success=True),
     "copies of others": copied,
     "its seeds are not": lambda v: v["episodes"].reverse(),
     "seeds are not those": lambda v: v["episodes"][3].update(seed=7),
     "changes the options": lambda v: v["settings"].update(
-        task_kwargs={"goal_radius": 0.02}
+        task_kwargs={"max_steps": 100, "goal_radius": 0.02}
     ),
     "it has 3 episodes": lambda v: v.update(episodes=v["episodes"][:3]),
     "protocol is 'published'": lambda v: v["settings"].update(protocol="published"),
@@ -122,6 +124,7 @@ FORGERIES = {
         mean=float("nan")
     ),
     "episode 0 succeeds, but": lambda v: v["episodes"][0].update(physics_error=True),
+    "0 succeeds, but was not": lambda v: v["episodes"][0].update(terminated=False),
     "episode 1 is cut off": lambda v: v["episodes"][1].update(terminated=False),
     "policy is": lambda v: v.update(policy="a" * 300),
     "commit is 3": lambda v: v.update(commit=3),
@@ -183,6 +186,21 @@ def test_a_name_is_no_markup(played, script, tmp_path, name):
         assert name in unescape(html)
 
 
+def test_a_replay_compares_every_figure_of_every_episode(played, tmp_path):
+    path = tmp_path / "one.json"
+    values = submission.submit("push", path, "type1_lcca")
+    assert entries.replay(entries.read(path))[1:] == (100, "policy")
+    values["episodes"][3]["forces"]["sum"]["maximum"] = 0.5
+    seed = values["episodes"][3]["seed"]
+    with pytest.raises(ValueError, match=f"1 of its 100 .* are others .*seed {seed};"):
+        entries.replay(entries.read(sealed(path, summed(values))))
+    other = {**values, "versions": {**values["versions"], "mujoco": "3.0.0"}}
+    assert entries.replay(entries.read(sealed(path, summed(other)))).equal == 99
+    values["policy_sha256"] = "a" * 64
+    with pytest.raises(ValueError, match="its weights are not those of push"):
+        entries.replay(entries.read(sealed(path, summed(values))))
+
+
 @pytest.fixture
 def short(monkeypatch):
     """The protocol has four episodes."""
@@ -214,9 +232,6 @@ def test_a_replay_finds_what_was_not_played(short, script, tmp_path):
     again = entries.replay(forged)
     assert again.equal == 0
     assert script.table([(forged, again)])[-1] == row.replace("4 of 4", "0 of 4")
-    values["policy_sha256"] = "a" * 64
-    with pytest.raises(ValueError, match="its weights are not those of push"):
-        entries.replay(entries.read(sealed(path, summed(values))))
 
 
 @pytest.mark.slow
@@ -329,12 +344,16 @@ def recorded(tmp_path_factory):
 
 def test_recorded_actions_give_the_same_episodes(recorded, tmp_path):
     path, expected = recorded
+    (tmp_path / "one.npz").write_bytes(b"of an earlier submission")
     found = submission.submit(str(path), tmp_path / "one.json", episodes=4)
     again = json.loads(json.dumps(expected.to_dict()))
     assert found["episodes"] == again["episodes"]
     assert found["policy"] == "random, recorded actions"
     assert found["settings"] == again["settings"]
+    assert (tmp_path / "one.npz").read_bytes() == path.read_bytes()
     assert found["policy_sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    with pytest.raises(ValueError, match="not the 4 of the varied .* on type1_bca"):
+        submission.RecordedActions(path).require("type1_bca", 4)
 
 
 @pytest.mark.parametrize(
@@ -361,9 +380,17 @@ def test_actions_are_kept_up_to_the_ends_of_episodes_and_played_from_there(tmp_p
     """Two batches of two and one episodes; the last action goes on past the file."""
     taken = np.random.RandomState(0).uniform(-1, 1, (3, 4, 7)).astype(np.float32)
     shown = iter([*taken[:2].swapaxes(0, 1), *taken[2:, :3].swapaxes(0, 1)])
+    held = np.empty((2, 7), np.float32)
+
+    def act(_):
+        """Actions in an array that the policy overwrites."""
+        action = next(shown)
+        held[: len(action)] = action
+        return held[: len(action)]
+
     policy = types.SimpleNamespace(
         name="mine", task="type1_bca", observation="internal", task_kwargs={},
-        num_actions=7, reset=lambda view, which: None, act=lambda _: next(shown),
+        num_actions=7, reset=lambda view, which: None, act=act,
     )  # fmt: skip
     recorder = submission._Recorder(policy)
     views = [types.SimpleNamespace(num_simulations=count) for count in (2, 1)]
@@ -371,6 +398,7 @@ def test_actions_are_kept_up_to_the_ends_of_episodes_and_played_from_there(tmp_p
         recorder.reset(view, np.ones(view.num_simulations, bool))
         for _ in range(steps):
             recorder.act({})
+            recorder.reset(view, np.arange(view.num_simulations) > 0)  # not all begin
     lengths = 2, 4, 3
     result = types.SimpleNamespace(
         episodes=[types.SimpleNamespace(length=length) for length in lengths],
@@ -388,3 +416,4 @@ def test_actions_are_kept_up_to_the_ends_of_episodes_and_played_from_there(tmp_p
         player.reset(view, np.ones(view.num_simulations, bool))
         for step in (0, 1, 2, 3, 3, 3):
             np.testing.assert_array_equal(player.act({}), wanted[rows, step])
+            player.reset(view, np.arange(view.num_simulations) > 0)
