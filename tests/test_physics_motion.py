@@ -6,7 +6,8 @@ import pytest
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
-from cathsim_dmc.anatomy.motion import _along_aorta
+from cathsim_dmc.anatomy.motion import Motion, _along_aorta
+from cathsim_dmc.anatomy.scan import topology
 from cathsim_dmc.collision import fields
 from cathsim_dmc.laws import blood, heart
 from cathsim_dmc.physics.vessel import VesselOptions
@@ -26,14 +27,19 @@ def arch():
     return phantoms.load("simple1")
 
 
-def test_breathing_moves_the_branches_by_the_published_way_to_the_middle(arch):
+def test_branches_move_with_their_ostia_in_the_aorta_as_published():
     """In inspiration down, to the front, and to the middle: of the LSA to the right."""
-    names, blood = list(arch.tree.vessels), arch.circulation
-    _, breath = _along_aorta(blood, arch.tree)
+    forked = phantoms.load("type2")
+    names, blood = list(forked.tree.vessels), forked.circulation
+    moved = np.hstack(_along_aorta(blood, forked.tree))
     for name, size, side in (("bca", 12.0e-3, 1.0), ("lsa", 11.1e-3, -1.0)):
-        (way,) = np.unique(breath[blood.vessel == names.index(name)], axis=0)
-        assert np.linalg.norm(way) == pytest.approx(size)
-        np.testing.assert_allclose(way / size, [0.33 * side, -0.47, -0.82], atol=0.01)
+        both = [names.index(each) for each in (name, f"{name}_fork2")]
+        (way,) = np.unique(moved[np.isin(blood.vessel, both)], axis=0)
+        fading = np.exp(-0.5 * (blood.courses[name].begin / 50e-3) ** 2)
+        assert np.linalg.norm(way[:3]) == pytest.approx(fading)
+        assert np.linalg.norm(way[3:]) == pytest.approx(size)
+        unit = [0.33 * side, -0.47, -0.82]
+        np.testing.assert_allclose(way[3:] / size, unit, atol=0.01)
 
 
 def test_the_heart_moves_the_root_and_breathing_the_aorta_as_far_as_published(arch):
@@ -51,6 +57,9 @@ def test_the_heart_moves_the_root_and_breathing_the_aorta_as_far_as_published(ar
     places = np.interp([0.0, begin / 4, begin / 2, line.length], way, far)
     np.testing.assert_allclose(places[:3], 8.9e-3, rtol=0.02)
     assert places[3] == pytest.approx(4.9e-3, rel=0.05)
+    for place, side in ((0, 1.0), (-1, -1.0)):  # the descending aorta to the right
+        unit = breath[place] / far[place]
+        np.testing.assert_allclose(unit, [0.33 * side, -0.47, -0.82], atol=0.02)
 
 
 def test_the_radius_follows_the_pulse_which_travels(tube):
@@ -88,13 +97,17 @@ def test_blood_in_a_moving_vessel_keeps_its_volume_and_moves_along(tube):
         assert flow == pytest.approx(1.0, rel=motion.FLOW_BOUND / 100)
 
 
-def test_blood_at_rest_is_carried_by_the_vessel():
-    task = suite.make_task("simple1_bca", vessel={"motion": True})
-    batch = BatchSimulation(task, 1, seeds=0)
-    batch.reset()
-    steps = [batch.step(np.zeros((1, 21))) for _ in range(40)]
-    speeds = np.concatenate([step.info()["blood_speed"] for step in steps])
-    assert speeds[0] < 1e-3 and 3e-3 < speeds.max() < 0.1
+def test_blood_at_rest_and_blood_that_flows_are_carried_by_the_vessel():
+    def speeds(**vessel):
+        task = suite.make_task("simple1_bca", vessel={"motion": True, **vessel})
+        batch = BatchSimulation(task, 1, seeds=0)
+        batch.reset()
+        steps = [batch.step(np.zeros((1, 21))) for _ in range(40)]
+        return np.concatenate([step.info()["blood_speed"] for step in steps])
+
+    rest = speeds()
+    assert rest[0] < 1e-3 and 3e-3 < rest.max() < 0.1
+    np.testing.assert_allclose(speeds(flow={"peak": 1e-9}), rest, atol=1e-7)
 
 
 def test_places_in_space_are_found_and_the_sheath_rests(arch):
@@ -108,12 +121,31 @@ def test_places_in_space_are_found_and_the_sheath_rests(arch):
     assert moved.max() > 8e-3 and growth.max() > 1e-4
     inlet = np.linalg.norm(points - arch.inlet.position, axis=1).argmin()
     assert moved[inlet] == 0.0 == growth[inlet]
+    low, step, shape = np.split(arch.motion.lattice[:7], [3, 4])
+    assert (low + step * (shape - 1) >= arch.lumen.box[1]).all()
+
+
+def test_the_surface_grows_with_the_pulse(arch):
+    """By the growth of the radius times the area, to first order."""
+    course, rest = motion.parameters(0.0, 0.0, 0.02), arch.surface
+    _, growth = arch.motion.to_space(course, 2.2, rest.vertices)
+    swept = growth[rest.faces].mean(axis=1) @ topology.areas(rest.vertices, rest.faces)
+    grown = arch.motion.surface(course, 2.2, rest)
+    assert grown.volume - rest.volume == pytest.approx(swept, rel=0.05) and swept > 0.0
 
 
 def test_motions_that_fold_space_are_refused(arch):
     options = VesselOptions.make({"motion": {"breathing": (0.5, 2.0), "heart": 0.012}})
     with pytest.raises(ValueError, match="breathing 2 fold 'simple1'.*smaller"):
         options.check(arch)
+    # The gradient of breathing is diag(1, 1, 0); the heart moves against it.
+    low, step, shape = np.zeros(3), 6e-3, (4, 4, 4)
+    breath = step * np.argwhere(np.ones(shape)) * (1, 1, 0)
+    values = np.hstack([-breath, breath, np.zeros((64, 2))])
+    linear = Motion(np.concatenate([low, [step], shape, values.ravel()]))
+    linear.check("linear", 0.3, 0.59)
+    with pytest.raises(ValueError, match="heart 300 mm and breathing 0.61 fold 'lin"):
+        linear.check("linear", 0.3, 0.61)
 
 
 def test_goal_and_head_are_judged_in_the_vessel_at_rest():

@@ -12,9 +12,11 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.circulation import Circulation
+from cathsim_dmc.laws.blood import beat
 from cathsim_dmc.laws.compliance import Material, stiffness
 from cathsim_dmc.laws.contact import COMPLIANT
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY
+from cathsim_dmc.physics.flow import Flow, FlowOptions
 from cathsim_dmc.physics.vessel import VesselOptions
 from cathsim_dmc.physics.wall import Wall, WallOptions
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -152,6 +154,42 @@ def test_blood_comes_from_the_heart_delayed_by_the_way(access):
     )
 
 
+def test_blood_at_links_and_head_is_that_of_their_places_in_the_aorta():
+    """Plug-like profile of the inflow, late by the way from the heart (SI units)."""
+    options = {"rate": 75.0, "peak": 0.5, "phase": 0.2, "wave_speed": 5.0}
+    task = suite.make_task("simple1_bca", vessel={"flow": options})
+    circulation = task.scene.anatomy.circulation
+    aorta = task.scene.anatomy.tree.root.centreline
+    batch = BatchSimulation(task, 1, seeds=0)
+    batch.reset()
+    action = np.zeros((1, 21))
+    action[:, -1] = 1.0
+    for _ in range(20):
+        nodes = batch.rollout.readings.centreline[0].copy()
+        batch.step(action)
+
+    def expected(points):
+        """Velocity (P, 3) at the peak of the beat, and its delay (P,)."""
+        place = aorta.project(points)
+        share = circulation.courses["aorta"].share(place.arc_length)
+        mean = 0.5 * share * (13.8e-3 / place.radius) ** 2
+        speed = mean * 11 / 9 * (1 - (place.distance / place.radius) ** 9)
+        along = aorta.at(place.arc_length).tangent
+        return speed[:, None] * along, place.arc_length / 5.0
+
+    flow = batch.rollout.effects[0]
+    blood, inside = flow.world.parameters, flow.radius[0] > 0.0
+    velocity, delay = expected(0.5 * (nodes[1:] + nodes[:-1])[inside])
+    assert inside.sum() > 8
+    found = blood.peak[0] * blood.velocity[0, inside]
+    np.testing.assert_allclose(found, velocity, atol=1e-9)
+    np.testing.assert_allclose(blood.delay[0, inside], delay, atol=1e-9)
+    (velocity,), (delay,) = expected(batch.rollout.readings.head)
+    beats = beat(1.25 * (20 * 0.04 - delay) + 0.2)
+    shown = batch.rollout.vessel.blood_velocity[0]
+    np.testing.assert_allclose(shown, beats * velocity, rtol=1e-6, atol=1e-9)
+
+
 def test_volume_and_profile_are_those_prescribed():
     for name in vessel.ANATOMIES:
         assert vessel.volume_defect(phantoms.load(name)) < vessel.VOLUME_BOUND
@@ -177,6 +215,13 @@ def test_outlets_share_by_murray_where_that_is_asked_for():
     for name, cube in cubes.items():
         share = cube / sum(cubes.values())
         assert courses[name].outlet == pytest.approx(share, rel=1e-6)
+    measured, murray = anatomy.circulation, anatomy.murray_circulation
+    assert measured.courses["lcca"].outlet == 0.069 != murray.courses["lcca"].outlet
+    for split, blood in (("measured", measured), ("murray", murray)):
+        flow = Flow(FlowOptions(split=split))
+        flow._circulations = {}
+        flow.enter(0, anatomy)
+        assert flow._circulations[0] is blood
 
 
 @pytest.mark.parametrize("force", vessel.FORCES)
