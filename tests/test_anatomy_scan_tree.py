@@ -2,8 +2,6 @@
 
 import re
 from dataclasses import replace
-from itertools import pairwise
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +17,6 @@ from cathsim_dmc.anatomy.arch.tree import arch_tree as random_arch
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Goal, Surface
 from cathsim_dmc.anatomy.reach import unreachable
-from cathsim_dmc.anatomy.scan import check
 from cathsim_dmc.anatomy.scan.aorta import unproven
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.ends import free_ends
@@ -465,65 +462,6 @@ def test_the_proof_finds_each_fault(computed):
     for other, words in (("lsa", "to the right"), ("lcca", "in this order")):
         vessels = renamed(good.tree.vessels, "bca", other)
         assert words in found(sides)
-
-
-def test_branches_are_checked_against_radius_and_ostium():
-    """A start outside of the parent; 22 mm in the lumen of another branch."""
-
-    def line(radius, *corners):
-        parts = [np.linspace(a, b, 40) for a, b in pairwise(np.array(corners))]
-        points = np.concatenate(parts) * 1e-3
-        keep = np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 0)
-        return Centreline(points[keep], np.full(keep.sum(), radius * 1e-3))
-
-    root = Vessel("aorta", line(5.0, (0.0, 0, 0), (0, 0, 100)))
-
-    def found(look, *branches):
-        tree = VesselTree({one.name: one for one in (root, *branches)})
-        return list(look(SimpleNamespace(tree=tree), None))
-
-    for off in (4.9, 5.1):
-        one = Vessel("b", line(2.0, (off, 0, 50), (off + 40, 0, 50)), "aorta", 1e-3)
-        said = found(check._parents, one)
-        assert bool(said) == (off > 5.0)
-    assert said[0].startswith("b starts 5.1 mm from the centreline of aorta")
-    path = line(2.0, (0.0, 0, 50), (60, 0, 50))
-    both = Vessel("c", line(2.0, (0.0, 0, 50), (22, 0, 50), (40, 0, 90)), "aorta", 0.0)
-    for ostium in (25e-3, 1e-3):
-        said = found(check._own_lumen, Vessel("b", path, "aorta", ostium), both)
-        assert any(each.startswith("c runs") for each in said) == (ostium < 22e-3)
-
-
-@pytest.mark.parametrize(
-    ("volume", "radii", "words"),
-    [
-        (100, (46, 3, 3), ""),  # its own lumen begins at the ostium
-        (0.01, (9, 3, 3), "holds 0.01 ml .*: the unit is wrong"),
-        (3000, (9, 3, 3), "holds 3e.03 ml .*: the unit is wrong"),
-        (100, (9, 0.2, 0.2), r"b has a radius of 0.2 mm.*one \(--units\)"),
-        (100, (9, 31, 31), r"b has a radius of 31 mm.*one \(--units\)"),
-        (100, (9, 3, 46), r"b has a radius of 24.5 mm.*one \(--units\)"),
-    ],
-)
-def test_volume_and_radii_that_no_vessel_has_are_told(volume, radii, words):
-    points = np.linspace(0.0, 0.04, 3)[:, None] * (0, 0, 1)
-    line = Centreline(points, 1e-3 * np.array(radii, float))
-    tree = SimpleNamespace(vessels={"b": Vessel("b", line, "aorta", 10e-3)})
-    surface = SimpleNamespace(volume=1e-6 * volume)
-    said = "; ".join(check._sizes(SimpleNamespace(tree=tree, surface=surface)))
-    assert re.fullmatch(words, said) or (words and re.search(words, said)), said
-
-
-@pytest.mark.parametrize(("apart", "tells"), [(50, False), (70, True)])
-def test_arms_that_end_near_each_other_tell_no_sides(apart, tells):
-    """The left one to the right of the other."""
-    vessels = {}
-    for name, x in (("rsa", apart), ("lsa", 0)):
-        points = 1e-3 * np.array([[0.0, 0, 0], [x, 0, 50]])
-        vessels[name] = SimpleNamespace(centreline=SimpleNamespace(points=points))
-    tree = SimpleNamespace(vessels=vessels)
-    said = list(check._arms(SimpleNamespace(tree=tree)))
-    assert bool(said) == tells
 
 
 @pytest.mark.slow
