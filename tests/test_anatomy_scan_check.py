@@ -1,12 +1,14 @@
 """The checks of a vessel tree, each against a lumen or vessels of a formula."""
 
 import re
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.anatomy.scan import check
@@ -15,6 +17,18 @@ from cathsim_dmc.anatomy.scan import check
 def tube(points, radii):
     line = Centreline(np.array(points) * 1e-3, np.array(radii) * 1e-3)
     return line.resampled(1e-3)
+
+
+def test_a_small_tree_is_checked_by_limits_of_its_size():
+    """A tenth of a phantom; its line may not leave the lumen by 0.04 mm."""
+    small = check._enlarged(phantoms.load("simple1", access="descending"), 0.1)
+    assert not any(check.check_tree(small).values())
+    lcca = small.tree.vessel("lcca")
+    points = lcca.centreline.points + (0.0, 0.34e-3, 0.0)  # of a radius of 0.3 mm
+    beside = replace(lcca, centreline=replace(lcca.centreline, points=points))
+    tree = VesselTree({**small.tree.vessels, "lcca": beside})
+    found = check.check_tree(replace(small, tree=tree, goals={}))
+    assert found["centrelines in the lumen"].startswith("lcca leaves the lumen")
 
 
 def test_branches_are_checked_against_radius_and_ostium():
