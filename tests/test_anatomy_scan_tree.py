@@ -17,6 +17,7 @@ from cathsim_dmc.anatomy.arch.tree import arch_tree as random_arch
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Goal, Surface
 from cathsim_dmc.anatomy.reach import unreachable
+from cathsim_dmc.anatomy.scan import check
 from cathsim_dmc.anatomy.scan.aorta import unproven
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.ends import free_ends
@@ -302,7 +303,10 @@ def test_the_ostium_of_a_goal_lies_ahead_of_the_inlet():
         """With the inlet before the ostium of the brachiocephalic artery."""
         place, _, tangent = aorta.centreline.at(ostium + distance)
         moved = replace(inlet, position=place, direction=-tangent)
-        return unreachable(replace(anatomy, inlet=moved))
+        found = unreachable(replace(anatomy, inlet=moved))
+        said = list(check._start(replace(anatomy, inlet=moved)))
+        assert [each.split(",")[0] for each in said] == list(found)
+        return found
 
     assert not any("bca" in names for names in missed(10.5e-3).values())
     assert missed(9e-3)["bca leaves aorta 9 mm past the inlet"] == ["bca"]
