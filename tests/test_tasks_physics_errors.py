@@ -269,6 +269,12 @@ def test_a_file_holds_the_action_and_the_state_of_the_simulation_that_failed(tmp
     np.testing.assert_array_equal(failed.action, action[1])
     for name in ("rollout._errors", "rollout.steps"):
         np.testing.assert_array_equal(failed.snapshot.arrays[name], before[name])
+    (_, words, *_) = simulation.random_states[1].get_state()
+    drawn = failed.snapshot.arrays["rollout._random_states.words"]
+    np.testing.assert_array_equal(drawn, [words])
+    assert failed.replay().errors == (physics_errors.DIVERGED,)
+    with pytest.raises(ValueError, match="objects as options.*make the task in Pyth"):
+        dataclasses.replace(failed, whole=False).replay()
 
 
 def test_a_folder_keeps_the_last_few_errors_one_of_an_episode(

@@ -22,7 +22,8 @@ from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.simulation.gymnasium import CathSimEnv, CathSimVectorEnv
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.snapshot import Snapshot
+from cathsim_dmc.tasks.physics_errors import DIVERGED
+from cathsim_dmc.tasks.snapshot import Snapshot, read_arrays, write_arrays
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 from side_wind import SideWind
@@ -377,6 +378,7 @@ def test_anatomies_in_another_order_or_with_other_goals_are_another_task(change)
         ({"device": SOFT}, "devices"),
         ({"working_length": 0.205}, "links"),
         ({"sheath_clearance": 3.5e-4}, "sheath_clearance"),
+        ({"physics_timestep": 0.002}, "timestep"),
     ],
 )
 def test_another_device_or_sheath_is_another_task(options, key):
@@ -434,12 +436,29 @@ def test_a_refused_snapshot_leaves_the_episode_as_it_is(task):
         environment.step(np.ones(21))
     snapshot = one.snapshot()
     arrays = dict(snapshot.arrays)
-    arrays["stepper.state"] = np.full_like(arrays["stepper.state"], np.nan)
+    arrays["stepper.state"] = arrays["stepper.state"].copy()
+    arrays["stepper.state"][0, -1] = np.inf
     with pytest.raises(ValueError, match="diverged"):
         one.restore(dataclasses.replace(snapshot, arrays=arrays))
     for _ in range(2):
         timesteps = one.step(np.ones(21)), other.step(np.ones(21))
     assert timesteps[0].reward == timesteps[1].reward
+
+
+def test_a_step_that_diverges_does_so_again_from_its_snapshot(task):
+    """As MuJoCo resets a simulation, it counts its warnings from one again."""
+    single, batch = suite.environment(task()), BatchSimulation(task(), 1)
+    for simulation, data in ((single, single.physics.data), (batch, batch.batch)):
+        simulation.reset()
+        data.qvel[...] = 2e4
+        snapshot = simulation.snapshot()
+        for _ in range(2):
+            simulation.restore(snapshot)
+            if simulation is single:
+                simulation.step(np.zeros(21))
+                assert simulation.task.error == DIVERGED
+            else:
+                assert simulation.step(np.zeros((1, 21))).errors == (DIVERGED,)
 
 
 def test_a_stepper_without_snapshots_is_refused_by_name(task):
@@ -450,7 +469,7 @@ def test_a_stepper_without_snapshots_is_refused_by_name(task):
         batch.snapshot()
 
 
-def test_a_damaged_file_is_refused(task, tmp_path):
+def test_a_damaged_file_is_refused(task, tmp_path, monkeypatch):
     environment = suite.environment(task())
     environment.reset()
     path = environment.snapshot().save(tmp_path / "state.npz")
@@ -469,6 +488,14 @@ def test_a_damaged_file_is_refused(task, tmp_path):
     np.savez(tmp_path / "bad.npz", meta=np.array([{}], object))
     with pytest.raises(ValueError, match="no file of a snapshot"):
         Snapshot.load(tmp_path / "bad.npz")
+    meta, arrays = read_arrays(path, "snapshot")
+    uneven = {**arrays, "more": np.zeros(2)}
+    write_arrays(path, "snapshot", meta, uneven)
+    with pytest.raises(ValueError, match="holds no snapshot: .* different numbers of"):
+        Snapshot.load(path)
+    monkeypatch.setattr("cathsim_dmc.tasks.snapshot._FORMAT", 2)
+    with pytest.raises(ValueError, match="it is a snapshot of format 1, not 2"):
+        Snapshot.load(path)
     with pytest.raises(FileNotFoundError):
         Snapshot.load(tmp_path / "none.npz")
     with pytest.raises(ValueError, match=r"must end in \.npz"):

@@ -199,6 +199,8 @@ class Stepper(abc.ABC):
         self.set_states(indices, kept["state"])
         self._forward(indices)  # updates the quantities that MuJoCo derives
         self.set_states(indices, kept["state"])
+        # After an error their numbers would hide an equal warning, see `_warned`.
+        self.warnings[indices] = 0
         self.repeated[indices] = kept["repeated"]
         self._put_contacts(indices, kept["contacts"])
 
