@@ -282,17 +282,17 @@ def test_a_folder_keeps_the_last_few_errors_one_of_an_episode(
 ):
     simulation, _ = _failing("simple1_bca", tmp_path, monkeypatch, 1)
     written = list(tmp_path.glob("*.npz"))
+    monkeypatch.setattr(physics_errors, "MAX_FORCE", -1.0)  # every step fails
     for _ in range(error_files.KEPT + 1):
         simulation.reset()
-        simulation.batch.qvel[:] = 1e12
         for _ in range(2):  # stepping on adds none
-            simulation.step(np.zeros((1, simulation.num_actions)))
+            step = simulation.step(np.zeros((1, simulation.num_actions)))
+            assert step.errors == (physics_errors.EXPLODED,)
         (new,) = set(tmp_path.glob("*.npz")) - set(written)
         written.append(new)
     assert set(tmp_path.iterdir()) == set(written[-error_files.KEPT :])
     held = set(tmp_path.iterdir())
     simulation.reset()
-    simulation.batch.qvel[:] = 1e12
     with small_disk(100):
         step = simulation.step(np.zeros((1, simulation.num_actions)))
     assert step.physics_error.all() and "is lost" in caplog.text
