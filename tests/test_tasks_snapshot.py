@@ -368,8 +368,12 @@ def test_anatomies_in_another_order_or_with_other_goals_are_another_task(change)
     )
     first.reset()
     second.reset()
+    snapshot = first.snapshot()
     with pytest.raises(ValueError, match="another task: its cases .*is"):
-        second.restore(first.snapshot())
+        second.restore(snapshot)
+    odd = {**snapshot.arrays, "rollout._case_of": np.array([2])}  # of 0 and 1
+    with pytest.raises(ValueError, match=r"is of the anatomies \[2\]"):
+        first.restore(dataclasses.replace(snapshot, arrays=odd))
 
 
 @pytest.mark.parametrize(
