@@ -18,7 +18,7 @@ from cathsim_dmc.laws.contact import COMPLIANT
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY
 from cathsim_dmc.physics.flow import Flow, FlowOptions
 from cathsim_dmc.physics.vessel import VesselOptions
-from cathsim_dmc.physics.wall import Wall, WallOptions
+from cathsim_dmc.physics.wall import STIFFENING, Wall, WallOptions
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import vessel
 
@@ -356,6 +356,9 @@ def test_options_of_a_vessel_are_those_of_a_mapping():
     given = {"flow": True, "wall": {"support": 0.5}, "motion": False}
     assert VesselOptions(**given) == VesselOptions.make(given)
     assert VesselOptions(**given).wall.support == 0.5
+    silicone = VesselOptions.make("silicone")
+    assert silicone == VesselOptions(wall={"modulus": 0.52e6, "thickness": 1.5e-3})
+    assert silicone.deepest == STIFFENING and VesselOptions().deepest is None
 
 
 def test_what_cannot_flow_or_be_observed_is_refused():
