@@ -9,13 +9,14 @@ from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.surface import lumen_surface
 
 
+def tube(points, radii, step: float = 1e-3) -> Centreline:
+    """A centreline through corners, mm, with a point for each step, m."""
+    line = Centreline(np.array(points) * 1e-3, np.array(radii) * 1e-3)
+    return line.resampled(step)
+
+
 def y_tree() -> VesselTree:
     """A trunk of 6 mm radius that parts into branches of 3.5 and 3 mm radius."""
-
-    def tube(points, radii, step=1e-3):
-        line = Centreline(np.array(points) * 1e-3, np.array(radii) * 1e-3)
-        return line.resampled(step)
-
     left = [(0, 0, 50), (4, 0, 58), (16, 0, 78), (24, 0, 100)]
     right = [(0, 0, 50), (-4, 4, 58), (-12, 15, 75), (-15, 26, 88)]
     return VesselTree(

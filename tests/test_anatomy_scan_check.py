@@ -7,16 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from synthetic_scans import tube
 
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.anatomy.scan import check
-
-
-def tube(points, radii):
-    line = Centreline(np.array(points) * 1e-3, np.array(radii) * 1e-3)
-    return line.resampled(1e-3)
 
 
 def test_a_small_tree_is_checked_by_limits_of_its_size():

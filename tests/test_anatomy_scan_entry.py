@@ -1,10 +1,12 @@
 """Where an import enters a lumen, where its goals lie, and what it leaves out."""
 
+import functools
 import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import synthetic_scans
 from synthetic_scans import marched, write_markup, write_obj, y_tree
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
@@ -26,11 +28,7 @@ from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
-
-def tube(points, radii):
-    """A centreline through corners, mm."""
-    line = Centreline(np.array(points) * 1e-3, np.array(radii) * 1e-3)
-    return line.resampled(0.5e-3)
+tube = functools.partial(synthetic_scans.tube, step=0.5e-3)
 
 
 def ways_of(vessels, spacing=1.5e-3):

@@ -1,12 +1,15 @@
 """Scans that are no adult arch: trees of other vessels, children, short models."""
 
+import functools
+
 import import_cases
 import import_trees
 import numpy as np
 import pytest
+import synthetic_scans
 from synthetic_scans import marched, write_obj, y_tree
 
-from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import units
 from cathsim_dmc.anatomy.scan.extract import trunk
@@ -20,11 +23,7 @@ from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.entities.devices import DEVICES
 
-
-def tube(points, radii):
-    """A centreline through corners, mm."""
-    line = Centreline(np.array(points) * 1e-3, np.array(radii) * 1e-3)
-    return line.resampled(0.5e-3)
+tube = functools.partial(synthetic_scans.tube, step=0.5e-3)
 
 
 def imported(folder, tree, spacing, **options):

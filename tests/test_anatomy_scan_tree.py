@@ -9,7 +9,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from scipy.spatial.distance import pdist
 from skimage.color import rgb2lab
-from synthetic_scans import marched, write_markup, write_obj
+from synthetic_scans import marched, tube, write_markup, write_obj
 
 from cathsim_dmc.anatomy import Anatomy, phantoms
 from cathsim_dmc.anatomy.arch.arch import ArchSeed
@@ -28,11 +28,6 @@ from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.pictures.anatomies import anatomy_figure
-
-
-def tube(points, radii):
-    line = Centreline(np.array(points) * 1e-3, np.array(radii) * 1e-3)
-    return line.resampled(1e-3)
 
 
 def arch_tree() -> VesselTree:

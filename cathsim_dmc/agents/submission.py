@@ -70,8 +70,9 @@ def submit(
         player, task, episodes, protocol=PROTOCOL, num_threads=num_threads
     )
     files.require_file(out, make=True)
-    ours: dict[str, Any] = {"policy_sha256": weights, "package": __version__}
-    ours["commit"] = _commit()
+    ours: dict[str, Any] = {
+        "policy_sha256": weights, "package": __version__, "commit": _commit(),
+    }  # fmt: skip
     if not isinstance(player, str):
         beside = out.with_suffix(RECORDED)
         if isinstance(player, _Recorder):

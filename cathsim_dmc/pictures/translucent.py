@@ -19,7 +19,7 @@ from cathsim_dmc.compiled import compiled
 # Colour of the wall, RGB in [0, 1], as lit from the left above the viewer's eye.
 WALL_COLOUR = np.array([0.80, 0.36, 0.33])
 LIGHT = np.array([-0.35, 0.55, 0.76])
-_LIGHT = LIGHT / np.linalg.norm(LIGHT)
+LIGHT /= np.linalg.norm(LIGHT)
 # Opacity of one layer of the wall: seen straight on, and along the surface.
 FACING, GRAZING = 0.08, 0.70
 # Opacity of the nearest wall over a device inside, as a share of the wall's opacity.
@@ -106,10 +106,10 @@ def glass(surface: Surface, projection: ParallelProjection) -> Glass:
     rows, columns = projection.shape
     pixel, depth, normal = _hits(surface, fine, (_SAMPLES * rows, _SAMPLES * columns))
     order = np.lexsort((depth, pixel))  # within a sample, the farthest first
-    both = behind, glaze = np.zeros((2, rows, columns, 4))
-    _blend(pixel[order], normal[order], behind, glaze)
-    both[..., :3] /= np.maximum(both[..., 3:], 1e-9)
-    behind, glaze = np.clip(both, 0.0, 1.0)
+    pictures = np.zeros((2, rows, columns, 4))
+    _blend(pixel[order], normal[order], pictures[0], pictures[1])
+    pictures[..., :3] /= np.maximum(pictures[..., 3:], 1e-9)
+    behind, glaze = np.clip(pictures, 0.0, 1.0)
     return Glass(behind, glaze)
 
 
@@ -193,7 +193,7 @@ def _blend(pixel, normal, behind, glaze):
             n = normal[hit]
             opacity = FACING + (GRAZING - FACING) * (1.0 - abs(n[2])) ** 2.5
             # The wall is lit from both sides.
-            light = n[0] * _LIGHT[0] + n[1] * _LIGHT[1] + n[2] * _LIGHT[2]
+            light = n[0] * LIGHT[0] + n[1] * LIGHT[1] + n[2] * LIGHT[2]
             light = min(max(-light if n[2] < 0.0 else light, 0.0), 1.0)
             over[3] = opacity
             for k in range(3):

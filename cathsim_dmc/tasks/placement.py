@@ -86,7 +86,7 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal | Sequence[float]") -> Goal
     if isinstance(goal, str):
         if goal not in anatomy.goals:
             bounds.refuse("goal", goal, allowed)
-        goal = anatomy.goal(goal)
+        goal = anatomy.goals[goal]
     elif not isinstance(goal, Goal):
         try:
             goal = bounds.vector("goal", goal, 3)
