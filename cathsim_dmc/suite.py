@@ -18,7 +18,7 @@ from dm_control import composer
 from dm_control import suite as dm_suite
 from dm_control.utils import containers
 
-from cathsim_dmc import bounds
+from cathsim_dmc import bounds, compiled_ahead
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.tasks import observations, placement, registered
 from cathsim_dmc.tasks.anatomies import load_anatomy as load_anatomy
@@ -138,6 +138,7 @@ def make_task(
     own = {key: chosen.pop(key) for key in definition.own_options if key in chosen}
     # Checked before the anatomy is built, which takes seconds.
     coaxial, living = config.devices is not None, config.vessel.living
+    compiled_ahead.expect("type1_lcca_pair" if coaxial else "femoral_type1_lcca")
     observations.resolve(config.observation, coaxial, living)
     random = bounds.random_state("random", random)
     goal = own.pop("goal", definition.goal or "bca")

@@ -1,6 +1,7 @@
 """The cache of compiled loops: no fault of it stops a run, and none goes unsaid."""
 
 import ast
+import atexit
 import ctypes
 import errno
 import logging
@@ -9,12 +10,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import filelock
 import numba
 import pytest
 from numba.core import caching
 
 import cathsim_dmc
-from cathsim_dmc import compiled_cache
+from cathsim_dmc import compiled_ahead, compiled_cache, suite
 from cathsim_dmc.collision import native
 from cathsim_dmc.compiled import compiled
 
@@ -196,6 +198,113 @@ def test_nothing_compiles_after_a_task_is_loaded(tmp_path):
     done = subprocess.run(run, env=os.environ | own, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("compiling for this machine") == 1
+
+
+LOADED = """
+import sys
+from cathsim_dmc import compiled_ahead, suite
+compiled_ahead.enabled = False
+suite.load("cathsim", sys.argv[1])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["type1_lcca", "type1_lcca_pair", "type1_lcca_wire"])
+def test_a_second_process_compiles_all_but_the_collider(task, tmp_path, monkeypatch):
+    expected = []
+    monkeypatch.setattr(compiled_ahead, "expect", expected.append)
+    suite.make_task(task)
+    own = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "MUJOCO_GL": "disable"}
+    first = [sys.executable, "-m", "cathsim_dmc.first_load", *expected]
+    subprocess.run(first, env=own, check=True)
+    before = set(files(tmp_path, "nbc"))
+    subprocess.run([sys.executable, "-c", LOADED, task], env=own, check=True)
+    (path,) = set(files(tmp_path, "nbc")) - before
+    assert path.name.startswith("loops.of_link")
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """Commands that the second process would have."""
+    commands = []
+
+    def start(command, **_):
+        commands.append(command)
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    monkeypatch.setattr(atexit, "register", lambda _: None)
+    for name in "_expected", "_started":
+        monkeypatch.setattr(compiled_ahead, name, [])
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    return commands
+
+
+def test_a_second_process_starts_once_and_only_for_what_is_missing(folder, started):
+    loop()
+    assert not started  # no task has been made
+    compiled_ahead.expect("type1_lcca")
+    loop()
+    assert not started  # nothing is missing
+    for path in files(folder, "nbi"):
+        path.unlink()
+    loop()
+    call_by_c()
+    assert [command[1:] for command in started] == [
+        ["-m", "cathsim_dmc.first_load", "type1_lcca"]
+    ]
+
+
+@pytest.mark.parametrize("absent", ["core", "interpreter", "program", "wish"])
+def test_a_process_compiles_alone_where_no_second_one_can_run(
+    absent, folder, started, monkeypatch
+):
+    def fail(*_, **__):
+        raise FileNotFoundError
+
+    if absent == "core":
+        monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    elif absent == "interpreter":
+        monkeypatch.setattr(sys, "executable", None)
+    elif absent == "program":
+        monkeypatch.setattr(subprocess, "Popen", fail)
+    else:
+        monkeypatch.setattr(compiled_ahead, "enabled", False)
+    compiled_ahead.expect("type1_lcca")
+    assert loop() == (42, 0)
+    assert not started
+
+
+@KINDS
+def test_what_another_process_compiles_is_waited_for(run, folder, monkeypatch):
+    run()
+    kept = {path: path.read_bytes() for path in files(folder, "nb?")}
+    for path in kept:
+        path.unlink()
+
+    class Lock(filelock.FileLock):
+        """The lock of a function that another process compiles meanwhile."""
+
+        def acquire(self, *arguments, **options):
+            for path, content in kept.items():
+                path.write_bytes(content)
+            return super().acquire(*arguments, **options)
+
+    monkeypatch.setattr(filelock, "FileLock", Lock)
+    assert run() == (42, 1)
+
+
+@KINDS
+def test_a_process_that_never_ends_is_not_waited_for(run, folder, monkeypatch, caplog):
+    run()
+    (lock,) = files(folder, "lock")
+    for path in files(folder, "nb?"):
+        path.unlink()
+    monkeypatch.setattr(compiled_cache, "_LONGEST_WAIT", 0.1)
+    with filelock.FileLock(lock):
+        assert run() == (42, 0)
+    assert run() == (42, 1)
+    assert not caplog.records
 
 
 @KINDS

@@ -303,7 +303,8 @@ def settle(live, loads, state, rows, lays):
     Args:
         live: `chain_fields.Live`.
         loads: `laws.sliding.Loads` of N simulations, arrays with the leading axis N.
-        state: `laws.sliding.State` of them, likewise.
+        state: `laws.sliding.State` of them, likewise, but `slipped` (N, 2 K) holds the
+            slips of both clamps of each device, m and rad.
         rows: Index of the first simulation, and the index after that of the last.
         lays: Whether an episode begins, see `laws.sliding.lay`.
     """
@@ -313,7 +314,7 @@ def settle(live, loads, state, rows, lays):
             continue
         own = sliding.State(
             state.gaps[i], state.hinges[i], state.angles[i], state.ways[i],
-            state.drag[i], state.slipped[i], state.axial[i],
+            state.drag[i], state.slipped[i, 1::2], state.axial[i],
         )  # fmt: skip
         stiffness, loss = loads.stiffness[i], loads.loss[i]
         if lays:

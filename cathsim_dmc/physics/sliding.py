@@ -234,7 +234,7 @@ class SlidingDevices(SingleDevice):
             angles=self._angles,
             ways=self._ways,
             drag=self._drag,
-            slipped=self.slipped[:, 1::2],
+            slipped=self.slipped,
             axial=axial,
         )
 
