@@ -103,6 +103,7 @@ def path_distances(groups: Groups, head: np.ndarray, begun: np.ndarray) -> np.nd
 def _refuse(objective: Objective, given: str) -> NoReturn:
     raise ValueError(
         f"outcome() of {type(objective).__name__} returns {given}; it must return an "
-        "Outcome(reward, success, terms): arrays with one finite number, one bool and "
-        "one finite number a term for each simulation"
+        "Outcome(reward, success, terms, failed): arrays with one finite number, one "
+        "bool, one finite number a term and one bool for each simulation; failed may "
+        "be None"
     )
