@@ -21,12 +21,16 @@ def expect(task: str) -> None:
     _expected[:] = [task]
 
 
-def start() -> None:
-    """Starts the second process, once, if a task is expected and there is a core."""
+def start(folder: str) -> None:
+    """Starts the second process, once, if a task is expected and there is a core.
+
+    Args:
+        folder: Folder of the cache; of second processes with the same one, one loads.
+    """
     alone = (os.cpu_count() or 1) < 2 or not sys.executable
     if alone or not enabled or not _expected or _started:
         return
-    command = [sys.executable, "-m", "cathsim_dmc.first_load", *_expected]
+    command = [sys.executable, "-m", "cathsim_dmc.first_load", *_expected, folder]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     none = subprocess.DEVNULL
     with contextlib.suppress(OSError):  # this process compiles everything then

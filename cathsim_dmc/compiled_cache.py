@@ -127,7 +127,7 @@ class _Cache(caching.FunctionCache):
         found = super().load_overload(sig, target_context)
         if found is not None:
             return found
-        compiled_ahead.start()
+        compiled_ahead.start(self._cache_path)
         kind = hashlib.sha256(repr(sig).encode()).hexdigest()[:16]
         name = f"{self._impl.filename_base}-{kind}.lock"
         self._lock = filelock.FileLock(Path(self._cache_path, name), _LONGEST_WAIT)

@@ -3,12 +3,12 @@
 `compiled_ahead` runs this module in a second process.
 """
 
+import contextlib
 import sys
+from pathlib import Path
 
+import filelock
 import numpy as np
-
-from cathsim_dmc import compiled_ahead, suite
-from cathsim_dmc.collision import fields
 
 
 def load(task: str) -> None:
@@ -17,6 +17,9 @@ def load(task: str) -> None:
     Args:
         task: Name of a task whose devices stay in the lumen without collisions.
     """
+    from cathsim_dmc import compiled_ahead, suite  # late: most second processes end
+    from cathsim_dmc.collision import fields
+
     compiled_ahead.enabled = False
     fields.leave_out_collider()
     environment = suite.load("cathsim", task)
@@ -24,5 +27,12 @@ def load(task: str) -> None:
     environment.step(np.zeros(environment.action_spec().shape))
 
 
+def main(task: str, folder: str) -> None:
+    """Loads a task, unless another process does so for a folder of the cache."""
+    lock = filelock.FileLock(Path(folder, "first_load.lock"), timeout=0)
+    with contextlib.suppress(filelock.Timeout), lock:
+        load(task)
+
+
 if __name__ == "__main__":
-    load(sys.argv[1])
+    main(*sys.argv[1:])

@@ -16,7 +16,7 @@ import pytest
 from numba.core import caching
 
 import cathsim_dmc
-from cathsim_dmc import compiled_ahead, compiled_cache, suite
+from cathsim_dmc import compiled_ahead, compiled_cache, first_load, suite
 from cathsim_dmc.collision import native
 from cathsim_dmc.compiled import compiled
 
@@ -215,7 +215,7 @@ def test_a_second_process_compiles_all_but_the_collider(task, tmp_path, monkeypa
     monkeypatch.setattr(compiled_ahead, "expect", expected.append)
     suite.make_task(task)
     own = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "MUJOCO_GL": "disable"}
-    first = [sys.executable, "-m", "cathsim_dmc.first_load", *expected]
+    first = [sys.executable, "-m", "cathsim_dmc.first_load", *expected, str(tmp_path)]
     subprocess.run(first, env=own, check=True)
     before = set(files(tmp_path, "nbc"))
     subprocess.run([sys.executable, "-c", LOADED, task], env=own, check=True)
@@ -250,9 +250,19 @@ def test_a_second_process_starts_once_and_only_for_what_is_missing(folder, start
         path.unlink()
     loop()
     call_by_c()
-    assert [command[1:] for command in started] == [
-        ["-m", "cathsim_dmc.first_load", "type1_lcca"]
-    ]
+    (command,) = started
+    assert command[1:4] == ["-m", "cathsim_dmc.first_load", "type1_lcca"]
+    assert Path(command[4]).is_relative_to(folder)
+
+
+def test_one_second_process_loads_for_a_cache(tmp_path, monkeypatch):
+    loaded = []
+    monkeypatch.setattr(first_load, "load", loaded.append)
+    with filelock.FileLock(tmp_path / "first_load.lock"):
+        first_load.main("type1_lcca", str(tmp_path))
+    assert not loaded
+    first_load.main("type1_lcca", str(tmp_path))
+    assert loaded == ["type1_lcca"]
 
 
 @pytest.mark.parametrize("absent", ["core", "interpreter", "program", "wish"])
