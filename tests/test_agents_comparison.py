@@ -111,6 +111,12 @@ def test_other_files_are_refused(tmp_path):
         EvaluationResult.load(path, "best")
 
 
+def test_an_evaluation_is_shown_in_a_line():
+    assert repr(result(policy="one")) == (
+        "<EvaluationResult of 'one' on 'type1_bca', published: 2 of 4 episodes succeed>"
+    )
+
+
 def test_rows_under_other_rules_are_marked(tmp_path):
     same = {"reward": {"path": -1.0}, "observation": ["route"], "max_steps": 2000}
     files = [
@@ -125,7 +131,8 @@ def test_rows_under_other_rules_are_marked(tmp_path):
     assert [row.rules for row in found.rows] == [1, 1, 2, 3, 4, 5]
     names = {name for one in found.differences() for name in one}
     assert names == {"task", "episodes", "seeds", "goal_radius"}
-    text = "\n".join(found.markdown())
+    text = repr(found)
+    assert text == found._repr_markdown_()
     assert "| one | 50 % | 1 of 4 | 50 % | 50 ± 0 | 20.0 ± 0.0 | – | – | 1 |" in text
     assert "Rows with different rules cannot be compared" in text
     assert "seeds: 11 to 14" in text and "goal_radius: 0.004" in text

@@ -58,6 +58,12 @@ class Comparison:
     rows: tuple[Row, ...]
     rules: tuple[Mapping[str, Any], ...]
 
+    def __repr__(self) -> str:
+        """The table, its caption and the rules."""
+        return "\n".join(self.markdown())
+
+    _repr_markdown_ = __repr__  # of a notebook
+
     @classmethod
     def of(cls, paths: Sequence[str | Path], baseline: bool = True) -> "Comparison":
         """Reads files of evaluations, and those in folders.

@@ -53,6 +53,14 @@ class EvaluationResult:
     conditions: tuple[Mapping[str, Any], ...] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Policy, task, protocol and successes."""
+        protocol = self.settings.get("protocol", "no protocol")
+        return (
+            f"<EvaluationResult of {self.policy!r} on {self.task!r}, {protocol}: "
+            f"{self.successes} of {len(self.episodes)} episodes succeed>"
+        )
+
     @classmethod
     def load(
         cls, path: str | Path, which: Literal["policy", "baseline"] = "policy"

@@ -121,5 +121,5 @@ def table(
     if json:
         print_json({"checks": [], **found.as_dict()})
         return 0
-    print(*found.markdown(), sep="\n")
+    print(found)
     return 0
