@@ -136,6 +136,11 @@ def test_settings_of_the_expert_are_checked(kind, given, words):
     assert kind() == dataclasses.replace(kind())
 
 
+def test_several_goals_of_one_anatomy_tell_what_they_need():
+    with pytest.raises(ValueError, match="^goal is .*a list of as many anatomies"):
+        suite.make_task("navigate", anatomy="type1", goal=["bca", "lcca"])
+
+
 @pytest.mark.parametrize("goal", [[1, [2]], [[1, 8, 4], [1]], ["1", 2, 3], "1,2,3", {}])
 def test_a_goal_that_is_no_place_is_refused(goal):
     with pytest.raises(ValueError, match="^goal is .*bca.*, a Goal, or a position"):

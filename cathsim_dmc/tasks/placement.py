@@ -91,7 +91,8 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal | Sequence[float]") -> Goal
         try:
             goal = bounds.vector("goal", goal, 3)
         except ValueError:
-            bounds.refuse("goal", goal, allowed)
+            several = "; several goals need a list of as many anatomies"
+            bounds.refuse("goal", goal, allowed + several)
         goal = anatomy.goal_at(goal)
         alone = dataclasses.replace(anatomy, goals={goal.name: goal})
         for where in unreachable(alone):
