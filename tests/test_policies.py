@@ -14,6 +14,7 @@ from cathsim_dmc.agents.training import train
 from cathsim_dmc.pictures import record
 from cathsim_dmc.policies import POLICIES, Policy, View, in_environment, make_policy
 from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.torchrl import BatchedEnv
 
 TASK = "simple1_bca"
@@ -194,10 +195,21 @@ def test_a_function_answers_with_arrays_or_is_named():
         load_policy(lost).act(seen)
 
 
+def test_a_policy_reads_batch_and_single_environment_alike():
+    seen, options = ["tracking", "image"], {"fluoroscopy": {"size": 32}}
+    given = {"random": 0, "observation": seen, **options}
+    one = suite.load("cathsim", TASK, given).reset().observation
+    one = environments.as_batch(one)
+    many = environments.make_env(TASK, observation=seen, task_kwargs=options).reset()
+    assert environments.as_batch(many) is many
+    for name in (environments.VECTOR, environments.PIXELS):
+        assert torch.equal(one[name], many[name]), name
+
+
 def test_what_is_no_policy_is_refused(tmp_path):
     with pytest.raises(ValueError, match="random, push, expert"):
         policies.make_policy("expret")
-    with pytest.raises(RuntimeError, match="no policy.*none of random, push, expert"):
+    with pytest.raises(RuntimeError, match="no policy.*random, push, exp.*--import"):
         load_policy(tmp_path / "expret")
     with pytest.raises(TypeError, match="policy is 3; it must be a name"):
         load_policy(3)

@@ -23,6 +23,7 @@ from cathsim_dmc.simulation import environments
 PolicyFunction = Callable[
     [TensorDictBase], TensorDictBase | torch.Tensor | npt.ArrayLike
 ]
+_OWN = "; one of your own is known once its module is imported (--import MODULE)"
 PolicyLike = str | Path | Checkpoint | Policy | PolicyFunction
 
 
@@ -57,9 +58,7 @@ class FunctionPolicy(Policy):
     @torch.no_grad()
     def act(self, observation: Any) -> np.ndarray:
         """Returns the actions (N, A) float32."""
-        if not isinstance(observation, TensorDictBase):
-            entries = {k: torch.as_tensor(one)[None] for k, one in observation.items()}
-            observation = TensorDict(environments.standard(entries, 1), batch_size=[1])
+        observation = environments.as_batch(observation)
         if "is_init" in self._keys:
             observation = self._recalled(observation)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -215,7 +214,7 @@ def load_policy(policy: PolicyLike, seed: int = 0, scripted: bool = True) -> Pol
         named = [*(POLICIES if scripted else ()), "pretrained:NAME"]
         raise CheckpointError(
             f"no policy {policy}: it is no file or directory, and none of "
-            f"{', '.join(named)}"
+            f"{', '.join(named)}{_OWN if scripted else ''}"
         )
     return TrainedPolicy(Checkpoint.open(policy) if path is None else path)
 

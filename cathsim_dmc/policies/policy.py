@@ -86,6 +86,7 @@ class Policy:
                 TensorDict with batch size [N], whose entries are joined in the order
                 of their names (`VECTOR` and `PIXELS` of `simulation.environments`);
                 from a composer environment arrays by name without the axis N.
+                `simulation.environments.as_batch` makes a TensorDict of both.
 
         Returns:
             (N, A) actions in [-1, 1].

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl import envs
 from torchrl.data import Bounded, Composite, Unbounded
 
@@ -95,6 +95,22 @@ def standard(
             )
         seen[PIXELS] = torch.cat(images, -3)
     return seen
+
+
+def as_batch(observation: TensorDictBase | Mapping[str, Any]) -> TensorDictBase:
+    """Converts what `policies.Policy.act` gets to a standard observation.
+
+    Args:
+        observation: Standard observation of N simulations, which is returned, or
+            arrays by name of one composer environment, without the axis N.
+
+    Returns:
+        VECTOR and/or PIXELS, see `standard`, with batch size [N] or [1].
+    """
+    if isinstance(observation, TensorDictBase):
+        return observation
+    entries = {k: torch.as_tensor(one)[None] for k, one in observation.items()}
+    return TensorDict(standard(entries, 1), batch_size=[1])
 
 
 class StandardObservation(envs.Transform):
