@@ -23,7 +23,14 @@ SNIPPETS = [
     "README.md",
     *(
         f"docs/{name}.md"
-        for name in ("index", "concepts", "how-to", "gymnasium", "forces")
+        for name in (
+            "index",
+            "concepts",
+            "how-to",
+            "own_training",
+            "gymnasium",
+            "forces",
+        )
     ),
 ]
 

@@ -49,7 +49,8 @@ class BatchedEnv(EnvBase):
         Args:
             num_envs: N.
             num_threads: Number of threads of the simulation, None for one per core.
-            seed: Seed of each simulation, or of the first; the others count up.
+            seed: Seed of each simulation, or of the first; the others count up, so
+                those of independent batches lie at least N apart.
             observation: Name or names of observations.
             task_kwargs: Other options of the task.
             device: "cpu"; "cuda" or "cuda:1" for MuJoCo Warp on a GPU, where the

@@ -132,8 +132,8 @@ class Cannulation(Shiftable, Routed):
         weights: reward term to its weight; terms without one are not computed.
         goal_arc_length: () or (N,), of the goal on the route, m; None for the route's
             end.
-        lumen: shortest paths in the lumen to the end of the route; None without the
-            term `path`.
+        lumen: shortest paths in the lumen to the end of the route, so that the term
+            `path` holds for goals on the route alone; None without this term.
     """
 
     goal: np.ndarray
