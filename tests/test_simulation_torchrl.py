@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 from conftest import SHORT_EPISODE, twin
-from torchrl.envs import DMControlEnv
+from tensordict import TensorDict
+from torchrl.envs import DMControlEnv, FrameSkipTransform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from cathsim_dmc import suite
@@ -51,6 +52,34 @@ def test_seed_of_dm_control_env_is_that_of_the_suite():
     np.testing.assert_array_equal(env.reset()["position"].numpy(), position)
     env.close()
     expected.close()
+
+
+def test_an_ended_simulation_stays_as_it_ended_until_its_reset():
+    env = BatchedEnv("simple1_bca", 2, num_threads=1, task_kwargs={"max_steps": 3})
+    push = TensorDict({"action": torch.ones(2, 21)}, batch_size=[2])
+
+    def steps(count):
+        return torch.stack([env.step(push.clone())["next"] for _ in range(count)], 1)
+
+    env.reset()
+    once = steps(2)
+    second = torch.tensor([[False], [True]])
+    env.reset(TensorDict({"_reset": second}, batch_size=[2]))
+    then = steps(4)
+    ends = [[True, True, True, True], [False, False, True, True]]
+    assert then["done"][..., 0].tolist() == then["truncated"][..., 0].tolist() == ends
+    assert (then[0, 1:].exclude("reward") == then[0, :1].exclude("reward")).all()
+    assert (then["reward"][..., 0] == 0).tolist() == [
+        [False, True, True, True],
+        [False, False, False, True],
+    ]
+    env.set_seed(0)
+    skipping = TransformedEnv(env, FrameSkipTransform(5))
+    skipping.reset()
+    first = skipping.step(push.clone())["next", "reward"][0]
+    assert first == once["reward"][0, 0] + once["reward"][0, 1] + then["reward"][0, 0]
+    env.reset()
+    assert not steps(1)["done"].any() and steps(1)["reward"].all()
 
 
 @pytest.mark.parametrize("option", ["observation", "random"])

@@ -27,6 +27,9 @@ class BatchedEnv(EnvBase):
     "truncated", and under "info" the figures of `tasks.step.Step.info` (float32 or
     bool), all (N, 1).
 
+    A simulation whose episode has ended stays as it ended, with a reward of 0, until it
+    is reset: transforms such as `FrameSkipTransform` step on.
+
     Attributes:
         simulation: The simulations underneath.
     """
@@ -80,6 +83,8 @@ class BatchedEnv(EnvBase):
         )
         place = "cpu" if device.startswith("warp:") else device
         super().__init__(device=place, batch_size=[num_envs])
+        self._ended = np.zeros(num_envs, dtype=bool)
+        self._last = TensorDict()  # the last step in which an episode ended
         self._declare_specs(self.simulation.task)
 
     def _declare_specs(self, task: Navigation) -> None:
@@ -142,6 +147,7 @@ class BatchedEnv(EnvBase):
         **kwargs,
     ) -> TensorDict:
         if snapshot is not None:
+            self._ended[:] = False
             return self._tensors(self.simulation.restore(snapshot))
         chosen = None
         if tensordict is not None and "_reset" in tensordict.keys():
@@ -149,6 +155,7 @@ class BatchedEnv(EnvBase):
             if not mask.any():  # TorchRL then keeps its present entries of all
                 return self.observation_spec.zero()
             chosen = np.flatnonzero(mask)
+        self._ended[slice(None) if chosen is None else chosen] = False
         return self._tensors(self.simulation.reset(chosen))
 
     def _step(self, tensordict: TensorDict) -> TensorDict:
@@ -160,6 +167,14 @@ class BatchedEnv(EnvBase):
         result["terminated"] = self._tensor(step.terminated)[:, None]
         result["truncated"] = self._tensor(step.truncated)[:, None]
         result["done"] = result["terminated"] | result["truncated"]
+        if self._ended.any():
+            waiting = torch.as_tensor(np.flatnonzero(self._ended), device=self.device)
+            result[waiting] = self._last[waiting]
+            result["reward"][waiting] = 0.0
+        ends = (step.terminated | step.truncated) & ~self._ended
+        if ends.any():
+            self._ended |= ends
+            self._last = result.clone()
         return result
 
     def _tensors(self, step: Step) -> TensorDict:
