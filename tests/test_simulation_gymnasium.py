@@ -191,6 +191,15 @@ LIVELY = {
 }
 
 
+def test_a_flat_observation_is_the_vector_of_networks():
+    from cathsim_dmc.simulation.environments import VECTOR, make_env
+
+    seen = ["tracking", "force"]
+    vector = make_env("simple1_bca", observation=seen, seed=3).reset()[VECTOR]
+    flat = gymnasium.wrappers.FlattenObservation(gymnasium.make(TASK, observation=seen))
+    np.testing.assert_array_equal(flat.reset(seed=3)[0], vector[0].numpy())
+
+
 @pytest.mark.parametrize("mode", list(gymnasium.vector.AutoresetMode))
 def test_make_vec_is_the_batch_and_equals_the_single_environments(mode):
     many, single = vector(mode, **LIVELY), vector(mode, "sync", **LIVELY)
