@@ -5,7 +5,7 @@ import pytest
 import synthetic_env
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.envs import CatTensors, TransformedEnv
 
 from cathsim_dmc import policies, suite
@@ -193,6 +193,19 @@ def test_a_function_answers_with_arrays_or_is_named():
 
     with pytest.raises(TypeError, match="policy lost answered with a NoneType.*action"):
         load_policy(lost).act(seen)
+
+
+def test_a_network_in_training_acts_as_in_evaluation_and_goes_on_in_training():
+    parts = torch.nn.Dropout(0.5), torch.nn.BatchNorm1d(4), torch.nn.Linear(4, 2)
+    network = torch.nn.Sequential(*parts)
+    parts[2].eval()
+    module = TensorDictModule(network, [environments.VECTOR], ["action"])
+    seen = TensorDict({environments.VECTOR: torch.ones(3, 4)}, batch_size=[3])
+    action = load_policy(module).act(seen)
+    assert [part.training for part in parts] == [True, True, False]
+    np.testing.assert_array_equal(parts[1].running_mean, np.zeros(4))
+    network.eval()
+    np.testing.assert_array_equal(action, load_policy(module).act(seen))
 
 
 def test_a_policy_reads_batch_and_single_environment_alike():

@@ -1,7 +1,8 @@
 """Policies by name, from a checkpoint, or from a function."""
 
+import contextlib
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -30,9 +31,11 @@ PolicyLike = str | Path | Checkpoint | Policy | PolicyFunction
 class FunctionPolicy(Policy):
     """A function of the standard observations.
 
-    A stochastic function, such as a network, acts deterministically, with the middle of
-    its distribution. A TensorDict module that reads "is_init", as recurrent modules of
-    TorchRL do, also reads what it has written under "next" in the step before.
+    A network acts deterministically: in evaluation mode, without dropout, and with the
+    middle of its distribution. Of a network inside another function only the latter
+    holds; call its `eval()`. A TensorDict module that reads "is_init", as recurrent
+    modules of TorchRL do, also reads what it has written under "next" in the step
+    before.
     """
 
     def __init__(self, function: PolicyFunction, name: str | None = None):
@@ -61,7 +64,8 @@ class FunctionPolicy(Policy):
         observation = environments.as_batch(observation)
         if "is_init" in self._keys:
             observation = self._recalled(observation)
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
+        middle = set_exploration_type(ExplorationType.DETERMINISTIC)
+        with middle, _evaluating(self._function):
             answer: Any = self._function(observation)
         if "is_init" in self._keys and isinstance(answer, TensorDictBase):
             written = answer.get("next", TensorDict())
@@ -83,6 +87,20 @@ class FunctionPolicy(Policy):
         if begun is None:
             begun = torch.ones(observation.batch_size, dtype=torch.bool)
         return observation.copy().update({**self._memory, "is_init": begun[:, None]})
+
+
+@contextlib.contextmanager
+def _evaluating(function: PolicyFunction) -> Iterator[None]:
+    """Puts a network into evaluation mode for a while."""
+    parts = function.modules() if isinstance(function, torch.nn.Module) else ()
+    training = [part for part in parts if part.training]
+    for part in training:
+        part.training = False
+    try:
+        yield
+    finally:
+        for part in training:
+            part.training = True
 
 
 class _Among(Policy):
