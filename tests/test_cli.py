@@ -131,7 +131,7 @@ def test_a_deleted_folder_is_named(cathsim, tmp_path, monkeypatch):
     (tmp_path / "gone").rmdir()
     code, out, err = cathsim("phantom", "generate", "type1", "--out", "here")
     assert (code, out) == (2, "")
-    assert "the present folder has been deleted; change to another" in err
+    assert "the current folder has been deleted; change to another" in err
 
 
 def test_list_as_json(cathsim):

@@ -49,7 +49,7 @@ def forget(monkeypatch):
 
 @pytest.fixture
 def module(tmp_path, monkeypatch, forget):
-    """A function that writes a module with a task into the present folder."""
+    """A function that writes a module with a task into the current folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)  # undone, with the caches of importlib
 

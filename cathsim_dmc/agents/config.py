@@ -121,13 +121,13 @@ class TrainingConfig:
         training_reward: Weights of the reward terms to learn from: path -1 success 10
             on the command line (no JSON), {"path": -1, "success": 10} in Python; None
             takes the task's. Evaluation and recordings always take the task's.
-        training_max_steps: Largest number of control steps of an episode of the
-            training, at whose end the value is carried on; None takes the task's.
-            Evaluation and recordings always take the task's.
-        training_start: Least and largest share of the way to the goal that the device
-            has made when an episode of the training starts; None takes the task's.
-            Evaluation and recordings always take the task's.
-        num_envs: Number of simulations stepped side by side.
+        training_max_steps: Largest number of control steps of a training episode; the
+            return of a truncated one is bootstrapped with the value of its last state;
+            None takes the task's. Evaluation and recordings always take the task's.
+        training_start: Range (low, high) of the fraction of the way to the goal at
+            which training episodes start; None takes the task's. Evaluation and
+            recordings always take the task's.
+        num_envs: Number of simulations stepped in parallel.
         num_threads: Number of threads of the batched simulation; None takes one per
             core, and on a cluster one in each process.
         seed: Seed of networks, exploration and environments.
@@ -139,7 +139,7 @@ class TrainingConfig:
             the mean image, as in digital subtraction angiography; their brightness
             otherwise.
         convolutions: Convolutions of the images, each (filters, kernel size, stride).
-        cnn_features: Width of the layer behind the convolutions (images only).
+        cnn_features: Width of the layer after the convolutions (images only).
         learning_rate: Learning rate of Adam, for every network.
         gamma: Discount factor per control step.
         observation_clip: Largest magnitude of a normalised vector entry; larger ones
@@ -149,29 +149,29 @@ class TrainingConfig:
             frames. An algorithm that begins with random actions anyway (SAC) needs
             none, nor does one that starts from another policy.
         initial_policy: Directory of the run or checkpoint, or "pretrained:NAME", whose
-            policy the networks start from, with its observation statistics; None
-            starts afresh.
-        initial_std: Deviation before the tanh that every action of an initial_policy
-            starts with; None keeps the policy's own.
+            policy the networks start from, with its observation statistics; None for
+            random weights.
+        initial_std: Initial standard deviation, before the tanh, of every action of an
+            initial_policy; None keeps the policy's own.
         checkpoint_frames: Number of frames between two checkpoints.
         checkpoint_seconds: Longest time between two checkpoints in seconds of wall
             time, so that a killed run loses no more.
         keep_checkpoints: Number of the newest checkpoints that stay on disk.
         metrics_frames: Number of frames between two rows of metrics.csv.
-        logger: Logger that gets these rows too: csv (a file for each column),
-            tensorboard, trackio or wandb, offline unless WANDB_MODE is online; each
-            but csv is an extra of that name. None takes metrics.csv alone.
+        logger: Logger that also gets the rows of metrics.csv: csv (a file for each
+            column), tensorboard, trackio or wandb, offline unless WANDB_MODE is online;
+            each except csv needs the extra of that name. None for metrics.csv only.
         torch_device: Torch device of the networks, such as "cpu" or "cuda".
         simulation_device: Where the simulations run: "cpu", or "cuda" for MuJoCo Warp
             on a GPU (docs/gpu.md), with hundreds of simulations or more.
         torch_threads: Number of threads of one torch operation. One is fastest for
             the small published MLP; images profit from all cores.
-        modules: Modules that define what the run uses, such as a task of your own. They
-            are kept with the run, named where they are missing, and imported by you
-            alone: `--import` on the command line.
-        collector: Where the simulations are: "local", in this process, or "ray", in
+        modules: Modules that define what the run uses, such as a task of your own. The
+            run stores their names, and an error names missing ones; only `--import`
+            imports them.
+        collector: Where the simulations run: "local", in this process, or "ray", in
             processes of a Ray cluster (needs the `ray` extra).
-        collectors: Number of these processes, which share the simulations.
+        collectors: Number of processes of "ray", which share the simulations.
     """
 
     algorithm: ClassVar[str] = ""
@@ -305,10 +305,10 @@ class ActorCriticConfig(TrainingConfig):
     Attributes:
         critic_observation: Name or names of the vector observations that the critic
             reads in place of the images that the policy reads (Pinto et al. 2018,
-            "Asymmetric Actor Critic for Image-Based Robot Learning"); only the
-            training needs them. None lets it read what the policy reads.
+            "Asymmetric Actor Critic for Image-Based Robot Learning"); only the training
+            needs them. None for those of the policy.
         torch_compile: Whether torch compiles the loss and its gradient, for faster
-            gradient steps (docs/training.md); it needs a C++ compiler and a minute.
+            gradient steps (docs/training.md); needs a C++ compiler and up to a minute.
     """
 
     critic_observation: str | tuple[str, ...] | None = None

@@ -34,17 +34,17 @@ class DAggerConfig(CloningConfig):
 
     Attributes:
         steps_per_env: Number of control steps of each environment in a round.
-        expert_share: Share of the control steps that the expert acts in, as a factor
-            from round to round; in the first round it acts alone.
+        expert_share: Factor by which the fraction of control steps in which the expert
+            acts falls from round to round; it is 1 in the first round.
         gradient_steps: Number of gradient steps in a round.
-        withdrawal_weight: Largest weight of the states in which the expert withdraws a
-            device, among those in which it does not; together they weigh at most as
+        withdrawal_weight: Largest weight in the loss of states in which the expert
+            withdraws a device, where the others have 1; together they weigh at most as
             much as the others.
-        expert_lead: By how much the expert keeps a guidewire ahead of the catheter
-            around it, m; negative where the catheter's shaped end goes first.
+        expert_lead: Distance by which the expert keeps a guidewire ahead of the
+            catheter around it, m; negative if the catheter leads.
         replay_frames: Largest number of states kept, the newest.
         replay_bytes: Largest size of their files in bytes; the smaller of the two
-            limits rules.
+            limits applies.
     """
 
     algorithm: ClassVar[str] = "dagger"

@@ -125,12 +125,12 @@ class BCConfig(CloningConfig):
     gradient steps so that metrics.csv shows its performance.
 
     Attributes:
-        demonstrations: Directory of the dataset, as `cathsim demos` writes it, with
-            the observation of the run among its observations; or of episodes of a hand,
-            as `cathsim play --out` writes them.
+        demonstrations: Directory of the dataset, as `cathsim demos` writes it, with the
+            observation of the run among its observations; or of episodes of a human
+            operator, as `cathsim play --out` writes them.
         gradient_steps: Number of gradient steps in all, spread over total_frames.
-        steps_per_env: Number of control steps of each environment between two
-            stretches of learning.
+        steps_per_env: Number of control steps of each environment between two blocks of
+            gradient steps.
     """
 
     algorithm: ClassVar[str] = "bc"

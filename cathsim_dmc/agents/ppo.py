@@ -61,18 +61,18 @@ class PPOConfig(ActorCriticConfig):
         minibatch_size: Number of frames per gradient step.
         epochs: Number of passes over the batch per update.
         gae_lambda: Decay factor of the generalised advantage estimate.
-        clip: Largest change of the probability ratio that is rewarded.
+        clip: Clipping range of the probability ratio.
         entropy_coefficient: Weight of the entropy bonus in the loss.
         value_coefficient: Weight of the squared value error in the loss.
         max_grad_norm: Largest joint gradient norm of both networks.
         target_kl: Approximate KL divergence from the collecting policy beyond which
             an update's epochs stop; None never stops.
-        initial_deviation: Standard deviation of the actions, before the tanh, that a
-            fresh policy explores with.
+        initial_deviation: Standard deviation of the exploration of a new policy, before
+            the tanh.
         noise_correlation: Correlation of the exploration noise between two control
             steps; 0 for white noise.
-        noise_shared: Share of the variance of the exploration noise that motors which
-            bend the tip about the same axis have in common; 0 for independent motors.
+        noise_shared: Fraction of the variance of the exploration noise that is common
+            to the motors of one bending axis; 0 for independent motors.
         anneal: Whether to decrease the learning rate linearly to zero over
             total_frames.
     """

@@ -41,10 +41,10 @@ class SACConfig(ActorCriticConfig):
 
     Attributes:
         batch_size: Number of transitions per gradient step.
-        tau: Share of the critics that the target critics take over in a step.
+        tau: Coefficient of the soft update of the target critics.
         replay_frames: Largest number of transitions kept.
-        replay_bytes: Largest size of the replay files in bytes; the smaller of the
-            two limits rules.
+        replay_bytes: Largest size of the replay files in bytes; the smaller of the two
+            limits applies.
         random_frames: Number of frames at the start with uniformly random actions
             and no learning.
         steps_per_env: Number of control steps of each environment between two

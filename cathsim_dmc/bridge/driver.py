@@ -37,7 +37,7 @@ class DriveOptions:
             first ones of a network take longer.
         overrun: What to do when an action takes longer than a period: "latest", answer
             the newest state and skip the others, or "stop".
-        watchdog: Silence of the device after which the driver stops, s.
+        watchdog: Time without a message of the device after which the driver stops, s.
         force_limit: Largest contact or push above which the driver stops, N; None for
             none.
     """

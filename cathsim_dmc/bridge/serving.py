@@ -35,8 +35,8 @@ class ServeOptions:
         lockstep: Whether each period waits for its action, at any speed; otherwise the
             clock does not wait.
         missed: What the device does in a period whose action has not come in time:
-            "still", no translation and no rotation, or "hold", the last action.
-        watchdog: Silence of the driver after which the device stops, s.
+            "still", no translation and no rotation, or "hold", repeat the last action.
+        watchdog: Time without a message of the driver after which the device stops, s.
         force_limit: Largest contact or push above which the device stops, N; None for
             none.
     """

@@ -17,15 +17,16 @@ from cathsim_dmc.cli.options import BAD_INPUT, INTERRUPTED
 
 _DESCRIPTION = (
     "Autonomous endovascular navigation: train, evaluate, record, validate. "
-    "`cathsim COMMAND --help` explains a command, `cathsim --version` names it."
+    "`cathsim COMMAND --help` explains a command, `cathsim --version` prints the "
+    "version."
 )
 _LONGEST = 1500  # characters of an error
 # Module and function of each command, and its summary.
 COMMANDS = {
     "train": ("training:command", "Train an agent."),
     "list": ("listing:show", "List the tasks, or the devices with their properties."),
-    "dataset": ("recordings:dataset", "Write labelled fluoroscopy with a split."),
-    "eval": ("agents:evaluate", "Play episodes with a policy and report figures."),
+    "dataset": ("recordings:dataset", "Write labelled fluoroscopy as a data set."),
+    "eval": ("agents:evaluate", "Evaluate a policy: success, reward, forces."),
     "table": ("result_tables:table", "Compare evaluations as a table in Markdown."),
     "submit": ("agents:submit", "Write a file for the leaderboard."),
     "record": ("agents:record", "Record one episode: as a Rerun file, or as a film."),
@@ -33,15 +34,15 @@ COMMANDS = {
     "replay": ("recordings:replay", "Open a recording in the Rerun viewer."),
     "replay-error": (
         "recordings:replay_error",
-        "Do the control step of a physics error again.",
+        "Repeat the control step of a physics error.",
     ),
     "play": ("agents:play", "Cannulate by hand, with the forces on the screen."),
     "upload": ("sharing:upload", "Upload a policy or a data set to a hub."),
     "serve": ("bridging:serve", "Serve a task as a device over TCP."),
     "drive": ("bridging:drive", "Drive a device over TCP with a trained policy."),
-    "doctor": ("checks:doctor", "Check what is installed; say what to do."),
+    "doctor": ("checks:doctor", "Check the installation; list remedies."),
     "export": ("exporting:export", "Write a scene as MJCF, or a policy as ONNX."),
-    "phantom": ("phantoms:phantoms", "Make, import and check anatomies."),
+    "phantom": ("phantoms:phantoms", "Import, build, check and export anatomies."),
     "validate": ("checks:validate", "Compare the physics with theory."),
     "benchmark": ("checks:benchmark", "Measure the speed on this machine."),
 }
@@ -87,11 +88,11 @@ def _refused(error: Exception) -> int:
 
 
 def _require_here() -> None:
-    """Raises FileNotFoundError if the present folder has been deleted."""
+    """Raises FileNotFoundError if the current folder has been deleted."""
     try:
         os.getcwd()
     except FileNotFoundError as error:
-        text = "the present folder has been deleted; change to another one (cd)"
+        text = "the current folder has been deleted; change to another one (cd)"
         raise FileNotFoundError(text) from error
 
 

@@ -78,15 +78,15 @@ def evaluate(
     Args:
         episodes: Number of episodes, each with a seed of its own; by default 30, and
             100 of the varied protocol.
-        seed: Seed of the first episode; the others lie above it.
+        seed: Seed of the first episode; those of the others are larger.
         protocol: Conditions: "published", where episodes differ by 1 mm of the start,
             or "varied", where start, roll, friction, stiffness, damping, delay, device
             and noise differ from episode to episode.
-        out: Directory for evaluation.json, of one anatomy heatmap.png, and errors/ with
-            the last physics errors.
-        baseline: Whether to compare with the random policy on the same seeds.
-        start: File of a snapshot (`snapshot().save`): one episode for each of its
-            simulations, from there on.
+        out: Directory for evaluation.json, heatmap.png (of one anatomy only), and
+            errors/ with the last physics errors.
+        baseline: Whether to evaluate the random policy too, on the same seeds.
+        start: File of a snapshot (`snapshot().save`) from which the episodes start, one
+            for each of its simulations.
         simulation_device: Where the simulations run: "cpu", or "cuda" for MuJoCo Warp
             on a GPU, "cuda:1" on the second one (extra gpu, docs/gpu.md).
         report: Whether to print each episode too: seed, anatomy, device, end, time,
@@ -167,7 +167,7 @@ def submit(
 ) -> int:
     """Play a policy under the varied protocol and write a file for the leaderboard.
 
-    In place of a policy, a file of agents.record_actions is played again.
+    Also takes a file of agents.record_actions, whose actions it repeats.
 
     Args:
         out: File to write, ending in .json.
@@ -205,12 +205,12 @@ def record(
 
     Args:
         out: File to write: .rrd (Rerun, with an .npz beside it), .npz (arrays), or a
-            film as `gif`.
-        gif: Path of a film for slides, .gif, .webp or, with the extra `video`, .mp4;
-            needs no OpenGL.
-        seed: Seed of the episode; with --start of the policy alone.
-        start: File of a snapshot (`snapshot().save`) of a running episode, from which
-            the policy goes on.
+            film as of --gif.
+        gif: Path of a film: .gif, .webp or, with the extra `video`, .mp4; needs no
+            OpenGL.
+        seed: Seed of the episode; with --start, of the policy only.
+        start: File of a snapshot (`snapshot().save`) of a running episode, which
+            the policy continues.
         fluoroscopy: Whether an .rrd file has X-ray images.
         options: Options of the task, over those that the policy was trained with.
     """
@@ -306,11 +306,11 @@ def demos(
 
     Args:
         out: Directory of the dataset, which must not exist. `minari.load_dataset`
-            knows it if its name ends in a version, such as lcca-v0.
+            finds it if its name ends in a version, such as lcca-v0.
         episodes: Number of episodes, each with a seed of its own.
-        observation: Names of the observations that a learner is to see.
+        observation: Names of the observations to store for learners.
         noise: Standard deviation of normal noise added to every entry of the expert's
-            action, so that it shows how it comes back to its way.
+            action, so that the dataset contains its corrections.
         seed: Seed of the first episode; the others count up.
         options: Options of the task.
     """
@@ -352,8 +352,8 @@ def play(
         speed: Speed of the simulation, in multiples of real time.
         policy: Policy to watch instead of playing yourself: directory of a run or of
             a checkpoint, or name of a policy, such as "pretrained:type1_bca".
-        hands: What you hold (extra `hands`): a gamepad vibrates with the largest
-            contact; the keys act beside it.
+        hands: Input device, with the extra `hands` also a gamepad, which vibrates with
+            the largest contact, or a SpaceMouse; the keys work in any case.
         options: Options of the task, over those that the policy was trained with.
     """
     player = agents.load_policy(policy, seed) if policy else None

@@ -52,14 +52,15 @@ def serve(
 ) -> int:
     """Serve a task as a device over TCP, for a driver in another program.
 
-    The messages are in docs/robot_messages.md. One driver after the other; there is no
-    password, so other machines are let in by --host alone.
+    The messages are in docs/robot_messages.md. Drivers are served one after the other,
+    without a password; by default only programs on this machine can connect (--host).
 
     Args:
-        host: Address to listen on, of IPv4 or IPv6; 0.0.0.0 for all of this machine.
+        host: Address to listen on, IPv4 or IPv6; 0.0.0.0 for all addresses of this
+            machine.
         port: Port to listen on; 0 takes a free one.
-        episodes: Number of episodes after which it ends; by default it goes on.
-        log: File of JSON lines to write, with what was applied.
+        episodes: Number of episodes after which it ends; no limit by default.
+        log: File to write: applied actions and forces, as JSON lines.
         how: How the device is served.
         options: Options of the task.
     """
@@ -104,10 +105,10 @@ def drive(
         episodes: Number of episodes.
         seed: Seed of the first episode, from which the others count up; by default the
             device chooses.
-        log: File of JSON lines to write, with what was sent.
+        log: File to write: sent actions and forces, as JSON lines.
         unchecked: Whether to drive a device that announces another period, or other
             names, units or scales of actions or observations, than the policy was
-            trained with. It gets the policy's actions in [-1, 1] as they are.
+            trained with. The policy's actions in [-1, 1] are sent unchanged.
         how: How the device is driven.
     """
     bounds.whole("episodes", episodes, 1)

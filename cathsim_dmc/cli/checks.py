@@ -41,7 +41,7 @@ class Finding(NamedTuple):
 
 
 def doctor(json: Json = False) -> int:
-    """Check versions, threads, compiled kernels and OpenGL; say what to do."""
+    """Check versions, threads, compiled kernels and OpenGL; list remedies."""
     threads = os.environ.get("OMP_NUM_THREADS", "not set")
     advice = "" if threads == "1" else "set it to 1 where several processes run"
     findings = [
@@ -137,9 +137,9 @@ def validate(
     """Compare the physics with theory, or with measured guidewires.
 
     Args:
-        part: Rod and drives; coaxial devices; contact with the wall and its shape;
-            devices at rest; flow, wall and motion of the vessel; force sensors;
-            guidewires on a bench.
+        part: rod: rod and drives; pair: coaxial devices; wall: contact with the wall
+            and its shape; rest: devices at rest; vessel: flow, wall and motion;
+            forces: force sensors; bench: measured guidewires.
         data: Of `bench`: folder with phantom.stl and wires.json (docs/bench.md).
         protocol: Options of `forces`.
     """
@@ -182,7 +182,7 @@ def _forces(options: Protocol, json: bool) -> int:
 def benchmark(
     part: Annotated[Literal["speed"], conf.Positional], /, json: Json = False
 ) -> int:
-    """Measure the speed of the simulator on one core, relative to this machine's.
+    """Measure the speed of the simulator on one core, relative to MuJoCo's.
 
     Calibrated speeds are real-time factors times the microseconds of one `mj_step` of
     dm_control's humanoid, timed in alternation; takes minutes.

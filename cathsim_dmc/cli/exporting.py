@@ -41,11 +41,11 @@ def export(
 
     Args:
         out: Directory to write, which must not exist. Of a task: scene.xml with the
-            start of an episode as a keyframe, and task.json; a wall that yields or
-            moves is rigid there. Of a policy: policy.onnx, card.json, selftest.npz and
-            selftest.py.
-        task: Task of the episode of a policy's self-test; by default its own.
-        seed: Seed of the episode; by default 0, of a policy 1,000,000.
+            start of an episode as a keyframe, and task.json; a compliant or moving wall
+            is written as rigid and at rest. Of a policy: policy.onnx, card.json,
+            selftest.npz and selftest.py.
+        task: Task of the episode of a policy's self-test; by default the policy's.
+        seed: Seed of the episode; by default 0, for a policy 1,000,000.
         wall: Pieces of a task's wall, see `cathsim phantom export --help`.
         options: Options of the task.
     """

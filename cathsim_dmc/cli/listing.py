@@ -17,7 +17,7 @@ _SHIPPED = Path(__file__).parents[1] / "pretrained"
 
 
 def show(devices: bool = False, json: Json = False, modules: Modules = ()) -> int:
-    """List the tasks and the policies that ship, or the devices with their properties.
+    """List the tasks and the shipped policies, or the devices with their properties.
 
     Args:
         devices: Whether to list the devices in place of the tasks.

@@ -16,12 +16,12 @@ CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 _TASK = "Task of `cathsim list`."
 Task = Annotated[str, conf.Positional, conf.arg(help=_TASK)]
-Json = Annotated[bool, conf.arg(help="Whether to print one JSON object alone.")]
+Json = Annotated[bool, conf.arg(help="Whether to print one JSON object only.")]
 _THREADS = "Number of threads of the simulation; one per core by default."
 _MODULES = (
-    "Module to import first, repeated for several: of a task, device, observation, "
-    "algorithm or policy of your own. It is looked for where Python looks, and in the "
-    "present folder."
+    "Module to import first, repeated for several: it registers a task, device, "
+    "observation, algorithm or policy of your own. It is searched in Python's path "
+    "and in the current folder."
 )
 Modules = Annotated[
     tuple[str, ...],
@@ -29,7 +29,7 @@ Modules = Annotated[
     conf.arg(name="import", metavar="MODULE", help=_MODULES),
 ]
 Threads = Annotated[int | None, conf.arg(help=_THREADS)]
-_RAY = "Whether the machines of a Ray cluster do the work (docs/cluster.md)."
+_RAY = "Whether to distribute the work over a Ray cluster (docs/cluster.md)."
 Ray = Annotated[bool, conf.arg(help=_RAY)]
 
 

@@ -55,7 +55,7 @@ def import_phantom(
 ) -> int:
     """Turn the surface of a lumen into an anatomy.
 
-    It ends with the commands that come next.
+    The output ends with the commands to run next.
 
     Args:
         mesh: Surface of the lumen: OBJ, STL, PLY, VTP or VTK; ends open or capped. Or a
@@ -72,11 +72,14 @@ def import_phantom(
             point in the patient, three of L, R, A, P, S, I, such as ILA; or nine
             numbers, the patient's left, back and head as directions in that frame.
         label: Values of a label map that are the lumen.
-        inlet: Where the device enters: a free end, or a place to cut the lumen at.
-        heart: Near the end of the aorta that is at the heart; found if not given.
+        inlet: Where the device enters, x y z in unit and frame of the surface: a free
+            end, or a point at which the lumen is cut.
+        heart: Point near the end of the aorta at the heart, like `inlet`; found if not
+            given.
         rename: Names of computed vessels, each as computed=wanted.
-        device: Device of the library (`cathsim list --devices`) that the vessels are to
-            let pass; by default a 5 Fr catheter, or the thinnest if that does not pass.
+        device: Device of the library (`cathsim list --devices`) that must fit through
+            the vessels; by default a 5 Fr catheter, or the thinnest device if that does
+            not fit.
     """
     bore = None if device is None else devices.get(device, "--device")
     if out is None:
@@ -159,7 +162,7 @@ def build(
         tree: Vessel tree in JSON: centrelines, radii, parents, inlets, goals
             (docs/anatomy_files.md has the format).
         out: Directory of the anatomy.
-        access: Inlet of the file that the device enters by; the first if left out.
+        access: Inlet in the file at which the device enters; by default the first.
     """
     _require_place(out)
     anatomy = read_tree(tree).build(access)
@@ -187,10 +190,10 @@ def generate(
             of that set.
         out: Directory of the anatomy.
         seed: Seed of a random arch of a type.
-        variant: How the branches of a random arch of a type leave it: normal,
+        variant: Variant of the branches of a random arch of a type: normal,
             bovine_trunk, bovine_branch or aberrant.
         neck: Whether a random arch of a type has the arteries of neck and arms.
-        index: Place of an arch in its set.
+        index: Index of an arch in its set.
         access: End of the aorta that the device enters, ascending or descending.
     """
     needs = dict.fromkeys(shipped.PHANTOMS) | dict.fromkeys(arch.SETS, "index")
@@ -228,15 +231,15 @@ def check(
     figure: Path | None = None,
     json: Json = False,
 ) -> int:
-    """Check an anatomy and measure what it is like.
+    """Check an anatomy and measure its shape.
 
-    Its surface, the field of its lumen, passage, goals; type of the arch, diameters,
-    take-offs, curvature.
+    Checks surface, field of the lumen, passage of the device, goals; measures type of
+    the arch, diameters, take-offs, curvature.
 
     Args:
         phantom: Directory of an anatomy, or the name of a phantom.
-        figure: PNG of three views; check.png in a directory of an anatomy if left
-            out.
+        figure: PNG of three views; by default check.png in the directory of the
+            anatomy.
     """
     # Not at the top: an import of a scan needs none of the simulation.
     from cathsim_dmc.tasks.anatomies import load_anatomy

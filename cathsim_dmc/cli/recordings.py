@@ -34,7 +34,7 @@ def dataset(
     Of random arches, or of the anatomies that are given.
 
     Args:
-        out: Folder of the data set; an interrupted run goes on in it.
+        out: Folder of the data set; the same command continues an interrupted run.
         processes: Number of processes; one per core by default.
         options: Content of the data set.
     """
@@ -78,7 +78,7 @@ def replay(
 def replay_error(
     file: Annotated[Path, conf.Positional], /, json: Json = False, modules: Modules = ()
 ) -> int:
-    """Do a control step again in which the physics failed; say whether it fails again.
+    """Repeat the control step of a physics error; report whether it fails again.
 
     Args:
         file: File of a folder `errors` of a training or an evaluation.

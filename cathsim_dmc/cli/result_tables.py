@@ -19,7 +19,7 @@ from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 _CAPTION = (
     "Mean ± standard deviation over episodes. Forces are means over a control step, as "
-    "a load cell at 25 Hz reads them, but for the peak. Mean force: sum over all "
+    "a load cell at 25 Hz reads them, except the peak. Mean force: sum over all "
     "contacts, mean over all steps. Mean contact force: largest single contact, mean "
     "over the steps with contact. Max force: largest single contact of any step. "
     "Largest sum: sum over all contacts of any step. Safe success: the goal reached "

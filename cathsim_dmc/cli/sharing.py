@@ -25,8 +25,8 @@ def upload(
         source: Directory of a run or checkpoint, pretrained:NAME or a .safetensors
             file; or the directory of a data set of `cathsim demos`, or of episodes of
             `cathsim play`.
-        place: hf:OWNER/NAME; the repository is made if it is not there.
-        public: Whether a repository that is made is public.
+        place: hf:OWNER/NAME; the repository is created if it does not exist.
+        public: Whether a repository that is created is public.
     """
     given = Path(source) if Path(source).exists() else source
     print(sharing.upload(given, place, private=not public))

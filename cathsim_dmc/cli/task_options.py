@@ -13,7 +13,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import Cannulation
 
-_OWN = " Text or JSON; by default, and with null, as the task or policy has it."
+_OWN = " Text or JSON; by default, and with null, that of the task or policy."
 _LISTS = {"observation", "devices"}  # options that take several names, as a,b
 _CONSTANTS = {"True": "true", "False": "false", "None": "null"}  # Python to JSON
 
@@ -23,20 +23,20 @@ class TaskOptions:
     """Options of a task.
 
     Attributes:
-        anatomy: Directory of an anatomy, or name of an arch (`navigate`), repeated for
-            several, of which each episode draws one.
-        goal: Name of the goal in it, or a place x,y,z of the lumen in the unit and
-            frame of the file that it was imported from (`navigate`). Of random arches
-            "any" for one branch after the other, or a name for each arch: lcca,any. Of
-            several anatomies a name for all, or one for each: lcca,bca.
-        access: Way in: "ascending", from the ascending aorta, or "descending", from
-            the femoral artery (`navigate`). Of several anatomies one for all, or one
-            for each, none for a scan: ascending,,descending.
+        anatomy: Directory of an anatomy, or name of a phantom (`navigate`), repeated
+            for several, of which each episode draws one.
+        goal: Name of a goal of the anatomy, or a point x,y,z in the lumen in the unit
+            and frame of the file that it was imported from (`navigate`). For random
+            arches "any" cycles through the branches; lcca,any names one for each arch.
+            For several anatomies one name for all, or one for each: lcca,bca.
+        access: End of the aorta that the device enters: "ascending", or "descending" as
+            from the femoral artery (`navigate`). For several anatomies one for all, or
+            one for each, none for a scan: ascending,,descending.
         arches: Set of random arches that episodes draw from: train, test,
             test_variants, neck or test_neck (`arch_…`, `femoral_arch_…`, `neck_…`).
         pool: Number of arches that episodes draw from (the same tasks).
-        first: Number in the set of the first of them (the same tasks).
-        numbers: Their numbers in the set, in place of pool and first.
+        first: Index in the set of the first arch of the pool (the same tasks).
+        numbers: Indices of the arches in the set, in place of pool and first.
         option: Option of the objective of a task of your own, name=value, repeated for
             several; the value is text or JSON.
     """

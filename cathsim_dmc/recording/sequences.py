@@ -66,14 +66,15 @@ class ImageSetOptions:
     Attributes:
         sequences: Number of motions in each anatomy.
         frames: Number of frames of a sequence.
-        views: Number of C-arms that see each motion, a sequence each.
+        views: Number of C-arms that image each motion; each gives a sequence.
         stride: Control steps of 40 ms from frame to frame.
         size: Pixels along a side of an image.
         vessel: State of the vessel: rigid, silicone or living.
         anatomies: Number of random arches in train, val and test; or of the given
-            anatomies, which are dealt out in their order.
-        pictures: Whether the images are also written as PNG, for tools of COCO.
-        seed: Seed of all that is drawn.
+            anatomies, in their order.
+        pictures: Whether the images are also written as PNG, for tools that read COCO
+            folders.
+        seed: Seed of all random numbers.
         anatomy: Directory of an anatomy, or name of a phantom, in place of random
             arches; repeated for several.
     """

@@ -75,22 +75,23 @@ class NavigationConfig:
         start_along_route: Range (low, high) of the fraction of the way from the usual
             start to the goal at which an episode starts, for curricula.
         max_steps: Number of control steps until the episode is truncated.
-        give_up: Whether an episode ends without success where the memory of attempts
-            gives up, see `tasks.retry`: at a lumen too narrow for the device.
-        friction: Coulomb coefficient between an uncoated device and the wall; a
-            hydrophilic one has its `friction_ratio` of it.
+        give_up: Whether an episode ends without success when the memory of attempts
+            (`tasks.retry`) gives up, as in a lumen too narrow for the device.
+        friction: Coulomb coefficient between an uncoated device and the wall; that of a
+            hydrophilic device is this times its `friction_ratio`.
         shaft_link: Length of the longest link of the shaft, m.
-        working_length: Simulated length of the device, m; None for what the goal needs.
-            Observations have one shape whatever it is.
-        sheath_clearance: Play of the device in the bore of the sheath all round, m;
-            None for a sheath that holds it on its axis (docs/sheath_and_drive.md).
+        working_length: Simulated length of the device, m; None for the length that the
+            goal requires. Shapes of observations do not depend on it.
+        sheath_clearance: Radial clearance of the device in the bore of the sheath, m;
+            None for a sheath that clamps the device on its axis
+            (docs/sheath_and_drive.md).
         physics_timestep: Length of a physics step, s; it divides the control step.
         solver_tolerance: Relative improvement at which the solver of contacts stops;
             with 1e-8 devices at rest are steadier (docs/validation.md), for up to a
             seventh more time.
-        outside_range: Whether a physics step longer than 5 ms and a device stiffer than
-            5000 N·mm², with which the physics does not hold, are warned of and not
-            refused.
+        outside_range: Whether a physics step above 5 ms or a device stiffer than 5000
+            N·mm², for which the physics is not valid, gives a warning instead of an
+            error.
         fluoroscopy: `imaging.options.FluoroscopyOptions`, or a mapping of its fields.
         endoluminal_size: Pixels along a side of endoluminal views, or (rows, columns).
         cameras: `cameras.CameraOptions` of `rgb` and `depth`, or a mapping of its
@@ -98,7 +99,7 @@ class NavigationConfig:
         randomisation: Ranges that each episode draws from: True for
             `randomisation.DEFAULT_RANGES`, False for none, a
             `randomisation.Randomisation` or a mapping of its fields.
-        effects: Effects of one's own, see `physics.effects.Effect`.
+        effects: User-defined effects, see `physics.effects.Effect`.
         vessel: Name of a preset in `physics.vessel.PRESETS`, or a mapping of the fields
             of `physics.vessel.VesselOptions`.
     """
