@@ -74,11 +74,11 @@ class FluoroscopyOptions:
     """Set-up of the angiography suite.
 
     Attributes:
-        view: name of a view, or (primary, secondary) angle in degrees. "best", then
-            for `biplane` as well, selects the pair of views of this anatomy with the
-            fewest ambiguous places.
+        view: name of a view, or (primary, secondary) angle in degrees. "best", for
+            `biplane` too, selects the pair of views of this anatomy in which the fewest
+            points are ambiguous.
         biplane: view of a second C-arm; None for a single plane.
-        third: view of a third roadmap, in which the observation `biplane` also seeks
+        third: view of a third roadmap, which the observation `biplane` also uses for
             its route; None for two roadmaps.
         roadmap_errors: `RoadmapErrors`, or a mapping of its fields.
         size: pixels along a side of the image, or (rows, columns).
@@ -90,7 +90,7 @@ class FluoroscopyOptions:
         noise: whether images have quantum noise, drawn from the environment's random
             state.
         kerma: air kerma at the detector per frame, Gy; the noise decreases with it.
-        gain: grey level of plain tissue as a fraction of white.
+        gain: grey level of tissue without vessel or device as a fraction of white.
         blur: standard deviation of the detector's point spread, m.
         roadmap: opacity of the roadmap over the live image, 0 for none; usually with
             `contrast=False`.

@@ -82,14 +82,14 @@ class Randomisation:
     Attributes:
         friction: Coulomb coefficient of an uncoated device on the wall; that of a
             hydrophilic device is this times its `friction_ratio`.
-        stiffness: factor of EI and GJ; damping and steering torques follow, so that
-            relaxation time and steering angles stay.
+        stiffness: factor of EI and GJ; damping and steering torques are scaled alike,
+            so relaxation time and steering angles do not change.
         loss: factor of the loss factor of the material.
         viscosity: factor of the viscosity of blood.
         start_radius: radius of the ball in which the tip starts, m.
         view: deviation of the C-arm's angles, degrees, rounded to whole degrees.
         gain: factor of the image's gain.
-        kerma: factor of the kerma, which sets the quantum noise if there is any.
+        kerma: factor of the kerma, which sets the quantum noise (with `noise`).
         goal_shift: shift of the goal along its branch, m, positive away from the
             ostium.
         roll: rotation of the device about its own axis at the start, rad.

@@ -299,7 +299,7 @@ for _key, _unit, _seen, _planes, _high, _dtype in (
     ("rgb", "colour level", "red, green, blue", 3, 255, np.uint8),
     ("depth", "m", "distance along the optical axis", 1, FARTHEST, np.float32),
 ):
-    _seen += ", of each of MuJoCo's cameras; they show the vessel at rest"
+    _seen += ", of each of MuJoCo's cameras"
 
     def _size(sizes: Sizes, planes: int = _planes) -> tuple[int, ...]:
         return (*sizes.cameras.size, planes * len(sizes.cameras.names))
@@ -313,7 +313,7 @@ for _key, _unit, _seen, _planes, _high, _dtype in (
         _devices,
         "m",
         "insertion of the end of each device, from the innermost outwards; 0 is the "
-        "place of the chain's end at the start of the stroke",
+        "position of the most distal end at the start of the stroke",
     ),
     Entry(
         "device_rotation", _devices, "rad", "angle of the rotary unit of each device"
@@ -340,8 +340,8 @@ def drives(frame: Frame) -> Observation:
         "device_load",
         2,
         "N",
-        "axial force in the device that reaches farthest, at the place where it leaves "
-        "the others, and friction between the devices",
+        "axial force in the most distal device, where it leaves the others, and "
+        "friction between the devices",
     ),
     needs=COAXIAL,
 )

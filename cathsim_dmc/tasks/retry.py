@@ -36,10 +36,10 @@ SHOWN = (
     "memory of the attempts: 1 while withdrawing; remaining withdrawal / 20 mm; "
     "control steps without progress, and outside the tube of the route, each divided "
     "by the number that begins a retry; number of retries / 4; look-ahead of the "
-    "attempt, one-hot (3); 1 in every second attempt, where the place of the head is "
-    "sought near its last one; force of the base, N; 1 after giving up. Coaxial "
-    "devices also have: 1 while slack is taken up; lead / 20 mm, at most 2; cosine "
-    "and sine of the offset in direction"
+    "attempt, one-hot (3); 1 in every second attempt, which seeks the head on the "
+    "route near its last position only; force of the base, N; 1 after giving up. "
+    "Coaxial devices also have: 1 while slack is taken up; lead / 20 mm, at most 2; "
+    "cosine and sine of the offset in direction"
 )
 
 

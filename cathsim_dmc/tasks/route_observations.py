@@ -24,9 +24,11 @@ _actions, _devices = map(attrgetter, ("actions", "devices"))
 
 def _ahead(name: str, way: str) -> tuple[Entry, ...]:
     """Entries of a route ahead, whose names begin with `name`."""
-    places = f"every {1e3 * AHEAD[1]:g} mm from the head's place on it, tip frame"
+    places = f"every {1e3 * AHEAD[1]:g} mm from the projection of the head, tip frame"
     points, count = f"{len(AHEAD)} points of {way}, {places}", len(TRACKED_PLACES) - 1
-    device = "points along the device, from proximal to before the head, tip frame"
+    device = (
+        "points along the device, from proximal to distal without the head, tip frame"
+    )
     out = "distance of the head outside the lumen, in radii of the lumen there; "
     out += "negative inside"
     return (

@@ -142,14 +142,14 @@ starts.
 
 {table}
 
-The channels of the cameras follow each other. "tip" looks from the head along its axis
-with a field of view of a right angle, as in endoluminal views, by its own lamp alone,
-and does not show the device. "top" and "side" show the vessel as translucent in `rgb`,
-but as solid in `depth`, where the wall hides the device. A batch renders its
-simulations one after the other. In a task with several anatomies each image shows the
-anatomy of its simulation, as a task with this anatomy alone does; the first image
-compiles a model with all meshes. A vessel that moves is drawn where it has moved to;
-its mesh is computed and uploaded for each image, which takes longer.
+The images of several cameras are concatenated along the channels. "tip" looks from the
+head along its axis with a field of view of a right angle, as in endoluminal views, by
+its own lamp alone, and does not show the device. "top" and "side" show the vessel as
+translucent in `rgb`, but as solid in `depth`, where the wall hides the device. A batch
+renders its simulations one after the other. In a task with several anatomies each image
+equals that of a task with the anatomy of its simulation alone; the first image compiles
+a model with all meshes. A moving vessel is drawn at its present position; its mesh is
+computed and uploaded for each image, which takes longer.
 
 All cameras of a process render in one thread of their own, so `physics.render` and
 other uses of OpenGL do not disturb them. Such a process cannot be
@@ -161,21 +161,22 @@ RANDOMISATION = """
 ## Domain randomisation
 
 Randomisation is off by default. With `task_kwargs={"randomisation": True}` every reset
-draws from the default ranges, with a mapping from the ranges that it gives. A range is
-`[low, high]` of a uniform distribution, or a `dm_control.composer.variation.Variation`.
-All draws, including quantum noise, come from the environment's random state; single and
-batched environments draw the same values.
+draws all quantities from the default ranges; a mapping gives the ranges of some
+quantities, and the others stay as without randomisation. A range is `[low, high]` of a
+uniform distribution, or a `dm_control.composer.variation.Variation`. All draws,
+including quantum noise, come from the environment's random state; single and batched
+environments draw the same values.
 
 {table}
 
-What an episode has drawn is readable: `env.task.conditions` of a composer environment,
+The drawn values of an episode are `env.task.conditions` of a composer environment,
 `env.unwrapped.conditions` of a Gymnasium environment, and a list with one for each
-simulation, `conditions` of `BatchSimulation` and `CathSimVectorEnv`. It is a named
+simulation, `conditions` of `BatchSimulation` and `CathSimVectorEnv`. They are a named
 tuple of the quantities above in their units, with the names of anatomy and goal, the
 insertion and the displacement of the start as they were applied, and, under `effects`,
-what a living vessel has drawn: phases and rates of heart and breathing, material of the
-wall. Quantities that are not randomised are None. Recorded episodes hold it as
-`meta["conditions"]`.
+the drawn phases and rates of heart and breathing and the material of the wall of a
+living vessel. Quantities that are not randomised are None. Recorded episodes contain
+them as `meta["conditions"]`.
 """
 
 
