@@ -177,8 +177,8 @@ def _tell_of_compiling() -> None:
     if "compiling" not in _told:
         _told.add("compiling")
         print(
-            "compiling for this machine, once, what has not been needed before: the "
-            "whole physics takes about 10 s, of coaxial devices 20 s",
+            "compiling for this machine, once; the result is cached: the whole physics "
+            "takes about 10 s, that of coaxial devices 20 s",
             file=sys.stderr,
         )
 
@@ -187,8 +187,8 @@ def _warn_of_damage(path: str, why: str) -> None:
     if "damage" not in _told:
         _told.add("damage")
         _LOG.warning(
-            "%s, a file of compiled loops, is damaged (%s); such files are thrown away "
-            "and compiled anew, which takes up to a minute",
+            "%s, a file of compiled loops, is damaged (%s); such files are deleted "
+            "and compiled again, which takes up to a minute",
             path,
             " ".join(why.split()),
         )
@@ -198,7 +198,7 @@ def _warn_of_no_place(folder: str, why: str) -> None:
     if "place" not in _told:
         _told.add("place")
         _LOG.warning(
-            "compiled loops cannot be kept in %s (%s), so every process compiles anew; "
+            "compiled loops cannot be kept in %s (%s), so every process compiles them; "
             "make room there, or set NUMBA_CACHE_DIR to another folder",
             folder,
             why,

@@ -40,7 +40,11 @@ def test_configs_survive_json(algorithm, preset):
         (SACConfig, {"random_frames": 10}, "random_frames is 10.*256"),
         (SACConfig, {"replay_frames": 32}, "replay_frames is 32"),
         (PPOConfig, {"hidden": ()}, "hidden is .*one entry or more"),
-        (PPOConfig, {"training_start": (0.1, 0.2, 0.3)}, "training_start .*two shares"),
+        (
+            PPOConfig,
+            {"training_start": (0.1, 0.2, 0.3)},
+            "training_start .*two fractions",
+        ),
     ],
 )
 def test_bad_values_are_named(kind, settings, message):

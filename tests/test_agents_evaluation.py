@@ -464,7 +464,7 @@ def test_a_function_of_one_observation_is_told_what_to_do():
         return torch.zeros(21)
 
     options = {"task_kwargs": {"max_steps": 3}}
-    with pytest.raises(ValueError, match=r"one answered with shape \(21,\); it must"):
+    with pytest.raises(ValueError, match=r"one returned shape \(21,\); it must"):
         evaluate(one, "type1_bca", 2, **options)
     with pytest.raises(ValueError, match=r"shape \(1, 21\); it must be \(2, 21\)"):
         evaluate(lambda many: one(many)[None], "type1_bca", 2, **options)

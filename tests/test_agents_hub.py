@@ -111,10 +111,10 @@ def test_damaged_weights_and_those_that_are_not_there_are_refused(local):
     ("text", "said"),
     [
         ("hf:me/nav", "names no commit.*hf:me/nav@"),
-        ("hf:me/nav@main", "no place on the hub"),
-        (f"hf:nav@{COMMIT}", "no place on the hub"),
-        (f"hf:me/../nav@{COMMIT}", "no place on the hub"),
-        (f"hf:me/nav@{COMMIT}#../x", "no place on the hub"),
+        ("hf:me/nav@main", "no repository on the hub"),
+        (f"hf:nav@{COMMIT}", "no repository on the hub"),
+        (f"hf:me/../nav@{COMMIT}", "no repository on the hub"),
+        (f"hf:me/nav@{COMMIT}#../x", "no repository on the hub"),
     ],
 )
 def test_only_a_pinned_commit_is_fetched(local, text, said):

@@ -907,7 +907,7 @@ def test_a_shipped_policy_drives_its_task_as_it_plays_it(cathsim, shared_environ
         with pytest.raises(ValueError, match="of the suite: cathsim serve"):
             require_fit(other, {"name": "x", **table})
     code, _, told = cathsim("drive", "expert", "--connect", "127.0.0.1:9")
-    assert code == 2 and "looks at the simulation" in told
+    assert code == 2 and "reads the simulation" in told
     code, _, told = cathsim("serve", "type1_lca")
     assert code == 2 and "type1_lcca" in told
 

@@ -47,7 +47,7 @@ def test_list_shows_every_task_with_a_line_and_variants_once(cathsim):
     assert code == 0 and not err
     for name in (*(n for n in TASKS if not n.endswith(("_wire", "_pair"))), "navigate"):
         assert name in out
-    tasks, policies = out.split("Policies that ship:")
+    tasks, policies = out.split("Shipped policies:")
     assert tasks.count("_pair") == tasks.count("_wire") == 1
     assert "pretrained:navigator_pair" in policies
     assert "brachiocephalic" in out
@@ -554,7 +554,7 @@ def test_every_setting_is_a_typed_option(cathsim, tmp_path):
     assert Checkpoint.open(tmp_path).config == config.replace(total_frames=128)
     same = "--resume", "--algo", "ppo"
     code, _, err = cathsim("train", "--out", tmp_path, *same, "--frames", 64)
-    assert code == 0 and "128 frames are done, and 64 are asked for" in err
+    assert code == 0 and "128 frames are done, of --frames 64: nothing" in err
     code, _, err = cathsim("train", "--out", tmp_path, "--resume", "--clip", 0.3)
     assert code == 2 and "clip: it has 0.1, given is 0.3" in err
 
@@ -608,7 +608,7 @@ def test_an_interrupted_training_says_how_to_go_on(cathsim, tmp_path):
     saved = Checkpoint.open(out).frames
     (line,) = [line for line in err.splitlines() if "interrupted" in line]
     assert f"after {saved} of 1000000 frames" in line
-    again = shlex.split(line.split("go on with: ")[1])
+    again = shlex.split(line.split("continue with: ")[1])
     assert again[0] == "cathsim"
     code, printed, err = cathsim(*again[1:], "--frames", saved + 64)
     assert code == 0, err

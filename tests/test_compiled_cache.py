@@ -80,7 +80,7 @@ def test_a_damaged_cache_is_compiled_anew(run, suffix, damage, folder, caplog):
     assert run() == (42, 0)
     (record,) = caplog.records
     assert str(path) in record.getMessage() and "\n" not in record.getMessage()
-    assert "compiled anew" in record.getMessage()
+    assert "compiled again" in record.getMessage()
     assert run() == (42, 1)  # it is whole again
     assert len(caplog.records) == 1
 

@@ -153,7 +153,7 @@ def test_commands_with_the_option_import_the_modules(cathsim, command):
     ("name", "message"),
     [
         ("", "give the name of a module"),
-        ("own_missing", "no such module where Python looks, nor in"),
+        ("own_missing", "no such module in Python's path, nor in"),
         ("own_three.py", "no such module"),
         ("own-three", "without .py"),
         ("own_broken", "--import own_broken fails: division by zero"),

@@ -38,13 +38,13 @@ def check_collector(config: TrainingConfig, learner: type[Learner]) -> None:
     if not learner.remote:
         raise ConfigError(
             f"collector={config.collector!r} cannot collect for {config.algorithm}, "
-            "whose expert looks at the simulations of this process: choose "
+            "whose expert reads the simulations of this process: choose "
             "collector='local'."
         )
     if config.num_envs % config.collectors:
         raise ConfigError(
             f"num_envs={config.num_envs} is not a multiple of "
-            f"collectors={config.collectors}: every collector has as many."
+            f"collectors={config.collectors}: each collector has the same number."
         )
     with files.refused(ConfigError, f"collector={config.collector!r}", ImportError):
         extras.require("ray", "ray")

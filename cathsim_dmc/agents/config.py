@@ -228,7 +228,9 @@ class TrainingConfig:
         named = bounds.SIMULATION_DEVICES
         require(bool(place), "simulation_device", self.simulation_device, named)
         ordered = start is None or (len(start) == 2 and start[0] <= start[1])
-        require(ordered, "training_start", start, "two shares (low, high), low <= high")
+        require(
+            ordered, "training_start", start, "two fractions (low, high), low <= high"
+        )
         try:
             json.dumps(self.task_kwargs, allow_nan=False)
         except (TypeError, ValueError) as error:

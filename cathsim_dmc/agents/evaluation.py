@@ -350,9 +350,9 @@ def _checked(policy: Policy, given: Any, env: EnvBase) -> torch.Tensor:
     if actions.shape != env.action_spec.shape:
         count, entries = env.action_spec.shape
         raise ValueError(
-            f"the policy {policy.name} answered with shape {tuple(actions.shape)}; it "
+            f"the policy {policy.name} returned shape {tuple(actions.shape)}; it "
             f"must be ({count}, {entries}), a row for each of the {count} episodes, "
-            "which are played side by side. A function f of one observation is called "
+            "which are played in parallel. A function f of one observation is called "
             "for each: lambda many: torch.stack([f(one) for one in many])"
         )
     return actions

@@ -52,13 +52,13 @@ def parse(text: str, pinned: bool = True) -> Reference:
         if pinned:
             form = "hf:OWNER/NAME@COMMIT, with 40 hexadecimal digits,"
         raise ValueError(
-            f"{text} is no place on the hub; give {form} and #POLICY where the "
+            f"{text} is no repository on the hub; give {form} and #POLICY where the "
             "repository holds several"
         )
     parts = found.groupdict()
     if pinned and parts["commit"] is None:
         raise ValueError(
-            f"{text} names no commit, so it could be another thing tomorrow; give "
+            f"{text} names no commit, so its content may change; give "
             f"{text.partition('#')[0]}@ and the 40 digits that `cathsim upload` "
             "printed, or that its page shows under Files, History"
         )

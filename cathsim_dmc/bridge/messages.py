@@ -276,7 +276,7 @@ def require_version(message: Mapping[str, Any]) -> None:
     if message["protocol"] != PROTOCOL:
         raise BridgeError(
             "wrong_version",
-            f"the other side speaks {message['protocol']}, this one {PROTOCOL}",
+            f"the other side has protocol {message['protocol']}, this one {PROTOCOL}",
         )
 
 

@@ -118,7 +118,7 @@ def drive(
     player = agents.load_policy(policy, scripted=False)
     if not isinstance(player, FunctionPolicy):
         raise ValueError(
-            f"the policy {player.name!r} looks at the simulation, which is not in this "
+            f"the policy {player.name!r} reads the simulation, which is not in this "
             "program; give a run, a checkpoint or pretrained:NAME"
         )
     done = []
@@ -200,7 +200,7 @@ def require_fit(
         if unchecked:
             return None
         raise ValueError(
-            f"what {player.name} was trained with cannot be told here, so the device "
+            f"the interface of {player.name} is not known here, so the device "
             f"{welcome['name']!r} cannot be compared with it; give what is missing, or "
             f"drive it --unchecked: {error}"
         ) from error

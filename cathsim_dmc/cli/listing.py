@@ -41,7 +41,7 @@ def show(devices: bool = False, json: Json = False, modules: Modules = ()) -> in
     for suffix, (_, words) in suite.COAXIAL.items():
         table.add_row(f"…_{suffix}", f"Each task but navigate, {words}.")
     console().print(table)
-    console().print("\nPolicies that ship: " + ", ".join(policies), highlight=False)
+    console().print("\nShipped policies: " + ", ".join(policies), highlight=False)
     return 0
 
 
@@ -49,8 +49,8 @@ def _device_table(rows: dict[str, dict[str, Any]]) -> Table:
     table = Table("device", box=None)
     columns = {
         "Ø mm": "outer_diameter_mm",
-        "lumen": "lumen_diameter_mm",
-        "EI shaft": "shaft_bending_stiffness_n_mm2",
+        "lumen mm": "lumen_diameter_mm",
+        "EI shaft N·mm²": "shaft_bending_stiffness_n_mm2",
         "EI tip N·mm²": "tip_bending_stiffness_n_mm2",
         "tip mm": "tip_length_mm",
     }

@@ -78,7 +78,7 @@ def _import(name: str) -> None:
         if error.name is None or not f"{name}.".startswith(f"{error.name}."):
             raise  # the missing module is one that the named module imports
         raise ValueError(
-            f"--import {name}: no such module where Python looks, nor in {here}"
+            f"--import {name}: no such module in Python's path, nor in {here}"
         ) from error
     except Exception as error:
         with files.refused(ValueError, f"--import {name} fails", Exception):

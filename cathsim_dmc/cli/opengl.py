@@ -27,7 +27,7 @@ def import_command(module: str, arguments: list[str]) -> ModuleType:
             raise
         say(
             f"cathsim: MUJOCO_GL={chosen}, but it cannot be loaded here "
-            f"({type(error).__name__}: {error}); going on with MUJOCO_GL=disable"
+            f"({type(error).__name__}: {error}); continuing with MUJOCO_GL=disable"
         )
         again = [sys.executable, "-m", "cathsim_dmc.cli", *arguments]
         os.execve(sys.executable, again, {**os.environ, "MUJOCO_GL": "disable"})

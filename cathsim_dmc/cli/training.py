@@ -106,13 +106,13 @@ def _train(config: agents.TrainingConfig, run: _Run) -> int:
             again += ["--import", module]
         say(
             f"interrupted after {result.frames} of {config.total_frames} frames, "
-            f"which are saved; go on with: {shlex.join(again)}"
+            f"which are saved; continue with: {shlex.join(again)}"
         )
         return INTERRUPTED
     if done and done[0] >= config.total_frames:
         say(
-            f"{done[0]} frames are done, and {config.total_frames} are asked for: "
-            "nothing is left to train (--frames)"
+            f"{done[0]} frames are done, of --frames {config.total_frames}: nothing is "
+            "left to train"
         )
     print(f"{result.frames} frames in {result.seconds:.0f} s: {result.checkpoint}")
     return 0

@@ -132,8 +132,8 @@ def field(struct: str, name: str) -> tuple[int, Any, Any]:
         proved = False
     if not proved:
         raise RuntimeError(
-            f"{struct}.{name} of MuJoCo {mujoco.__version__} is not where it is said "
-            "to be; install a version that pyproject.toml allows"
+            f"{struct}.{name} of MuJoCo {mujoco.__version__} has another offset than "
+            "documented; install a version that pyproject.toml allows"
         )
     return place, kind, known
 

@@ -50,8 +50,8 @@ _STEERABLE_TUBE = (
     "(unpublished figure)"
 )
 _FIVE_FRENCH = (
-    "EI: shaft between that tube's body (22.7 N·mm²) and an Amplatz wire (291), tip "
-    "that body's own; lumen 1.0 mm, for wires up to 0.038 inch"
+    "EI: shaft between the body of steerable_4f (22.7 N·mm²) and an Amplatz wire "
+    "(291), tip as that body; lumen 1.0 mm, for wires up to 0.038 inch"
 )
 
 # The device of the registered tasks: the published discretisation of the tip (ten links
@@ -97,7 +97,7 @@ def _shaped(name: str, source: str, *arcs: Arc, tip_links: int = 10) -> Device:
     )
 
 
-_OUTLINE = "one bend, as the type has; its size assumed, within some 10° and 2 mm"
+_OUTLINE = "one bend, as this type has; its size is assumed, to within 10° and 2 mm"
 DIAGNOSTIC_5F_J = _shaped(
     "diagnostic_5f_j", "arc of 12.1 mm over 72°", Arc(12.1e-3, math.radians(72))
 )

@@ -360,7 +360,9 @@ def _set_random(sources: Sequence[np.random.RandomState], arrays: Arrays) -> Non
     rest = arrays["rest"]
     # numpy reads its words at this place, without a check of bounds.
     if not ((rest[:, 0] >= 0) & (rest[:, 0] <= _WORDS)).all():
-        raise ValueError(f"the snapshot's random states stand at {rest[:, 0].tolist()}")
+        raise ValueError(
+            f"the snapshot's random states have the positions {rest[:, 0].tolist()}"
+        )
     pairs = zip(sources, arrays["words"], rest.tolist(), strict=True)
     for source, words, (place, has_gauss, gauss) in pairs:
         source.set_state(("MT19937", words, int(place), int(has_gauss), gauss))

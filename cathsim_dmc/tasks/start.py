@@ -108,8 +108,8 @@ class StartPosture:
             if not self._ahead:
                 raise ValueError(
                     f"start_along_route is {tuple(along_route)}: "
-                    f"{scene.catheter.device.name!r} can be laid nowhere there in "
-                    f"{scene.anatomy.name!r}; give smaller shares"
+                    f"{scene.catheter.device.name!r} fits nowhere there in "
+                    f"{scene.anatomy.name!r}; give smaller fractions"
                 )
         self._starts, self._scale = [rest], 1.0
         self._radius = config.randomisation.start_radius
