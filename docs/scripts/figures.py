@@ -117,7 +117,7 @@ def families(checks: list[dict]) -> dict[str, list[dict]]:
 
 def table(checks: list[dict]) -> list[str]:
     """Table with the worst value of each family, as lines of Markdown."""
-    rows = ["| check | worst | bound | figures |", "|---|---|---|---|"]
+    rows = ["| check | worst | bound | checks |", "|---|---|---|---|"]
     for (name, unit, bound), group in families(checks).items():
         worst = max if bound.startswith("<=") else min
         value = f"{worst(check['value'] for check in group):.3g} {unit}".strip()
