@@ -27,7 +27,7 @@ _BADGE = (
     "docs/tutorials/{name})"
 )
 _INSTALL = """\
-# Installs the package in Colab, beside the torch that is there; nothing elsewhere.
+# In Colab: installs the package and keeps Colab's torch. Elsewhere: no effect.
 import sys
 
 # OWNER/NAME on GitHub, or a wheel of `make dist` that you upload.
