@@ -233,7 +233,7 @@ def load(
         visualize_reward: Has no effect.
 
     Raises:
-        ValueError: if domain, task or an option does not exist; says which do.
+        ValueError: if domain, task or an option does not exist; lists those that do.
     """
     if domain_name == DOMAIN:
         known(task_name)

@@ -28,7 +28,7 @@ class BatchSource(Protocol):
 
 
 def check_collector(config: TrainingConfig, learner: type[Learner]) -> None:
-    """Check that collectors on a cluster can do what the settings ask for.
+    """Check that collectors on a cluster support the settings.
 
     Raises:
         ConfigError: they cannot; the message says what to change.

@@ -16,8 +16,8 @@ SHADOW = 32.0
 class ObservationNormaliser(nn.Module):
     """Shift and scale each entry to zero mean and unit spread, then clip.
 
-    Entries mix metres with inertias of 1e-9 kg m^2, so no common epsilon fits: an
-    entry whose spread cannot be told from rounding gives exactly zero instead of
+    Entries mix metres with inertias of 1e-9 kg m^2, so no common epsilon fits: an entry
+    whose spread cannot be distinguished from rounding gives exactly zero instead of
     amplified noise. Statistics change only in `update`, never in `forward`, and are
     buffers, so they are saved with the weights.
 

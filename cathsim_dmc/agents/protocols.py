@@ -29,7 +29,7 @@ class Protocol(NamedTuple):
     """Conditions of an evaluation.
 
     Attributes:
-        episodes: Number of episodes, unless another one is asked for.
+        episodes: Number of episodes, unless another one is given.
         task_kwargs: Options of the task, over all others.
         devices: Devices that episodes take in turn where the options name none.
     """

@@ -17,7 +17,7 @@ _DIGEST = "first.sha256"  # file with the digest of the first transitions, see `
 
 
 class ReplayError(ValueError):
-    """The files of a replay are missing, damaged or not the ones asked for."""
+    """The files of a replay are missing, damaged or not those of the run."""
 
 
 class ReplayMemory:

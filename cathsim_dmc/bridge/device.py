@@ -33,7 +33,7 @@ class State(NamedTuple):
             at the base.
         time: Clock of the device, s.
         end: Why the episode is over: "success", "truncated", "physics_error" or
-            "force_limit"; None while it goes on.
+            "force_limit"; None while the episode runs.
     """
 
     observation: Mapping[str, np.ndarray]
@@ -50,7 +50,8 @@ class Device(Protocol):
         period: Duration of a control step, s.
         action: A dictionary for each entry of an action, see `interface.action_table`:
             "name" and "unit"; "scale", "low" and "high" where they are known. Entries
-            whose unit holds "/s", such as m/s, are 0 when the device must hold still.
+            whose unit contains "/s", such as m/s, are 0 when the device must hold
+            still.
         observation: A dictionary for each array, see `interface.observation_table`:
             "key", "shape" and "dtype", and "unit" where it is known.
     """

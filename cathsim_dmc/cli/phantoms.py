@@ -67,7 +67,7 @@ def import_phantom(
         units: Unit of a surface, and of CSV centrelines, inlet and heart; guessed if
             not given. Of a label map only where its header is wrong or names none.
         frame: Frame of a surface, and of CSV centrelines, inlet and heart; by default
-            what the file says (3D Slicer's do), else LPS.
+            the one that the file names (as 3D Slicer writes it), else LPS.
         axes: Of a scan that does not stand upright: where +x, +y and +z of that frame
             point in the patient, three of L, R, A, P, S, I, such as ILA; or nine
             numbers, the patient's left, back and head as directions in that frame.

@@ -351,7 +351,7 @@ class NotCompiledError(ValueError):
 
 
 class Callback:
-    """A function that C calls, compiled when its address is first asked for."""
+    """A function that C calls, compiled when its address is first requested."""
 
     def __init__(self, function: Callable, signature: str, cache: bool):
         self._function, self._signature, self._cache = function, signature, cache

@@ -88,7 +88,7 @@ def _disc(radius: float) -> float:
 
 
 def carried_mass(devices: Sequence[Device]) -> float:
-    """Mass per length of the blood that coaxial devices carry, kg/m.
+    """Added mass of blood per length of coaxial devices, kg/m.
 
     Across its axis, a cylinder moves as much blood around it as it displaces (potential
     flow), and all blood in its lumen.

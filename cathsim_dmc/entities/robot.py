@@ -110,7 +110,7 @@ def pose(qpos, held, joints):
     Args:
         qpos: (N, nq), MuJoCo's, written.
         held: (2,) int, indices in `qpos` of insertion and rotation of the device; a
-            negative index stands for the value 0.
+            negative index means the value 0.
         joints: (len(JOINTS),) int, indices in `qpos` of the joints.
     """
     given = np.zeros((4, len(qpos)))

@@ -1,6 +1,6 @@
 """Blood at rest: its drag across the links of the device, in every physics step.
 
-`laws.blood` has the law. docs/physics.md says what is left out.
+`laws.blood` has the law. docs/physics.md lists what is left out.
 """
 
 from numpy.random import RandomState

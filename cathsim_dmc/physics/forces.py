@@ -26,7 +26,7 @@ REFINEMENT = 8
 class Contacts:
     """Contacts of the device with the wall; K rows, of which some are empty.
 
-    World frame, SI units, float64. Empty rows hold zeros. A contact with a hollow wall
+    World frame, SI units, float64. Empty rows are zeros. A contact with a hollow wall
     may be two rows, each with about half of the load.
 
     Attributes:

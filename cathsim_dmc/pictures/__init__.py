@@ -85,7 +85,7 @@ def fluoroscopy(env: Any, *, seed: int = 0, **options: Any) -> np.ndarray:
 
     Args:
         env: What `cathsim_dmc.suite.load` returns, after a reset.
-        seed: Seed of the quantum noise, if `noise=True` is asked for.
+        seed: Seed of the quantum noise, used with `noise=True`.
         **options: Fields of `FluoroscopyOptions` that differ from the task's,
             such as `view="LAO45"`, `size=512`, `contrast=False`.
 

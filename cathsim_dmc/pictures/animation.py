@@ -47,8 +47,8 @@ def animate(
 ) -> Path:
     """Write an episode as an animated GIF or WebP or an MP4, whole or not at all.
 
-    On the left the vessel as glass with device, goal and contact forces, on the right
-    the X-ray image over the force on the wall.
+    On the left the translucent vessel with device, goal and contact forces, on the
+    right the X-ray image above the force on the wall.
 
     Args:
         surface: Lumen surface, `anatomy.surface`.
@@ -63,7 +63,7 @@ def animate(
     Raises:
         ValueError: on another suffix, or an episode without a goal.
         FileNotFoundError: if the folder does not exist.
-        ImportError: if an MP4 is asked for and cannot be encoded.
+        ImportError: if `path` is an MP4 and cannot be encoded.
     """
     bounds.instance("episode", episode, Episode)
     bounds.whole("frames", frames, 1, bounds.MOST_STEPS)

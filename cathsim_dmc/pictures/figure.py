@@ -187,7 +187,7 @@ def draw_fluoroscopy(
     """Draw the X-ray image of a moment, with the goal as a ring.
 
     Args:
-        options: Set-up of the machine; None takes the task's, zoomed in.
+        options: Set-up of the C-arm; None takes the task's, zoomed in.
         window: Grey levels that are black and white; percentiles of the image if None.
 
     Returns:

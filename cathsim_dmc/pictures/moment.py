@@ -36,7 +36,7 @@ class Moment:
         force_scale: Force of the last colour of the scale.
         path: (P, 3) past places of the head, or (0, 3).
         title: Text above the picture.
-        x_ray: Fluoroscopy options, machine's deviation and devices of the episode.
+        x_ray: Fluoroscopy options, deviation of the C-arm and devices of the episode.
         shadows: X-ray shadows of the devices.
         upright: Whether the sides of the patient are known, see `is_upright`.
     """
@@ -146,7 +146,7 @@ _machine = functools.lru_cache(maxsize=8)(Angiograph)  # each holds some megabyt
 
 
 def fluoroscope_of(moment: Moment, options: FluoroscopyOptions) -> Fluoroscope:
-    """The frontal plane of the episode's machine, with the vessel at rest."""
+    """The frontal plane of the episode's C-arm, with the vessel at rest."""
     return _machine(moment.rest, options).planes(moment.x_ray.deviation)[0]
 
 

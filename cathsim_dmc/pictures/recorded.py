@@ -48,7 +48,7 @@ def record(
             `start` it seeds the policy alone.
         max_steps: Number of control steps after which the episode is cut off.
         task_name: Name of the task in the record; that of the environment otherwise.
-        start: Snapshot of a running episode, which the policy goes on with; the record
+        start: Snapshot of a running episode, which the policy continues; the record
             begins there. None for a new episode.
 
     Returns:
@@ -60,7 +60,7 @@ def record(
             returns no action of the environment, or `start` is of another task or of
             an episode that has ended.
         OSError: the file's folder does not exist or is read-only.
-        ImportError: an MP4 is asked for without the extra `video`.
+        ImportError: `path` is an MP4 and the extra `video` is missing.
     """
     if path is not None:
         _checked(path)
@@ -117,7 +117,7 @@ def as_function(
 def write(
     episode: Episode, env: Any, path: str | os.PathLike[str], fluoroscopy: bool = True
 ) -> Path:
-    """Write an episode in the format that the file's name asks for.
+    """Write an episode in the format of the file's suffix.
 
     Args:
         env: The environment, for the anatomy and the shapes of the robot.

@@ -70,7 +70,7 @@ class Episode:
 
     Raises:
         ValueError: on a wrong shape, a value that is not finite, contacts out of order,
-            or metadata that JSON cannot hold.
+            or metadata that JSON cannot represent.
     """
 
     task: str

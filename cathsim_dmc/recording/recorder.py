@@ -108,13 +108,13 @@ class EpisodeRecorder:
                 random state continues, and the episode cannot be repeated.
             max_steps: Ends the episode as truncated; by default only the environment
                 ends it.
-            start: Snapshot of a running episode, of which the record holds what
-                follows, in place of a reset; it has a random state of its own.
+            start: Snapshot of a running episode, from which the recording starts, in
+                place of a reset; it has a random state of its own.
 
         Raises:
-            ValueError: if the policy returns an action of a wrong shape or with
-                values that are not finite, ``max_steps`` is not positive, or
-                ``start`` does not fit or comes with a seed.
+            ValueError: if the policy returns an action of a wrong shape or with values
+                that are not finite, ``max_steps`` is not positive, or ``start`` does
+                not fit or is given with a seed.
         """
         if start is not None and seed is not None:
             raise ValueError(

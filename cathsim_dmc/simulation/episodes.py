@@ -71,7 +71,7 @@ def play_alone(
     Args:
         choose: Function from the present time step to the action. It may raise
             StopIteration to end the episode.
-        start: Snapshot of a running episode, which goes on; None for a reset.
+        start: Snapshot of a running episode, which is continued; None for a reset.
 
     Yields:
         The start, with None, then the action and time step of every control step.

@@ -138,7 +138,7 @@ class CathSimEnv(gymnasium.Env):
 
     @property
     def conditions(self) -> Conditions:
-        """What the present episode has drawn; see `tasks.conditions`."""
+        """Drawn values of the present episode; see `tasks.conditions`."""
         return self.environment.task.conditions
 
     def snapshot(self) -> Snapshot:

@@ -59,9 +59,9 @@ def write_mjcf(
 
     Raises:
         ValueError: the task or an option does not exist, or the task has no single
-            scene because it draws its anatomy anew in each episode.
+            scene because each episode draws its anatomy.
         FileExistsError: the directory exists.
-        ModuleNotFoundError: CoACD is asked for and not installed.
+        ModuleNotFoundError: CoACD is selected and not installed.
     """
     directory = Path(directory)
     if directory.exists():

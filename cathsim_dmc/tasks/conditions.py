@@ -1,4 +1,4 @@
-"""What an episode has drawn, for logs, recordings and conditioned policies."""
+"""Drawn values of an episode, for logs, recordings and conditioned policies."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence

@@ -14,7 +14,7 @@ def action_table(chain: Chain) -> list[dict[str, Any]]:
 
     Returns:
         A dictionary for each of the A entries: "name", "low", "high", "meaning", and
-        "scale", the value that 1 stands for, in "unit".
+        "scale", the value of the action 1 in "unit".
     """
     motors = {one.name: one for one in getattr(chain, "tip_motors", ())}
     rows = []

@@ -363,7 +363,7 @@ class Navigation(composer.Task, NotCopied):
 
     @property
     def conditions(self) -> Conditions:
-        """What the present episode has drawn: friction, start, anatomy and others."""
+        """Drawn values of the present episode: friction, start, anatomy and others."""
         self._current()
         return self.rollout.conditions()
 

@@ -49,7 +49,7 @@ class Outcome(NamedTuple):
         success: (...) bool, which ends the episode.
         terms: name to weighted reward term (...).
         failed: (...) bool, which ends the episode without success, such as a limit of
-            force that is exceeded; None for never. A success counts even so.
+            force that is exceeded; None for never. Success takes precedence.
     """
 
     reward: np.ndarray
@@ -208,8 +208,8 @@ class Cannulation(Shiftable, Routed):
         Args:
             goal: Goal in the lumen of one of its vessels.
             reward: Weights of the reward terms.
-            goal_radius: Distance from the goal that counts as reached, m; by default
-                8 mm, or what a short branch has room for.
+            goal_radius: Distance from the goal that counts as reached, m; by default 8
+                mm, less in a short branch.
             farthest_shift: Largest shift of the goal away from the ostium, m.
         """
         vessel = anatomy.tree.vessel(goal.vessel)

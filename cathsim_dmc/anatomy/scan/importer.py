@@ -56,12 +56,12 @@ def import_scan(
             Or a label map (NIfTI, NRRD), whose unit and frame are its own.
         centreline_paths: 3D Slicer markups or tables x,y,z[,radius], one per branch;
             the branch is called after the file (centreline-LCCA.mrk.json: "lcca").
-            Without any they are computed, and named where the arch tells how.
-        units: of the mesh, of tables and of ``inlet``: "mm", "cm", "m", "um" or
-            "inch"; None takes that of a label map's header, or guesses by the width
-            of the lumen and the size, and says so.
-        mesh_frame: "LPS" or "RAS", of the mesh, of tables and of ``inlet``; None is
-            what the mesh's file says (3D Slicer's do), else LPS.
+            Without any they are computed, and named if the arch identifies them.
+        units: of the mesh, of tables and of ``inlet``: "mm", "cm", "m", "um" or "inch";
+            None takes that of a label map's header, or guesses by the width of the
+            lumen and the size, with a note.
+        mesh_frame: "LPS" or "RAS", of the mesh, of tables and of ``inlet``; None takes
+            the frame that the mesh's file names (as 3D Slicer writes it), else LPS.
         axes: how that frame is turned in the patient, if the scan does not stand
             upright, such as "ILA", or nine numbers; see ``units.upright``.
         labels: values of a label map that are the lumen.
