@@ -19,7 +19,7 @@ from cathsim_dmc.analysis.force_statistics import millinewtons
 
 _FIGURES = ("success", "length", "max_force")
 _HEAD = """\
-# Policies that ship
+# Shipped policies
 
 Written by `python benchmarks/export.py`; the card beside each, NAME.json, has its \
 settings. Evaluated over 30 episodes by the published rule (2,000 control steps, \

@@ -1,4 +1,4 @@
-"""A force of one's own: a constant wind from the side on every link of the device.
+"""A user-defined force: a constant wind from the side on every link of the device.
 
     python examples/side_wind.py --wind 0 0 0.3
 
