@@ -52,7 +52,9 @@ def config_from_dict(values: Mapping[str, Any]) -> TrainingConfig:
 
 def _choice(table: Mapping[str, Any], name: object, what: str) -> Any:
     if not isinstance(name, str) or name not in table:
-        raise ConfigError(f"{what} {name!r} is unknown; choose one of {list(table)}.")
+        raise ConfigError(
+            f"{what} {name!r} is unknown; choose one of {', '.join(table)}."
+        )
     return table[name]
 
 

@@ -205,7 +205,7 @@ def record(
 
     Args:
         out: File to write: .rrd (Rerun, with an .npz beside it), .npz (arrays), or a
-            film as of --gif.
+            film as of --film.
         gif: Path of a film: .gif, .webp or, with the extra `video`, .mp4; needs no
             OpenGL.
         seed: Seed of the episode; with --start, of the policy only.
@@ -216,9 +216,11 @@ def record(
     """
     targets = [path for path in (out, gif) if path is not None]
     if not targets:
-        raise ValueError("nothing is to be written; give --out, an .rrd file, or --gif")
+        raise ValueError(
+            "nothing is to be written; give --out, an .rrd file, or --film"
+        )
     if gif == out:
-        raise ValueError(f"--out and --gif are both {out}; leave one of them out")
+        raise ValueError(f"--out and --film are both {out}; leave one of them out")
     for path, endings in (out, recorded.FORMATS), (gif, SUFFIXES):
         if path is not None and path.suffix not in endings:
             raise ValueError(f"{path} does not end in {' or '.join(endings)}")

@@ -48,7 +48,7 @@ class Clip:
         parts += [f"--{name} {value}" for name, value in self.options.items()]
         parts += [f"--seed {self.seed}"] if self.seed != EVALUATION_SEED else []
         parts += [f"--max-steps {self.steps}"] if self.steps else []
-        return " ".join([*parts, f"--gif {self.name}.webp"])
+        return " ".join([*parts, f"--film {self.name}.webp"])
 
 
 def _shipped(task: str, caption: str) -> Clip:
