@@ -56,7 +56,7 @@ def evaluate(
     make_env: EnvFactory = environments.make_env,
     on_cluster: bool = False,
 ) -> EvaluationResult:
-    """Play episodes with a policy, each with a seed of its own, all side by side.
+    """Play episodes with a policy in parallel, each with a seed of its own.
 
     A trained policy acts deterministically (the middle of its distribution) with
     frozen observation statistics. Only the first episode of each environment counts,
@@ -66,7 +66,7 @@ def evaluate(
         policy: Policy, or its name, path or function, see `policies.load_policy`.
         task: Name of the task; None takes the one that the policy was trained on.
         episodes: Number of episodes; None for that of the protocol.
-        seed: Seed of the first episode; the others lie above it.
+        seed: Seed of the first episode; those of the others are larger.
         protocol: Name of the conditions in `protocols.PROTOCOLS`.
         name: Name of the policy for the reports.
         observation: Name or names of observations; None takes the policy's own.

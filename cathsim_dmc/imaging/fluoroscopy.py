@@ -38,7 +38,7 @@ class Fluoroscope:
         vessel: (rows, columns) path length through the lumen, m.
         vessel_mask: (rows, columns) bool, pixels whose central ray meets the lumen.
         contrast: iodine in the lumen, kg/m³ (mg/ml); 0 is contrast off.
-        kerma, blur, gain, roadmap: Gy, m and two shares, see `FluoroscopyOptions`.
+        kerma, blur, gain, roadmap: Gy, m and two fractions, see `FluoroscopyOptions`.
     """
 
     carm: CArm

@@ -159,7 +159,7 @@ class Effect:
         """
 
     def conditions(self, index: int) -> Mapping[str, float]:
-        """What the episode of one simulation has drawn by `restart`, by name.
+        """Values that `restart` has drawn for the episode of one simulation, by name.
 
         It is read from the effect's state, so that it is that of a restored episode.
         Names begin with that of the effect and a dot, such as "wind.speed".

@@ -26,7 +26,7 @@ REFINEMENT = 8
 class Contacts:
     """Contacts of the device with the wall; K rows, of which some are empty.
 
-    World frame, SI units, float64. Empty rows are zeros. A contact with a hollow wall
+    World frame, SI units, float64. Empty rows are zeros. A contact with a concave wall
     may be two rows, each with about half of the load.
 
     Attributes:
@@ -73,7 +73,7 @@ class WallForce(NamedTuple):
 
     Attributes:
         sum: (...), sum of the magnitudes of all contacts, last substep.
-        max: (...), largest single contact, last substep; a hollow wall may have two
+        max: (...), largest single contact, last substep; a concave wall may have two
             contacts at one place.
         peak_sum: (...), largest sum of any substep of the control step; it depends
             on the physics step, see `PEAK_NOTE`.

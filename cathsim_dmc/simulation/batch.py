@@ -74,7 +74,7 @@ class BatchSimulation(NotCopied):
         """Compiles the task's model and starts the threads.
 
         Args:
-            task: Task that belongs to no environment; from now on it is the batch's.
+            task: Task that belongs to no environment; it then belongs to the batch.
             num_simulations: N.
             num_threads: Number of worker threads, 0 for one per core.
             seeds: Seeds of the simulations, or of the first; the others count up.
@@ -138,7 +138,7 @@ class BatchSimulation(NotCopied):
 
     @property
     def conditions(self) -> list[Conditions]:
-        """What the present episode of each simulation has drawn."""
+        """Drawn values of the present episode of each simulation."""
         return list(map(self.rollout.conditions, range(self.num_simulations)))
 
     def reset(self, indices: np.ndarray | None = None) -> Step:

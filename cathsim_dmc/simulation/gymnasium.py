@@ -305,7 +305,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def conditions(self) -> list[Conditions]:
-        """What the present episode of each simulation has drawn."""
+        """Drawn values of the present episode of each simulation."""
         return self.simulation.conditions
 
     def snapshot(self) -> Snapshot:

@@ -221,7 +221,7 @@ class Restorable:
         return np.array(found).reshape(len(planes), -1, 3, 4)
 
     def conditions(self, index: int = 0) -> Conditions:
-        """What the episode of one simulation has drawn; RuntimeError before any."""
+        """Drawn values of the episode of one simulation; RuntimeError before any."""
         if self._random_states is None:
             raise RuntimeError("no episode has begun; call reset() first")
         return self._drawn.of(index, self.case(index).scene, self.effects)
