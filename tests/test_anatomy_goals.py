@@ -61,6 +61,8 @@ def test_a_place_that_is_no_goal_is_refused(anatomy):
         placement.resolve_goal(anatomy, 7)
     with pytest.raises(ValueError, match="before the inlet, where a device starts"):
         placement.resolve_goal(moved(anatomy), place(anatomy, "trunk", 10e-3))
+    with pytest.raises(ValueError, match="5 mm past the inlet, where a device starts"):
+        placement.resolve_goal(moved(anatomy), place(anatomy, "trunk", 25e-3))
 
 
 def moved(anatomy):

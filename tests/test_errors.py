@@ -56,7 +56,7 @@ def test_wrong_domain_name():
         ({**TYPE1, "anatomy": "type9"}, ["type9", *ELSEWHERE]),
         ({**TYPE1, "anatomy": "no/such"}, ["no/such", *ELSEWHERE]),
         ({"max_steps": 10**400}, ["max_steps", "an integer from 1"]),
-        ({"physics_timestep": 0.003}, ["physics_timestep", "whole part"]),
+        ({"physics_timestep": 0.003}, ["physics_timestep", "divided by a whole"]),
         ({"physics_timestep": 0.02}, ["physics_timestep", "0.005", "outside_range"]),
         ({"device": STIFF}, ["'stiff'", "0.005 N·m²", "outside_range"]),
         ({"friction": -0.1}, ["friction", "-0.1", "from 0 to 2"]),

@@ -286,9 +286,11 @@ class TrainingConfig:
     def from_dict(cls, values: Mapping[str, Any]) -> "TrainingConfig":
         """Make a config from its fields by name; ConfigError if one is not allowed."""
         valid = [item.name for item in dataclasses.fields(cls)]
-        if unknown := sorted(set(values) - set(valid)):
+        if unknown := set(values) - set(valid):
+            names = ", ".join(sorted(map(str, unknown)))
             raise ConfigError(
-                f"{cls.__name__} has no field {unknown}; valid fields are {valid}."
+                f"{cls.__name__} has no field {names}; its fields are "
+                f"{', '.join(valid)}."
             )
         return cls(**values)
 

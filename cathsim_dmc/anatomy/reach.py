@@ -17,11 +17,11 @@ def least_ahead(inlet: Inlet) -> float:
     return min(OSTIUM_AHEAD, AHEAD_RADII * inlet.radius)
 
 
-def unreachable(anatomy: Anatomy) -> dict[str, list[str]]:
+def unreachable(anatomy: Anatomy, nearest: float = 0.0) -> dict[str, list[str]]:
     """Lists of names of unreachable goals, by the reason.
 
-    They lie behind the inlet, or in a branch whose ostium is less than `least_ahead`
-    ahead of the inlet.
+    They lie in the vessel of the inlet less than `nearest` (m) ahead of it, or in a
+    branch whose ostium is less than `least_ahead` ahead of it.
     """
     inlet, tree = anatomy.inlet, anatomy.tree
     line = tree.vessel(inlet.vessel).centreline
@@ -30,7 +30,7 @@ def unreachable(anatomy: Anatomy) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for name, goal in anatomy.goals.items():
         if goal.vessel == inlet.vessel:
-            place, least, what = goal.arc_length, 0.0, f"{name} lies"
+            place, least, what = goal.arc_length, nearest, f"{name} lies"
         else:
             branch = tree.vessel(goal.vessel)
             while branch.parent not in (inlet.vessel, None):

@@ -210,7 +210,10 @@ def _angles(name: str, view: View) -> tuple[float, float]:
     if is_best(view):
         return _ANY[name]
     if isinstance(view, str):
-        return VIEWS[bounds.choice(name, view, VIEWS)]
+        if view not in VIEWS:
+            names = ", ".join((*VIEWS, BEST))
+            bounds.refuse(name, view, f"one of {names}, or two angles in degrees")
+        return VIEWS[view]
     primary, secondary = bounds.vector(name, view, 2, -360.0, 360.0, "degrees")
     tilt = f"secondary angle of {name}"
     bounds.number(tilt, float(secondary), -89.0, 89.0, "degrees")

@@ -215,8 +215,8 @@ class NavigationConfig:
             bounds.refuse(
                 "physics_timestep",
                 self.physics_timestep,
-                f"a whole part of the control step of {CONTROL_TIMESTEP:g} s, from "
-                f"{least} to {most} physics steps each",
+                f"the control step of {CONTROL_TIMESTEP:g} s divided by a whole "
+                f"number from {least} to {most}",
             )
 
     def _check_range(self):

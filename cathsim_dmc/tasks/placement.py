@@ -12,6 +12,7 @@ from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.anatomy.reach import least_ahead, unreachable
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.sheath import CLEARANCE
+from cathsim_dmc.physics.randomisation import START_JITTER
 from cathsim_dmc.tasks.config import WORKING_LENGTHS
 
 # The steerable tip starts free of the sheath wherever the way to the first branching
@@ -95,7 +96,9 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal | Sequence[float]") -> Goal
             bounds.refuse("goal", goal, allowed + several)
         goal = anatomy.goal_at(goal)
         alone = dataclasses.replace(anatomy, goals={goal.name: goal})
-        for where in unreachable(alone):
+        # The farthest that the head starts past the inlet where the goal is near.
+        start = _LARGEST_SHARE * least_ahead(anatomy.inlet) + START_JITTER
+        for where in unreachable(alone, start + _LINE_SPACING):
             raise ValueError(
                 f"goal {goal.name}: {where}, where a device starts; give a place "
                 "farther in, or import with another inlet"
