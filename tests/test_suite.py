@@ -19,6 +19,7 @@ from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.physics import forces
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.navigation import Navigation
 
 # The goal does not move within an anatomy, unless it is randomised.
 CONSTANT = {"tracking_goal", "tracking_goal_pixels", "goal_position"}
@@ -215,6 +216,26 @@ def test_steps_in_one_loop_are_those_of_composer(shared_environment):
     np.testing.assert_array_equal(new, seen[0][-1]["position"])
     assert (old != new).any()
     for environment in environments:
+        environment.close()
+
+
+def test_a_subclass_of_the_task_gets_its_after_substep(shared_environment):
+    task = shared_environment("type1_lcca").task
+    times = []
+
+    class Sampled(Navigation):
+        def after_substep(self, physics, random_state):
+            super().after_substep(physics, random_state)
+            times.append(physics.time())
+
+    own = suite.environment(Sampled(task.scene, task.objective, task.config, 0))
+    alone = suite.environment(twin(task))
+    for environment in (own, alone):
+        environment.reset()
+    seen = [env.step(np.ones(21)).observation for env in (own, alone)]
+    assert len(times) == task.substeps
+    assert_bitwise_equal(seen[:1], seen[1:])
+    for environment in (own, alone):
         environment.close()
 
 

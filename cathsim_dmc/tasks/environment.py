@@ -6,6 +6,7 @@ import dm_env
 import numpy as np
 from dm_control import composer
 
+from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.snapshot import NotCopied, Snapshot
 
 
@@ -78,6 +79,7 @@ class Environment(composer.Environment, NotCopied):
             self._legacy_step
             or self._raise_exception_on_physics_error
             or _overridden(self.task, "before_substep")
+            or _overridden(self.task, "after_substep", of=Navigation)
             or before.entity_hooks
             or before.extra_hooks
             or after.entity_hooks
@@ -146,5 +148,7 @@ def _is_plain(enabled: Any) -> bool:
     return enabled.update_interval == 1 and enabled.delay == 0
 
 
-def _overridden(task: composer.Task, hook: str) -> bool:
-    return getattr(type(task), hook) is not getattr(composer.Task, hook)
+def _overridden(
+    task: composer.Task, hook: str, of: type[composer.Task] = composer.Task
+) -> bool:
+    return getattr(type(task), hook) is not getattr(of, hook)
