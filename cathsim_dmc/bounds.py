@@ -192,6 +192,8 @@ def random_state(name: str, value: Any) -> np.random.RandomState:
     """Returns the RandomState given, or a new one of a seed; None draws the seed."""
     if isinstance(value, np.random.RandomState):
         return value
+    if value is not None and not _is_whole(value):
+        refuse(name, value, "a numpy.random.RandomState, or an integer as its seed")
     return np.random.RandomState(None if value is None else seed(name, value))
 
 

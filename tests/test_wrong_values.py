@@ -26,6 +26,7 @@ from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
 from cathsim_dmc.policies.pursuit import Plan, Settings
 from cathsim_dmc.tasks.coaxial_ends import CoaxialEnds
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation
 from cathsim_dmc.tasks.retry import Pattern, RetrySettings
 from cathsim_dmc.tasks.route import Route
@@ -271,7 +272,7 @@ def test_what_a_task_shows_is_not_its_state(pair):
         np.testing.assert_array_equal(array, kept[name], name)
 
 
-AXIS = straight(0.2)
+AXIS, CONFIG = straight(0.2), NavigationConfig()
 
 
 @pytest.mark.parametrize(
@@ -298,11 +299,41 @@ AXIS = straight(0.2)
         (lambda: AngiographyArena(tolerance=-1), "tolerance is -1.*above 0"),
         (lambda: Phantom("type1"), "anatomy is 'type1'.*an Anatomy"),
         (lambda: Scene.build("type1", "lcca", {}), "config is {}.*a NavigationConfig"),
+        (lambda: Scene.build("type1", "lcca", CONFIG), "anatomy is 'type1'"),
+        (lambda: Navigation("type1", None), "scene is 'type1'.*a Scene"),
+        (lambda: Cannulation.to(None, "bca"), "goal is 'bca'.*a Goal"),
+        (lambda: suite.make_task(TASK, random=np.random), "RandomState, or an integer"),
     ],
 )
 def test_wrong_arguments_of_entities_are_refused(build, words):
     with pytest.raises(ValueError, match=words):
         build()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"friction": 0.1}, {"physics_timestep": 2e-3}, {"device": "steerable_4f"}, {}],
+)
+def test_a_task_has_the_options_of_its_scene(shared_environment, changes):
+    task = shared_environment(TASK).task
+    config, objective = dataclasses.replace(CONFIG, **changes), task.objective
+    if changes:
+        with pytest.raises(ValueError, match=f"config has {next(iter(changes))}=.*bui"):
+            Navigation(task.scene, objective, config)
+    with pytest.raises(ValueError, match="config is {}.*a NavigationConfig"):
+        Navigation(task.scene, objective, {})
+    assert Navigation(task.scene, objective).config is task.scene.config
+
+
+def test_a_wall_and_its_device_are_in_one_model(shared_environment):
+    phantom = Phantom(shared_environment(TASK).task.scene.anatomy, drawn=False)
+    device, arena = Catheter(), AngiographyArena()
+    arena.attach(phantom)
+    with pytest.raises(ValueError, match="'link_0' is not in the model"):
+        phantom.add_wall(device.links[0])
+    arena.attach(device)
+    phantom.add_wall(device.links[0])
+    assert arena.mjcf_model.find("geom", "wall") is not None
 
 
 @pytest.mark.parametrize("name", sorted(POLICIES))

@@ -82,8 +82,16 @@ class Phantom(composer.ModelWrapperEntity):
             hole: radius of the hole in the cap over the inlet, m; no cap if the hole is
                 as wide as the lumen.
             moving: whether heart and breathing may move the wall.
+
+        Raises:
+            ValueError: if phantom and device are not attached to the same arena.
         """
         root = self.mjcf_model.root_model
+        if device_body.root.root_model is not root:
+            raise ValueError(
+                f"device_body {device_body.full_identifier!r} is not in the model of "
+                "the phantom; attach both to one arena, then add the wall"
+            )
         lumen = self.anatomy.lumen.with_hole(hole)
         motion = self.anatomy.motion.lattice if moving else None
         root.worldbody.add(

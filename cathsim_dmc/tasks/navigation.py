@@ -68,7 +68,8 @@ class Navigation(composer.Task, NotCopied):
 
         Args:
             scene: Entities, attached to the arena, and their placement.
-            config: Options; those that shape the scene must be the scene's.
+            config: Options; those that shape the scene must be the scene's. None for
+                the scene's.
             random: Seed or source of randomness of the environment.
             others: Further scenes with their objectives; each episode then draws one
                 of all scenes. They have other anatomies, the same device and goals of
@@ -76,14 +77,17 @@ class Navigation(composer.Task, NotCopied):
             name: Name of the task in texts; None for the name of the class.
 
         Raises:
-            ValueError: if the objective does not support the randomisation, or the
-                scenes differ in more than their anatomies.
+            ValueError: if the scene was built with other options, the objective does
+                not support the randomisation, or the scenes differ in more than their
+                anatomies.
         """
+        bounds.instance("scene", scene, Scene)
+        config = scene.config if config is None else config
+        scene.check(config)
         self.name = name or type(self).__name__
         self.options: dict[str, Any] = {}
         self._scene = scene
         self._objective = objective
-        config = config or NavigationConfig()
         if others is None and (scan := scene.anatomy.scan) is not None:
             places = np.array([scene.anatomy.inlet.position, scene.goal.position])
             aimed = config.fluoroscopy.aimed(scan.vertices, places)

@@ -212,6 +212,7 @@ class Cannulation(Shiftable, Routed):
                 mm, less in a short branch.
             farthest_shift: Largest shift of the goal away from the ostium, m.
         """
+        bounds.instance("goal", goal, Goal)
         vessel = anatomy.tree.vessel(goal.vessel)
         if goal_radius is None:
             goal_radius = min(GOAL_RADIUS, anatomy.goal_room(goal))

@@ -32,6 +32,12 @@ _TORSION_JOINTS = 4
 # free motion, and as fast in a jam. MuJoCo's own limit is 60 degrees of freedom.
 _DENSE_LINKS = 50
 
+# Options that shape the device, the sheath or the arena.
+_SHAPING = (
+    "device", "devices", "lead", "lumen_friction", "rotation", "friction", "shaft_link",
+    "working_length", "sheath_clearance", "physics_timestep", "solver_tolerance",
+)  # fmt: skip
+
 # Cameras and their axes, right and up: the published top view, and one from the side.
 # Seen from the front, the patient's left is on the right of the image.
 VIEWS = {"top": (1, 0, 0, 0, 0, 1), "side": (0, 1, 0, 0, 0, 1)}
@@ -50,6 +56,7 @@ class Scene:
         catheter: the device, or the stack of coaxial devices.
         sheath: holds the device before the inlet.
         robot: the follower, which moves along with the device.
+        config: options with which the scene was built.
     """
 
     anatomy: Anatomy
@@ -60,6 +67,7 @@ class Scene:
     catheter: Chain
     sheath: Sheath
     robot: Robot
+    config: NavigationConfig
 
     @classmethod
     def build(
@@ -85,6 +93,7 @@ class Scene:
             ValueError: if goal, device or vessel options do not fit the anatomy.
         """
         bounds.instance("config", config, NavigationConfig)
+        bounds.instance("anatomy", anatomy, Anatomy)
         goal = placement.resolve_goal(anatomy, goal)
         config.vessel.check(anatomy)
         chosen, shift = chosen_devices(config), config.randomisation.farthest_shift
@@ -110,10 +119,22 @@ class Scene:
             catheter=catheter,
             sheath=Sheath(bore, radius, clearance=config.sheath_clearance),
             robot=Robot(device_radius=radius),
+            config=config,
         )
         scene._attach(config)
         scene._add_cameras(drawn)
         return scene
+
+    def check(self, config: NavigationConfig) -> None:
+        """Raises ValueError if options that shape a scene are not those of this one."""
+        bounds.instance("config", config, NavigationConfig)
+        for name in _SHAPING:
+            given, own = getattr(config, name), getattr(self.config, name)
+            if given != own:
+                raise ValueError(
+                    f"config has {name}={given!r}, but the scene was built with "
+                    f"{own!r}; give Scene.build and Navigation the same config"
+                )
 
     def _add_cameras(self, drawn: bool):
         """Adds the cameras of `VIEWS`."""
