@@ -60,12 +60,15 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
 
     Raises:
         ValueError: if the name is taken or has other characters than letters, digits
-            and _ : . -, or an option of the objective has the name of an option that
-            all tasks have.
+            and _ : . -, the task is not a `Navigation`, or an option of the objective
+            has the name of an option that all tasks have.
     """
     if not re.fullmatch(r"[\w:.-]+", bounds.text("name", name)):
         bounds.refuse("name", name, "of letters, digits and the signs _ : . -")
     bounds.instance("definition", definition, TaskDefinition)
+    kind = definition.task
+    if not isinstance(kind, type) or not issubclass(kind, Navigation):
+        bounds.refuse("task of the definition", kind, "Navigation, or a subclass of it")
     if taken := sorted({*_TAKEN, *_CONFIG_FIELDS} & {*definition.objective_options}):
         raise ValueError(
             f"the objective of {name!r} has the options {', '.join(taken)}, which are "
@@ -164,7 +167,8 @@ def make_task(
 
     others = map(room, range(1, len(anatomies))) if len(anatomies) > 1 else None
     scene, objective = room(0)
-    made = Navigation(scene, objective, config, random, others=others, name=name)
+    kind = definition.task
+    made = kind(scene, objective, config, random, others=others, name=name)
     made.options = dict(options)
     return made
 

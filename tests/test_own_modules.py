@@ -1,12 +1,16 @@
 """Tasks of one's own on the command line: `--import`, entry points, kept names."""
 
+import dataclasses
 import json
 import sys
 import textwrap
 
 import pytest
+from dm_control import suite as dm_suite
 
 from cathsim_dmc import agents, cli, suite
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.navigation import Navigation
 
 MODULE = """
 from cathsim_dmc import suite
@@ -102,6 +106,24 @@ def test_commands_take_own_tasks(cathsim, module, command):
     code, out, err = cathsim(*command.split(), "--import", "own_two")
     assert code == 0, err
     assert "own_demo" in out or "episodes succeed" in out
+
+
+class Timed(Navigation):
+    def should_terminate_episode(self, physics):
+        return super().should_terminate_episode(physics) or physics.time() > 0.1
+
+
+def test_a_task_of_a_class_of_ones_own_is_loaded_by_dm_control(forget):
+    known = suite.TASKS["simple1_bca"]
+    with pytest.raises(ValueError, match="task of the definition is 'Timed'.*subclass"):
+        suite.register("own_time", dataclasses.replace(known, task="Timed"))
+    suite.register("own_time", dataclasses.replace(known, task=Timed))
+    env = dm_suite.load("cathsim", "own_time", {"random": 0, "max_steps": 50})
+    env.reset()
+    lasts = [env.step(env.action_spec().minimum).last() for _ in range(3)]
+    assert lasts == [False, False, True]
+    with pytest.raises(ValueError, match="Timed overrides should_terminate_episode"):
+        BatchSimulation(suite.make_task("own_time"), 2)
 
 
 OBJECTIVE = """

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation, Objective
 
 OF_ARCHES = "arches", "pool", "first", "numbers"  # options that choose random arches
@@ -28,6 +29,8 @@ class TaskDefinition:
         random_arch: whether each episode draws one of the random arches that the
             task's options `arches`, `pool`, `first` and `numbers` choose; `anatomy` is
             None then.
+        task: class of the task. A subclass of `Navigation` that overrides hooks of
+            composer makes single environments; batches refuse it.
     """
 
     description: str
@@ -37,6 +40,7 @@ class TaskDefinition:
     objective: Callable[..., Objective] = Cannulation.to
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     random_arch: bool = False
+    task: type[Navigation] = Navigation
 
     @property
     def own_options(self) -> tuple[str, ...]:
