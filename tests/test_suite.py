@@ -239,6 +239,25 @@ def test_a_subclass_of_the_task_gets_its_after_substep(shared_environment):
         environment.close()
 
 
+def test_a_warning_beside_a_hook_repeats_the_control_step(shared_environment):
+    env = suite.environment(twin(shared_environment("type1_lcca").task))
+    times = []
+
+    def disturb(physics, random_state):
+        times.append(physics.time())
+        if len(times) == 3:  # not in the repetition
+            physics.data.qvel[:] = 1e6
+
+    env.add_extra_hook("after_substep", disturb)
+    env.reset()
+    timestep = env.step(np.zeros(21))
+    assert timestep.mid() and timestep.reward < 0 and env.task.stepper.repeated[0] == 1
+    assert len(times) == 3 and env.task.error is None
+    assert env.step(np.zeros(21)).mid()
+    assert len(times) == 3 + env.task.substeps
+    env.close()
+
+
 @pytest.mark.parametrize(
     "options", [{"random": -1}, {"observation": "pixels"}, {"friction": -1.0}]
 )

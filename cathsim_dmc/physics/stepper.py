@@ -286,10 +286,11 @@ class Stepper(abc.ABC):
 
 
 class SingleStepper(Stepper):
-    """One simulation, stepped by `step`, or by composer, which calls `keep`.
+    """One simulation, stepped by `step`, or by `advance` and `keep` around hooks.
 
     Attributes:
         data: The simulation.
+        stopped: Whether MuJoCo has warned in this control step, which ends it.
     """
 
     has_snapshots = True
@@ -312,18 +313,21 @@ class SingleStepper(Stepper):
         # Contacts of each physics step; 0 where there is none.
         self._rows = np.zeros((substeps, len(self._sensor)))
         self._substep, self._size = 0, mujoco.mj_stateSize(model, _STATE)
-        self._stopped, self._known_warnings = False, b""  # of the control step
+        self.stopped, self._known_warnings = False, b""  # of the control step
 
     def begin(self, control: np.ndarray) -> None:
         """Begins a control step with the control (1, U) of all its physics steps."""
         super().begin(control)
-        self._substep, self._stopped = 0, False
+        self._substep, self.stopped = 0, False
         self._known_warnings = self._warnings_before.tobytes()
 
     def keep(self) -> None:
         """Keeps the contacts of the last physics step."""
-        self._rows[self._substep] = self._sensor
+        self._keep_in(self._rows[self._substep])
         self._substep += 1
+
+    def _keep_in(self, row: np.ndarray) -> None:
+        row[:] = 0.0 if self.stopped else self._sensor
 
     @property
     def contact_rows(self) -> np.ndarray:
@@ -354,27 +358,26 @@ class SingleStepper(Stepper):
 
     def step(self) -> None:
         """Does a physics step, and keeps its contacts."""
-        self._advance(self._rows[self._substep])
-        self._substep += 1
+        self.advance()
+        self.keep()
 
     def run(self) -> None:
         """Does all physics steps of a control step."""
-        for row in self._rows:
-            self._advance(row)
-        self._substep = self.substeps
+        for _ in self._rows:
+            self.step()
 
-    def _advance(self, row: np.ndarray) -> None:
+    def advance(self) -> None:
         """Does a physics step; none after a warning, as in a batch."""
-        if not self._stopped:
+        if not self.stopped:
             mujoco.mj_step(self._model, self.data)
-            self._stopped = self.warnings.tobytes() != self._known_warnings
-        row[:] = 0.0 if self._stopped else self._sensor
+            self.stopped = self.warnings.tobytes() != self._known_warnings
 
     def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
-        self._stopped, self._known_warnings = False, self._warnings_before.tobytes()
+        self.stopped, self._known_warnings = False, self._warnings_before.tobytes()
         rows = np.empty((self.substeps * parts, self._rows.shape[1]))
         for row in rows:
-            self._advance(row)
+            self.advance()
+            self._keep_in(row)
         self._rows[:] = rows[parts - 1 :: parts]
         return rows[None]
 

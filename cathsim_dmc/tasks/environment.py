@@ -76,8 +76,7 @@ class Environment(composer.Environment, NotCopied):
         hooks = self._hooks
         before, after = hooks._before_substep, hooks._after_substep  # noqa: SLF001
         return bool(
-            self._legacy_step
-            or self._raise_exception_on_physics_error
+            self._composed
             or _overridden(self.task, "before_substep")
             or _overridden(self.task, "after_substep", of=Navigation)
             or before.entity_hooks
@@ -86,12 +85,30 @@ class Environment(composer.Environment, NotCopied):
             or after.extra_hooks
         )
 
+    @property
+    def _composed(self) -> bool:
+        """Whether composer's own physics step is asked for."""
+        return self._legacy_step or self._raise_exception_on_physics_error
+
     def _substep(self, action):
-        """Does a physics step; with composer's own function if a hook needs it."""
-        if self._watched:
+        """Does a physics step with its hooks; after a warning it keeps zeros alone.
+
+        The stepper repeats a control step with a warning; composer would end the
+        episode.
+        """
+        stepper = self.task.stepper
+        if self._composed:
             super()._substep(action)
+        elif not self._watched or stepper.stopped:
+            stepper.step()
         else:
-            self.task.stepper.step()
+            physics, random_state = self._physics_proxy, self._random_state
+            self._hooks.before_substep(physics, action, random_state)
+            stepper.advance()
+            if stepper.stopped:
+                stepper.keep()
+            else:
+                self._hooks.after_substep(physics, random_state)
 
     def snapshot(self) -> Snapshot:
         """Returns the state between two steps; an episode continues from it exactly.
