@@ -9,7 +9,7 @@ from dm_control import composer, mjcf
 
 from cathsim_dmc import bounds
 from cathsim_dmc.entities import contact
-from cathsim_dmc.entities.device import Device
+from cathsim_dmc.entities.device import LONGEST, Device
 from cathsim_dmc.entities.posture import x_first
 
 # Physics step of the tasks, s. An implicit step of length h damps a spring like a
@@ -149,7 +149,7 @@ class Chain(composer.ModelWrapperEntity):
         timestep: float,
     ) -> None:
         """Builds base, links, head, motors and sensors; `devices` must be set."""
-        bounds.number("stroke", stroke, unit="m", positive=True)
+        bounds.number("stroke", stroke, 0.0, LONGEST, "m", positive=True)
         bounds.number("timestep", timestep, unit="s", positive=True)
         self.device = self.devices[-1]
         self.stroke, self.timestep, self.link_lengths = stroke, timestep, links.lengths

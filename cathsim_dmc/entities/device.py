@@ -10,7 +10,9 @@ from cathsim_dmc.imaging import materials
 from cathsim_dmc.imaging.device import Shadow
 
 _MOST_LINKS = 200
-_LONGEST_TIP = 1.0  # m; a longer one is taken for one given in millimetres
+# Lengths beyond these are taken for ones given in millimetres.
+LONGEST = 3.0  # m, the longest wires sold
+_LONGEST_TIP = 1.0  # m
 THICKEST = 10e-3  # m, outer radius; sheaths of aortic valves have half of it
 DENSEST = 22.6e3  # kg/m³, osmium
 # Frequency at which a damper has the loss factor of the material, Hz; that of the first

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from cathsim_dmc import bounds
-from cathsim_dmc.entities.device import Arc, Device, Section
+from cathsim_dmc.entities.device import LONGEST, Arc, Device, Section
 from cathsim_dmc.imaging import materials
 
 FRENCH = 1e-3 / 3.0  # m of outer diameter per French
@@ -265,7 +265,7 @@ class Discretisation:
 
     def __post_init__(self):
         for name in ("working_length", "shaft_link"):
-            bounds.number(name, getattr(self, name), positive=True)
+            bounds.number(name, getattr(self, name), 0.0, LONGEST, "m", positive=True)
         bounds.whole("torsion_joints", self.torsion_joints, 0)
 
     def link_lengths(self, *devices: Device) -> np.ndarray:

@@ -20,6 +20,7 @@ _COLOUR = (0.35, 0.45, 0.6, 0.35)
 
 def straight(length: float) -> np.ndarray:
     """Centreline (2, 3) m of a straight sheath, `length` m along +z to the origin."""
+    bounds.number("length", length, unit="m", positive=True)
     return np.array([[0.0, 0.0, -length], [0.0, 0.0, 0.0]])
 
 

@@ -42,7 +42,8 @@ def write_mjcf(
 
     `scene.xml` is a file of plain MuJoCo: convex pieces replace the wall, and boxes the
     bore of the sheath, whose fields only this package can read. With the same actions
-    it moves nearly as the task does. The keyframe "start" is the start of the episode.
+    it moves nearly as a task with the same `sheath_clearance` does, by default that of
+    `entities.sheath.CLEARANCE`. The keyframe "start" is the start of the episode.
     `task.json` has the rest, see `describe`.
 
     Coaxial devices are one chain whose model fields change in every control step; the

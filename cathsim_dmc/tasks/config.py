@@ -11,7 +11,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.entities.arena import SOLVER_TOLERANCE
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import FRICTION, MOST_FRICTION
-from cathsim_dmc.entities.device import Device
+from cathsim_dmc.entities.device import LONGEST, Device
 from cathsim_dmc.entities.device_stack import LEAD, LUMEN_FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.effects import Effect, copied
@@ -28,7 +28,7 @@ from cathsim_dmc.tasks.cameras import CameraOptions
 
 MAX_STEPS = 2000  # published
 EVALUATION_SEED = 1_000_000  # of the first episode; apart from those of training
-WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
+WORKING_LENGTHS = (0.02, LONGEST)  # m
 _FRICTION = (0.0, MOST_FRICTION, "")  # Coulomb coefficient
 # Allowed ranges (low, high, unit). A link of the shaft is longer than its radius and
 # shorter than the diameter of a large vessel.
