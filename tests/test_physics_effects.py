@@ -441,3 +441,24 @@ def test_fields_that_the_device_writes_over_are_refused(task, when, message):
         BatchSimulation(
             suite.make_task(task, effects=[Stiff()], sheath_clearance=0.35e-3), 1
         )
+
+
+def test_a_field_that_no_effect_declares_is_refused(shared_environment):
+    class Heavier(Effect):
+        def restart(self, index, episode, random_state):
+            self.world.field(index, "body_mass")[:] *= 2.0
+
+    task = shared_environment("type1_lcca").task
+    env = suite.environment(twin(task, effects=[Heavier()]))
+    with pytest.raises(ValueError, match="body_mass, .* model_fields; name it there"):
+        env.reset()
+    env.close()
+
+
+def test_a_law_with_self_is_refused():
+    class Pulled(Effect):
+        def law(self, parameters, time, links):
+            links.xfrc_applied[0, 0] += 1.0
+
+    with pytest.raises(ValueError, match=r"Pulled.law is a method.*@staticmethod"):
+        suite.load("cathsim", "simple1_bca", {"effects": [Pulled()]})

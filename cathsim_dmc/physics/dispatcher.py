@@ -10,6 +10,7 @@ is then called before them.
 import ctypes
 import functools
 import hashlib
+import inspect
 import threading
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -198,12 +199,18 @@ def laws(effect: Any, kind: Any, start: int) -> list[Law]:
         start: Offset of its parameters in `userdata`.
 
     Raises:
-        ValueError: if the effect does not say where its law acts.
+        ValueError: if the law is no static method, or the effect does not say where it
+            acts.
     """
     name, adapter = type(effect).__qualname__, None
     if effect.adapter is not None:
         adapter = getattr(adapters, effect.adapter)
     elif effect.law is not None:
+        if inspect.ismethod(effect.law):
+            raise ValueError(
+                f"{name}.law is a method; make it a @staticmethod of parameters, time "
+                "and what it acts on, without self"
+            )
         bounds.choice(f"{name}.acts_in", effect.acts_in, ACTS_IN)
         adapter = adapters.made(effect.law, kind, effect.acts_in)
     return [] if adapter is None else [Law(name, effect.acts_in, adapter, start)]

@@ -71,7 +71,8 @@ class World:
         arrays: The state, arrays (N, ...) with MuJoCo's names: those of
             `ModelIndex.FIELDS` and of `Effect.data_fields`.
         field: Returns a field of one simulation's own model, to be written, by the
-            index of the simulation and MuJoCo's name of the field.
+            index of the simulation and MuJoCo's name of the field. ValueError for a
+            field that no effect has in its `model_fields`.
         parameters: Parameters of the effect's law, `Effect.parameters` of views
             (N, ...). They are part of MuJoCo's state, and 0 when an episode begins.
     """
@@ -211,6 +212,21 @@ def _kind(effect: Effect) -> Any:
     return effect.parameters or (NoParameters if acts else None)
 
 
+def _declared(effects: Sequence[Effect], field: Callable[[int, str], np.ndarray]):
+    """`World.field` that gives the fields which some effect declares, and no others."""
+    known = {name for effect in effects for name in effect.model_fields}
+
+    def declared(index: int, name: str) -> np.ndarray:
+        if name not in known:
+            raise ValueError(
+                f"an effect writes {name}, a field of the model that is not in its "
+                "model_fields; name it there, so that snapshots save it"
+            )
+        return field(index, name)
+
+    return declared
+
+
 def _sizes(chain: Chain) -> dict[str, int]:
     """Sizes of a chain, by the names in the shapes of parameters."""
     sizes = {"links": len(chain.links), "joints": len(chain.bends) // 2}
@@ -272,6 +288,7 @@ class Layout:
                 f"scene has room for {self._user.shape[1]}: build it with the same "
                 "configuration"
             )
+        world = dataclasses.replace(world, field=_declared(effects, world.field))
         laws, start = [], 0
         for effect in effects:
             kind, parameters = _kind(effect), None
