@@ -163,9 +163,10 @@ RANDOMISATION = """
 Randomisation is off by default. With `task_kwargs={"randomisation": True}` every reset
 draws all quantities from the default ranges; a mapping gives the ranges of some
 quantities, and the others stay as without randomisation. A range is `[low, high]` of a
-uniform distribution, or a `dm_control.composer.variation.Variation`. All draws,
-including quantum noise, come from the environment's random state; single and batched
-environments draw the same values.
+uniform distribution, or a `dm_control.composer.variation.Variation`
+([exceptions](how-to.md#a-value-for-each-simulation)); `start_radius` and
+`tracking_noise` are single numbers. All draws, including quantum noise, come from the
+environment's random state; single and batched environments draw the same values.
 
 {table}
 
