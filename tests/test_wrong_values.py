@@ -315,7 +315,10 @@ def test_wrong_arguments_of_entities_are_refused(build, words):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"friction": 0.1}, {"physics_timestep": 2e-3}, {"device": "steerable_4f"}, {}],
+    [
+        *({"friction": 0.1}, {"physics_timestep": 2e-3}, {"device": "steerable_4f"}),
+        *({"vessel": "living"}, {}),
+    ],
 )
 def test_a_task_has_the_options_of_its_scene(shared_environment, changes):
     task = shared_environment(TASK).task

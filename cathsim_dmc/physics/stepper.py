@@ -323,11 +323,8 @@ class SingleStepper(Stepper):
 
     def keep(self) -> None:
         """Keeps the contacts of the last physics step."""
-        self._keep_in(self._rows[self._substep])
+        self._rows[self._substep] = 0.0 if self.stopped else self._sensor
         self._substep += 1
-
-    def _keep_in(self, row: np.ndarray) -> None:
-        row[:] = 0.0 if self.stopped else self._sensor
 
     @property
     def contact_rows(self) -> np.ndarray:
@@ -358,13 +355,14 @@ class SingleStepper(Stepper):
 
     def step(self) -> None:
         """Does a physics step, and keeps its contacts."""
-        self.advance()
-        self.keep()
+        self._advance_into(self._rows[self._substep])
+        self._substep += 1
 
     def run(self) -> None:
         """Does all physics steps of a control step."""
-        for _ in self._rows:
-            self.step()
+        for row in self._rows:
+            self._advance_into(row)
+        self._substep = self.substeps
 
     def advance(self) -> None:
         """Does a physics step; none after a warning, as in a batch."""
@@ -372,12 +370,15 @@ class SingleStepper(Stepper):
             mujoco.mj_step(self._model, self.data)
             self.stopped = self.warnings.tobytes() != self._known_warnings
 
+    def _advance_into(self, row: np.ndarray) -> None:
+        self.advance()
+        row[:] = 0.0 if self.stopped else self._sensor
+
     def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
         self.stopped, self._known_warnings = False, self._warnings_before.tobytes()
         rows = np.empty((self.substeps * parts, self._rows.shape[1]))
         for row in rows:
-            self.advance()
-            self._keep_in(row)
+            self._advance_into(row)
         self._rows[:] = rows[parts - 1 :: parts]
         return rows[None]
 

@@ -36,6 +36,7 @@ _DENSE_LINKS = 50
 _SHAPING = (
     "device", "devices", "lead", "lumen_friction", "rotation", "friction", "shaft_link",
     "working_length", "sheath_clearance", "physics_timestep", "solver_tolerance",
+    "vessel",
 )  # fmt: skip
 
 # Cameras and their axes, right and up: the published top view, and one from the side.
