@@ -124,8 +124,10 @@ def measured(request):
 def test_path_falls_along_the_route(measured):
     _, task = measured
     places = np.linspace(0, task.route.length, 200)
-    ways = task.lumen_distance(task.route.at(places).position)
+    heads = task.route.at(places).position
+    ways = task.lumen_distance(heads)
     assert np.diff(ways).max() < 0.3e-3
+    assert (ways >= task.distance(heads)).all()
     assert ways[-1] == pytest.approx(0.0, abs=1e-9)
 
 
@@ -152,6 +154,15 @@ def test_a_shifted_goal_shifts_the_path(anatomy):
         moved = task.shifted(np.array(shift))
         assert moved.lumen_distance(start) - before == pytest.approx(shift, abs=2e-3)
         assert moved.lumen_distance(moved.goal) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_head_beside_the_route_has_the_way_to_it_before_itself(anatomy):
+    task = cannulation(anatomy, "lcca")
+    place = task.route.at(0.05)
+    side = np.cross(place.tangent, [0.0, 1.0, 0.0])
+    head = place.position + 1e-3 * side / np.linalg.norm(side)
+    left = task.route.length - 0.05
+    assert task.path_distance(head) == pytest.approx(left + 1e-3, abs=1e-5)
 
 
 @given(
@@ -234,6 +245,8 @@ def test_a_shifted_goal_stays_in_its_branch_and_may_be_passed(anatomy):
     places = task.branch.project(moved.goal).arc_length
     middle = task.branch.project(task.goal).arc_length
     np.testing.assert_allclose(places, [task.ostium, middle, task.branch.length])
+    beside = dataclasses.replace(task, goal=task.goal + [0.0, 1e-3, 0.0])
+    np.testing.assert_allclose(beside.shifted(np.array(0.0)).goal, beside.goal)
     for past in (-5e-3, 5e-3):
         head = task.route.at(task.goal_arc_length + past).position
         assert task.path_distance(head) == pytest.approx(5e-3)
@@ -330,3 +343,20 @@ def test_a_simulation_that_has_diverged_does_not_keep_others_from_beginning():
     assert judging.path_distances(groups, head, np.array([0]))[0] == 5.0
     with pytest.raises(ValueError, match="finite"):
         judging.path_distances(groups, head, np.array([1]))
+
+
+def test_an_episode_ends_by_its_objective_or_its_physics(anatomy):
+    class Limited(Cannulation):
+        def failure(self, measurement):
+            return measurement.wall_force.mean_sum > 1.0
+
+    task = Limited.to(anatomy, anatomy.goal("bca"))
+    given = measurement(
+        task, np.tile(task.goal, (3, 1)), mean_sum=np.array([2.0, 0, 0])
+    )
+    diverged = np.array([False, True, False])
+    judged = judging.judge([(task, slice(None))], given, diverged)
+    assert judged.failed.tolist() == [True, True, False]
+    assert judged.success.tolist() == [False, False, True]
+    assert judged.reward[1:].tolist() == [0.0, 10.0]
+    assert judged.terms["success"].tolist() == [0.0, 0.0, 10.0]
