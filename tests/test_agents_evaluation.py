@@ -22,6 +22,7 @@ from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.forces import NAMES
 from cathsim_dmc.physics.randomisation import Randomisation
+from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation.batch import BatchSimulation
 
 SORTED = sorted(synthetic_env.SIZES)
@@ -70,7 +71,21 @@ def test_only_the_first_episode_of_each_seed_counts():
             action[0] = 0.0
         return action
 
-    many = play(policy=three_go, episodes=4, seed=50).episodes
+    class ThreeGo(Policy):
+        def reset(self, view, which):
+            begun.append(which.copy())
+
+        def act(self, observation):
+            return three_go(observation)
+
+    begun, run = [], []
+    many = play(
+        policy=ThreeGo(), episodes=4, seed=50,
+        observer=lambda env, running: run.append(running.copy()),
+    ).episodes  # fmt: skip
+    assert sum(run).tolist() == [episode.length for episode in many]
+    count = sum(begun)
+    assert count[0] == 1 and (count[1:] > 1).all()
     assert many[0].length == 40 and not many[0].success
     for number, episode in enumerate(many[1:], 51):
         (alone,) = play(policy=three_go, episodes=1, seed=number).episodes
@@ -79,7 +94,22 @@ def test_only_the_first_episode_of_each_seed_counts():
         assert episode.length < 20  # so that another one ends
 
 
-def test_pieces_of_a_group_are_its_episodes_with_their_numbers():
+def test_options_of_an_evaluation_replace_those_of_the_training():
+    class Trained(Policy):
+        task_kwargs, observation = {"max_steps": 5}, "internal"
+
+        def act(self, observation):
+            return push(observation)
+
+    for given, length in (None, 5), ({}, 40):
+        (episode,) = play(policy=Trained(), episodes=1, task_kwargs=given).episodes
+        assert episode.length == length
+    for given, played in (None, "internal"), ("image", "image"):
+        result = play(policy=Trained(), episodes=1, observation=given)
+        assert result.settings["observation"] == played
+
+
+def test_pieces_of_a_group_are_its_episodes_with_their_numbers(monkeypatch):
     plan = evaluation._Plan.of(expert, "reach", 5, 50, "published", None, None, None)
     (group,) = plan.groups(None, None, synthetic_env.make_env, None)
     pieces = group.pieces(2)
@@ -88,6 +118,37 @@ def test_pieces_of_a_group_are_its_episodes_with_their_numbers():
     assert [one.env for one in found] == [0, 1, 2, 3, 4]
     whole = evaluation._play(group, None)
     assert [one.length for one in found] == [one.length for one in whole]
+    assert {piece.num_threads for piece in pieces} == {1}
+    cluster, threads = evaluation.cluster, []  # its jobs finish in any order
+    monkeypatch.setattr(torch, "set_num_threads", threads.append)
+    monkeypatch.setattr(
+        cluster,
+        "over",
+        lambda work, jobs, each: [
+            (n, work(jobs[n])) for n in reversed(range(len(jobs)))
+        ],
+    )
+    for room in (2, 8):
+        monkeypatch.setattr(cluster, "room", lambda each, room=room: room)
+        assert evaluation._play_on_cluster([group], None) == whole
+    assert set(threads) == {torch.get_num_threads()}
+
+
+@pytest.mark.parametrize("protocol", ["published", "varied"])
+def test_seeds_count_up_or_are_those_of_the_protocol(protocol):
+    def make_env(task, *, seed, **_):
+        seeds.append(seed)
+        raise InterruptedError
+
+    plan = evaluation._Plan.of("push", "type1_bca", 8, 3, protocol, None, None, None)
+    groups = plan.groups(None, None, make_env, None)
+    assert sum(len(group.part.seeds) for group in groups) == 8
+    for group in groups:
+        seeds = []
+        with pytest.raises(InterruptedError):
+            evaluation._play(group, None)
+        (seed,), own = seeds, group.part.seeds
+        assert seed == own if protocol == "varied" else seed == own[0] == 3
 
 
 def test_the_contacts_of_later_episodes_are_left_out():
@@ -164,10 +225,15 @@ def test_force_figures_are_those_of_the_steps():
     assert max(forces) > 0
 
 
-def test_evaluation_repeats_and_is_json(tmp_path):
+def test_evaluation_repeats_and_is_json(tmp_path, monkeypatch):
+    errors = []
+    monkeypatch.setattr(
+        evaluation.environments, "record_errors", lambda env, to: errors.append(to)
+    )
     first = play(policy="random", episodes=5, out_dir=tmp_path)
     second = play(policy="random", episodes=5)
     assert first == second
+    assert errors == [tmp_path / "errors"]
     assert play(policy="random", episodes=5, seed=1) != first
     written = json.loads((tmp_path / "evaluation.json").read_text())
     assert written == json.loads(json.dumps(first.to_dict()))
@@ -436,6 +502,17 @@ def test_safe_success_counts_the_mean_force_of_every_control_step():
     older = EvaluationResult("reach", "x", (1,), (episode(True, None),), {})
     assert older.safe_success(0.5) == 0 and older.safe_success(1.0) == 1
     assert "mean_sum" not in older.summary()["forces"]
+    # Figures are of the episodes that tell them.
+    failed = dataclasses.replace(episode(True, None), physics_error=True)
+    mixed = (*episodes[:2], failed, failed)
+    result = EvaluationResult("reach", "x", (4, 5, 6, 7), mixed, {}, distinct=False)
+    (mean, deviation), told = (
+        result.mean_sd("forces.mean_sum.maximum"),
+        result.to_dict(),
+    )
+    assert (mean, deviation) == pytest.approx((0.5, 0.1 * 2**0.5))
+    assert told["summary"]["forces"]["mean_sum"]["maximum"]["mean"] == mean
+    assert told["summary"]["physics_errors"] == 2 and told["seed"] == 4
 
 
 def test_success_interval_against_a_published_value():
@@ -476,7 +553,7 @@ def test_a_function_of_one_observation_is_told_what_to_do():
 
 
 def test_an_evaluation_goes_on_from_a_snapshot(tmp_path, cathsim):
-    drawn = {"friction": [0.1, 0.2]}
+    drawn = {"friction": [0.1, 0.1]}  # episodes from seeds are not distinct
     task = suite.make_task("simple1_bca", max_steps=12, randomisation=drawn)
     simulation = BatchSimulation(task, 2, num_threads=1, seeds=5)
     simulation.reset()
@@ -495,7 +572,7 @@ def test_an_evaluation_goes_on_from_a_snapshot(tmp_path, cathsim):
     assert code == 0, err
     played = json.loads(out)["policy"]
     episodes = played["episodes"]
-    assert played["settings"]["started"] is True
+    assert played["settings"]["started"] is played["distinct"] is True
     assert [one["length"] for one in episodes] == [8, 8]
     # The seeds have not drawn what the snapshot holds.
     assert not any("conditions" in one for one in episodes)
