@@ -208,8 +208,8 @@ def test_each_job_of_a_cluster_has_its_result_and_those_left_are_cancelled(fake_
     assert fake_ray.options == {"num_cpus": 1, "max_retries": 3}
     assert not fake_ray.cancelled
     with pytest.raises(ArithmeticError, match="a fault"):
-        list(cluster.over(work, [10, 11, 13]))
-    assert len(fake_ray.cancelled) == 1
+        list(cluster.over(work, [10, 11, 13], 2))
+    assert len(fake_ray.cancelled) == 1 and fake_ray.options["num_cpus"] == 2
 
 
 @pytest.fixture(scope="module")

@@ -1,14 +1,17 @@
 """Training with collectors on a Ray cluster."""
 
+import functools
 import os
 import signal
 import sys
 import threading
 import time
+import types
 
 import pytest
 import synthetic_env
 import torch
+from tensordict import TensorDict
 from test_agents_training import run, small_ppo, small_sac
 
 from cathsim_dmc.agents import ConfigError, make_config, train
@@ -53,6 +56,88 @@ def test_episodes_whose_process_was_lost_are_left_out():
     outcomes = tracker.add(second)
     assert outcomes == whole.add(second) and len(outcomes) == 6
     assert {one.length for one in outcomes} == {5}
+
+
+class Actor:
+    """A collector in place of a process: its row of a batch, or its loss."""
+
+    def __init__(self, row=None):
+        self.row, self.weights, self.asked = row, [], 0
+        for name in ("update_policy_weights_", "next"):
+            remote = functools.partial(functools.partial, getattr(self, f"_{name}"))
+            setattr(self, name, types.SimpleNamespace(remote=remote))
+
+    def _update_policy_weights_(self, weights):
+        self.weights.append(float(weights["weight"]))
+
+    def _next(self):
+        self.asked += 1
+        if self.row is None:
+            from ray.exceptions import RayActorError
+
+            raise RayActorError
+        return TensorDict({"row": torch.tensor([self.row])}, [1])
+
+
+def test_a_lost_collector_is_replaced_and_the_parts_keep_their_order(monkeypatch):
+    pytest.importorskip("ray")
+    from cathsim_dmc.agents import ray_source
+
+    made, added = [], []
+
+    def make_env(task, **options):
+        made.append((torch_seeds[-1], options))
+
+    class Collectors:
+        remote_collectors = lost, other = [Actor(), Actor(1.0)]
+        collector_kwargs = [{"own": n} for n in range(2)]
+
+        def add_collectors(self, factories, count, policy, options, places):
+            added.append((options, places))
+            factories[0]()
+            self.remote_collectors.append(Actor(0.0))
+
+    torch_seeds, threads, killed = [], [], []
+    monkeypatch.setattr(torch, "manual_seed", torch_seeds.append)
+    monkeypatch.setattr(torch, "set_num_threads", threads.append)
+    monkeypatch.setattr(ray_source, "_await_certainty", lambda actor: None)
+    monkeypatch.setattr(ray_source.cluster, "room", lambda each: 1)
+    ray = types.SimpleNamespace(
+        put=lambda held: held, kill=killed.append,
+        get=lambda requests: [request() for request in requests],
+    )  # fmt: skip
+    monkeypatch.setattr(ray_source, "ray", ray)
+    policy, source = torch.nn.Linear(1, 1), object.__new__(ray_source.RaySource)
+    torch.nn.init.constant_(policy.weight, 4.0)
+    config = small_ppo(
+        num_envs=4,
+        torch_threads=7,
+        training_max_steps=5,
+        critic_observation="full",
+        **CLUSTER,
+    )
+    vars(source).update(
+        _config=config, _learner=types.SimpleNamespace(policy=policy),
+        _make_env=make_env, _frames=600, _losses=0, _threads=1, _policy=None,
+        _random_frames=lambda frames: 1500 - frames, _collector=Collectors(),
+    )  # fmt: skip
+    for number in range(2):
+        source._factory(number)()
+    assert source._batch()["row"].tolist() == [0.0, 1.0]
+    assert killed == [Collectors.lost]
+    assert Collectors.other.asked == 1 and Collectors.other.weights == [4.0]
+    # Random frames are shared; without a processor the new one shares one.
+    assert added[0][0] == [{"own": 0, "init_random_frames": 450}]
+    assert added[0][1][0]["num_cpus"] == 0
+    assert source._batch()["row"].tolist() == [0.0, 1.0]
+    assert source._frames == 600 + 2 * config.frames_per_batch
+    source._factory(0)()
+    seeds, options = zip(*made, strict=True)
+    assert len(set(seeds)) == len({one["seed"] for one in options}) == 4
+    assert options[1]["seed"] - options[0]["seed"] == 2
+    assert {one["num_envs"] for one in options} == {2} and set(threads) == {7}
+    assert options[0]["task_kwargs"] == config.training_kwargs
+    assert options[0]["observation"] == config.collected_observation
 
 
 @pytest.fixture(scope="module")
