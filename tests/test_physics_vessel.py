@@ -63,22 +63,25 @@ def test_blood_comes_to_a_place_by_the_way_from_the_heart(against):
         aorta = Centreline(aorta.points[::-1], aorta.radii[::-1])
     arm = line([0, 0, 0.08], [0.1, 0, 0.08], 5e-3, 4e-3)
     thin = line([0.04, 0, 0.08], [0.04, 0.06, 0.08], 3e-3, 2e-3)
-    vessels = Vessel("aorta", aorta), Vessel("arm", arm, "aorta", 11e-3)
-    tree = VesselTree(
-        {one.name: one for one in (*vessels, Vessel("thin", thin, "arm", 5e-3))}
-    )
-    blood = Circulation.of(tree)
+    tiny = line([0.04, 0.03, 0.08], [0.04, 0.03, 0.12], 2e-3, 1e-3)
+    vessels = (
+        Vessel("aorta", aorta), Vessel("arm", arm, "aorta", 11e-3),
+        Vessel("thin", thin, "arm", 5e-3), Vessel("tiny", tiny, "thin", 3e-3),
+    )  # fmt: skip
+    blood = Circulation.of(VesselTree({one.name: one for one in vessels}))
     np.testing.assert_allclose(blood.ways, np.abs(blood.ends).sum(axis=-1), atol=1e-9)
     assert blood.radius == pytest.approx(12e-3)
-    # By Murray's law the ends divide the blood as the cubes of 9, 4 and 2 mm do.
-    cubes, x, z = 9**3 + 4**3 + 2**3, blood.ends[:, 0, 0], blood.ends[:, 0, 2]
+    # By Murray's law the ends divide the blood as the cubes of 9, 4, 2 and 1 mm do.
+    cubes, (x, y, z) = 9**3 + 4**3 + 2**3 + 1, blood.ends[:, 0].T
     wanted = np.select(
-        [blood.vessel == 2, blood.vessel == 1, z < 0.079],
-        [2**3, 4**3 + 2**3 * (x < 0.039), cubes], 9**3,
+        [blood.vessel == 3, blood.vessel == 2, blood.vessel == 1, z < 0.079],
+        [1, 2**3 + (y < 0.029), 4**3 + (2**3 + 1) * (x < 0.039), cubes], 9**3,
     )  # fmt: skip
     sign = np.where((blood.vessel == 0) & against, -1.0, 1.0)
-    near = np.abs(blood.ends.mean(axis=1)[:, [0, 2]] - [0.04, 0.08]) < 3.1e-3
-    clear = ~(near[:, 0] & (blood.vessel == 1) | near[:, 1] & (blood.vessel == 0))
+    # Place of the next mouth along each vessel, on the axis on which it runs.
+    mouths, axes = [0.08, 0.04, 0.03, np.inf], np.take([2, 0, 1, 2], blood.vessel)
+    middles = np.take_along_axis(blood.ends.mean(axis=1), axes[:, None], 1)[:, 0]
+    clear = np.abs(middles - np.take(mouths, blood.vessel)) > 3.1e-3
     found = (sign * blood.shares.mean(axis=1))[clear]
     np.testing.assert_allclose(found, wanted[clear] / cubes, rtol=1e-9)
 
