@@ -132,6 +132,13 @@ def test_pieces_of_a_group_are_its_episodes_with_their_numbers(monkeypatch):
         monkeypatch.setattr(cluster, "room", lambda each, room=room: room)
         assert evaluation._play_on_cluster([group], None) == whole
     assert set(threads) == {torch.get_num_threads()}
+    starts, continued = [], dataclasses.replace(group, start=np.arange(5))
+    monkeypatch.setattr(
+        evaluation, "_first_episodes", lambda *given: starts.append([*given[-1]]) or ()
+    )
+    for piece in continued.pieces(2):
+        evaluation._play(piece, None)
+    assert starts == [[0, 1], [2, 3], [4]]
 
 
 @pytest.mark.parametrize("protocol", ["published", "varied"])
