@@ -23,7 +23,13 @@ from cathsim_dmc.simulation.gymnasium import CathSimEnv, CathSimVectorEnv
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.physics_errors import DIVERGED
-from cathsim_dmc.tasks.snapshot import Snapshot, read_arrays, write_arrays
+from cathsim_dmc.tasks.snapshot import (
+    Snapshot,
+    packed,
+    read_arrays,
+    restored,
+    write_arrays,
+)
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 from side_wind import SideWind
@@ -545,6 +551,30 @@ def test_the_digest_of_an_anatomy_is_that_of_its_lumen():
     narrow = VesselTree({**tree.vessels, name: wide})
     same = [Anatomy.from_tree(each).digest for each in (tree, tree, narrow)]
     assert same[0] == same[1] != same[2]
+
+
+def test_a_state_of_any_kind_comes_back_to_its_simulations():
+    def values(seed):
+        made = np.random.RandomState(seed)
+        made.normal()  # another number of the pair is kept
+        sources = [np.random.RandomState(5), made]
+        lines = [made.normal(size=(2, 3)), made.normal(size=(4, 3))]
+        return {
+            "array": made.normal(size=(2, 3)), "lines": lines, "sources": sources,
+            "texts": ("", "a", None)[seed : seed + 2], "none": None,
+        }  # fmt: skip
+
+    rows, first, second = np.arange(2), values(0), values(1)
+    wanted, arrays = values(1), packed("state", second, rows)
+    kept = first["array"].copy(), first["array"]
+    found = restored("state", first, arrays, rows)
+    np.testing.assert_array_equal(*kept)
+    np.testing.assert_array_equal(found["array"], wanted["array"])
+    for mine, other in zip(found["lines"], wanted["lines"], strict=True):
+        np.testing.assert_array_equal(mine, other)
+    assert found["texts"] == ("a", None) and found["none"] is None
+    for mine, other in zip(first["sources"], wanted["sources"], strict=True):
+        assert mine.normal() == other.normal()
 
 
 @pytest.mark.parametrize("value", [[1.0], np.zeros(3)])
