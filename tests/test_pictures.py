@@ -130,6 +130,12 @@ def test_an_episode_is_plotted_over_time(pushed):
     )
     np.testing.assert_allclose(bottom.lines[1].get_ydata(), 8.0)  # radius of the goal
     assert TASK in figure.get_suptitle() and "truncated" in figure.get_suptitle()
+    # Within the goal, after a snapshot of two seconds.
+    meta = {**episode.meta, "distance": [1e-3] * len(episode.time)}
+    near = dataclasses.replace(episode, meta=meta, time=episode.time + 2.0)
+    bottom = cathsim_dmc.plot(near).axes[-1]
+    assert bottom.get_ylim()[1] > 8.0
+    assert (bottom.get_xlim()[0], bottom.lines[0].get_xdata()[0]) == (0.0, 0.0)
     with pytest.raises(TypeError, match="Episode.load.*str"):
         cathsim_dmc.plot("episode.npz")
 
@@ -174,8 +180,8 @@ def test_coaxial_devices_have_their_colours_and_their_ends():
 
 def test_phases_are_what_the_base_does(pushed):
     _, episode = pushed
-    # 25 mm/s, 1.25 mm/s and -2.5 mm/s; the base rests below 2 mm/s.
-    steps = [1e-3] * 10, [5e-5] * 10, [1e-3], [0.0] * 9, [-1e-4] * 8
+    # 25 mm/s, 1.25 mm/s, -1 mm/s and -2.5 mm/s; the base rests below 2 mm/s.
+    steps = [1e-3] * 10, [5e-5] * 10, [1e-3], [-4e-5] * 9, [-1e-4] * 8
     way = np.cumsum([0.0, *np.concatenate(steps)])
     states = len(way)
     made = dataclasses.replace(
@@ -314,6 +320,7 @@ def test_x_ray_pictures_show_what_the_task_observes(task, options):
     np.testing.assert_array_equal(cathsim_dmc.fluoroscopy(env), image)
     surface = env.task.scene.anatomy.surface
     moment = Moment.of_episode(episode, surface)
+    np.testing.assert_allclose(moment.goal, env.task.rollout.goal.reshape(3))
     own = moment.x_ray.options
     assert np.abs(xray(moment, own).astype(int) - image).max() <= 1
     film = xray_film(episode, surface, own)[-1, ..., 0]  # in the contrast of a screen
@@ -341,6 +348,7 @@ def test_a_film_is_drawn_a_few_states_at_a_time(pushed, monkeypatch):
     monkeypatch.setattr(Fluoroscope, "render", count)
     film = xray_film(episode, surface, options)
     assert sum(drawn) == episode.steps + 1 > max(drawn) * 4
+    assert (film.min(), film.max()) == (0, 255)
     monkeypatch.setattr(recorded, "_TOGETHER", 1000)
     np.testing.assert_array_equal(xray_film(episode, surface, options), film)
 
@@ -521,12 +529,22 @@ def test_the_cursor_of_a_film_stands_at_the_time_of_the_state(pushed, monkeypatc
         drawn.append((axes, draw(axes, episode)))
         return drawn[-1][1]
 
+    def x_ray(axes, moment, options, seed, window):
+        looks.append((options.noise, options.kerma, seed, window))
+        return draw_fluoroscopy(axes, moment, options, seed, window)
+
+    looks = []
+    monkeypatch.setattr(animation.drawing, "draw_fluoroscopy", x_ray)
     monkeypatch.setattr(animation, "_draw_force", kept)
     steps = np.array([0, episode.steps // 2, episode.steps])
     surface, places = env.task.scene.anatomy.surface, []
     for _ in animation._frames(episode, surface, 200, steps):
         places.append(drawn[0][1].get_xdata()[0])
     np.testing.assert_allclose(places, 0.04 * steps)
+    # Noise of each state is its own, and the grey levels are those of the first.
+    noise, dose, seeds, (first, *others) = zip(*looks, strict=True)
+    assert all(noise) and set(dose) == {4e-7} and list(seeds) == steps.tolist()
+    assert first is None and len(set(others)) == 1 and others[0] is not None
     time, force = drawn[0][0].lines[0].get_data()
     np.testing.assert_allclose(time, 0.04 * np.arange(1, episode.steps + 1))
     largest = np.array(episode.meta["wall_force_mean_max"])
@@ -622,6 +640,7 @@ def test_a_figure_shows_forces_along_themselves_and_tells_them(pushed):
     wanted = moment.force[:, [0, 2]] * 22 / np.linalg.norm(moment.force[1])
     wanted[2] = 0.0, 5.0  # the shortest
     np.testing.assert_allclose(np.column_stack([arrows.U, arrows.V]), wanted)
+    np.testing.assert_allclose(axes.texts[-1].xy, arrows.XY[1] + wanted[1])
     colours = force_colours(np.linalg.norm(moment.force, axis=1), 0.2) / 255
     np.testing.assert_allclose(arrows.get_facecolors()[:, :3], colours)
     assert bar.get_ylim() == (0.0, 200.0) and "mN" in bar.get_ylabel()
@@ -633,6 +652,10 @@ def test_a_figure_shows_forces_along_themselves_and_tells_them(pushed):
 def test_the_ring_in_the_fluoroscopy_has_the_size_of_the_goal(pushed):
     moment, axes = Moment.of(pushed[0]), Picture().add_subplot()
     own = on_screen(moment.x_ray.options)
+    for zoom, centre, shown in (2.0, None, 2.0), (1.0, (0.0, 0.0, 0.0), 1.0):
+        given = dataclasses.replace(own, magnification=zoom, centre=centre)
+        assert on_screen(given).magnification == shown
+    assert own.magnification == 1.3
     draw_fluoroscopy(axes, moment)
     (arm,) = own.carms(moment.rest.vertices)
     ends = moment.goal + moment.goal_radius * np.array([-arm.axes[0], arm.axes[0]])
