@@ -350,6 +350,9 @@ def test_a_snapshot_that_does_not_fit_is_refused_in_a_line(task):
     other = suite.environment(task(randomisation={"tracking_noise": 1e-3}))
     with pytest.raises(ValueError, match="other options: it lacks tracking"):
         other.restore(snapshot)
+    other.reset()
+    with pytest.raises(ValueError, match="other options: it has tracking"):
+        environment.restore(other.snapshot())
     pair = suite.environment(suite.make_task("simple1_bca_pair"))
     with pytest.raises(ValueError, match="of another task: its devices") as error:
         pair.restore(snapshot)
@@ -377,9 +380,10 @@ def test_anatomies_in_another_order_or_with_other_goals_are_another_task(change)
     snapshot = first.snapshot()
     with pytest.raises(ValueError, match="another task: its cases .*is"):
         second.restore(snapshot)
-    odd = {**snapshot.arrays, "rollout._case_of": np.array([2])}  # of 0 and 1
-    with pytest.raises(ValueError, match=r"is of the anatomies \[2\]"):
-        first.restore(dataclasses.replace(snapshot, arrays=odd))
+    for number in (-1, 2):  # of 0 and 1
+        odd = {**snapshot.arrays, "rollout._case_of": np.array([number])}
+        with pytest.raises(ValueError, match=rf"is of the anatomies \[{number}\]"):
+            first.restore(dataclasses.replace(snapshot, arrays=odd))
 
 
 @pytest.mark.parametrize(
@@ -499,12 +503,21 @@ def test_a_damaged_file_is_refused(task, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="no file of a snapshot"):
         Snapshot.load(tmp_path / "bad.npz")
     meta, arrays = read_arrays(path, "snapshot")
-    uneven = {**arrays, "more": np.zeros(2)}
-    write_arrays(path, "snapshot", meta, uneven)
-    with pytest.raises(ValueError, match="holds no snapshot: .* different numbers of"):
-        Snapshot.load(path)
+    with pytest.raises(ValueError, match="a snapshot of format 1, not a recording of"):
+        read_arrays(path, "recording")
+    none = {name: array[:0] for name, array in arrays.items()}
+    for bad, words in (
+        ({**arrays, "more": np.zeros(2)}, "holds no snapshot: .* different numbers of"),
+        (none, "holds no snapshot: .* different numbers of"),
+        ({**arrays, "more": np.zeros(1, complex)}, "other than numbers and texts"),
+    ):
+        write_arrays(path, "snapshot", meta, bad)
+        with pytest.raises(ValueError, match=words):
+            Snapshot.load(path)
+    older = dataclasses.replace(environment.snapshot(), versions={"mujoco": "1"})
+    assert Snapshot.load(older.save(path)).versions == older.versions
     monkeypatch.setattr("cathsim_dmc.tasks.snapshot._FORMAT", 2)
-    with pytest.raises(ValueError, match="it is a snapshot of format 1, not 2"):
+    with pytest.raises(ValueError, match="it is a snapshot of format 1, not a .* 2"):
         Snapshot.load(path)
     with pytest.raises(FileNotFoundError):
         Snapshot.load(tmp_path / "none.npz")
@@ -551,6 +564,16 @@ def test_the_digest_of_an_anatomy_is_that_of_its_lumen():
     narrow = VesselTree({**tree.vessels, name: wide})
     same = [Anatomy.from_tree(each).digest for each in (tree, tree, narrow)]
     assert same[0] == same[1] != same[2]
+
+
+def test_paths_of_any_number_of_points_fit():
+    def snapshot(points, axes):
+        arrays = {"paths*": np.zeros((1, points, axes))}
+        return Snapshot({}, {"stepper.state": np.zeros((1, 2)), **arrays})
+
+    snapshot(2, 3).require(snapshot(4, 3))
+    with pytest.raises(ValueError, match=r"of another model: paths\* .*\(-1, 2\)"):
+        snapshot(2, 2).require(snapshot(4, 3))
 
 
 def test_a_state_of_any_kind_comes_back_to_its_simulations():

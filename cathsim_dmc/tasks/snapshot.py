@@ -213,7 +213,8 @@ def read_arrays(
         meta = dict(json.loads(str(held.pop(_META))))
         found = meta["kind"], meta["format"]
         if found != (kind, _FORMAT):
-            raise ValueError(f"it is a {found[0]} of format {found[1]}, not {_FORMAT}")
+            wanted = f"{kind} of format {_FORMAT}"
+            raise ValueError(f"it is a {found[0]} of format {found[1]}, not a {wanted}")
     return meta, held
 
 
