@@ -201,6 +201,7 @@ def coaxial(tmp_path_factory):
     }
     episode = make_recorded()
     meta = {**episode.meta, "devices": devices, "vessel": vessel, **means}
+    meta["action_names"] = ["wire/push", "catheter/push"]
     episode = dataclasses.replace(episode, catheter=line, meta=meta)
     return episode, Recording(write_rrd(episode, make_tube(), path))
 
@@ -226,6 +227,8 @@ def test_every_plot_is_in_its_unit(coaxial):
     for entity, values in wanted.items():
         found = np.array(recording.values(f"/series/{entity}", "Scalars:scalars"))
         np.testing.assert_allclose(found[:, 0], values, rtol=1e-6, err_msg=entity)
+    names = recording.fixed("/series/action", "SeriesLines:names")
+    assert names == ["wire/push", "catheter/push"]  # of both devices
 
 
 def test_blood_goal_and_devices_are_drawn_in_metres(coaxial):
@@ -297,6 +300,8 @@ def test_text_says_what_happens_when(written):
     ):
         assert f"| {name} | {text} |" in page
     assert not any(line.startswith("| distance |") for line in page)
+    later = dataclasses.replace(episode, time=episode.time + 2.0)
+    assert "| simulated time | 0.24 s |" in rerun_text.markdown(later)
 
 
 @pytest.mark.parametrize("end", TERMINATIONS)

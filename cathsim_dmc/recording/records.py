@@ -64,7 +64,7 @@ class CoaxialRecord:
         """Returns the number (T+1, L) of the outermost device at each link's middle."""
         lengths = np.linalg.norm(np.diff(line, axis=1), axis=-1)
         middle = np.cumsum(lengths[:, ::-1], axis=1)[:, ::-1] - lengths / 2
-        number = np.broadcast_to(self.gaps.argmin(axis=1)[:, None], middle.shape).copy()
+        number = np.zeros(middle.shape, int)  # the leading device has no gap
         for k in range(len(self.names)):
             number[middle >= self.gaps[:, k, None]] = k
         return number
