@@ -53,11 +53,17 @@ def test_every_episode_has_errors_of_its_own_which_a_snapshot_keeps():
     errors = {"noise": 0.5, "gaps": 1, "calibration": 2.0}
     seen = {**OPTIONS["fluoroscopy"], "third": "AP", "roadmap_errors": errors}
     observed = ["biplane", "biplane_retry"]
-    options = {**OPTIONS, "observation": observed, "fluoroscopy": seen}
+    drawn = {**OPTIONS["randomisation"], "view": [4, 5]}
+    options = {"observation": observed, "fluoroscopy": seen, "randomisation": drawn}
     task = suite.make_task(TASK, **options)
     batch = BatchSimulation(task, 2, seeds=5, num_threads=1)
     first = batch.reset().observation["biplane_radii"].copy()
     assert not np.array_equal(first[0], first[1])
+    rollout = batch.rollout
+    for i, deviation in enumerate(rollout.deviations):
+        machine = rollout.case(i).angiograph
+        assert rollout._sensors.planes[i] is machine.planes(deviation)
+        assert rollout._sensors.thirds[i] is machine.third(deviation)
     action = np.full((2, 21), 0.3)
     batch.step(action)
     kept = batch.snapshot()
