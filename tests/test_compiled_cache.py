@@ -287,21 +287,24 @@ def test_a_process_compiles_alone_where_no_second_one_can_run(
 
 @KINDS
 def test_what_another_process_compiles_is_waited_for(run, folder, monkeypatch):
-    run()
-    kept = {path: path.read_bytes() for path in files(folder, "nb?")}
-    for path in kept:
-        path.unlink()
+    kept, taken = {}, []
 
     class Lock(filelock.FileLock):
         """The lock of a function that another process compiles meanwhile."""
 
         def acquire(self, *arguments, **options):
+            taken.append(self)
             for path, content in kept.items():
                 path.write_bytes(content)
             return super().acquire(*arguments, **options)
 
     monkeypatch.setattr(filelock, "FileLock", Lock)
+    run()
+    kept.update((path, path.read_bytes()) for path in files(folder, "nb?"))
+    for path in kept:
+        path.unlink()
     assert run() == (42, 1)
+    assert [lock.is_locked for lock in taken] == [False, False]
 
 
 @KINDS
@@ -352,6 +355,14 @@ def used_by_compiled(tree):
             by = {ast.unparse(each).split("(")[0] for each in node.decorator_list}
             if by & COMPILING:
                 yield from (x.id for x in ast.walk(node) if isinstance(x, ast.Name))
+
+
+def test_another_mujoco_compiles_anew(monkeypatch):
+    stamp = compiled_cache._stamp.__wrapped__
+    before = stamp()
+    assert stamp() == before
+    monkeypatch.setattr(compiled_cache.metadata, "version", lambda name: "0")
+    assert stamp() != before
 
 
 def test_a_change_of_any_source_of_compiled_code_compiles_anew():
