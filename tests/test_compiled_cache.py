@@ -226,24 +226,27 @@ def test_a_second_process_compiles_all_but_the_collider(task, tmp_path, monkeypa
 @pytest.fixture
 def started(monkeypatch):
     """Commands that the second process would have."""
-    commands = []
+    commands, ends = [], []
 
-    def start(command, **_):
+    def start(command, *, env, **_):
+        assert env["PYTHONPATH"].split(os.pathsep) == sys.path
         commands.append(command)
         return subprocess.CompletedProcess(command, 0)
 
     monkeypatch.setattr(subprocess, "Popen", start)
-    monkeypatch.setattr(atexit, "register", lambda _: None)
+    monkeypatch.setattr(atexit, "register", ends.append)
     for name in "_expected", "_started":
         monkeypatch.setattr(compiled_ahead, name, [])
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    return commands
+    yield commands
+    assert len(ends) == len(commands)  # it ends with this process
 
 
 def test_a_second_process_starts_once_and_only_for_what_is_missing(folder, started):
     loop()
     assert not started  # no task has been made
-    compiled_ahead.expect("type1_lcca")
+    compiled_ahead.expect("type1_bca")
+    compiled_ahead.expect("type1_lcca")  # the last one counts
     loop()
     assert not started  # nothing is missing
     for path in files(folder, "nbi"):
