@@ -49,7 +49,14 @@ def test_the_table_names_what_the_functions_return(environment, monkeypatch):
 
 def test_an_own_row_returns_what_it_declares(environment):
     table, entry = observations.OBSERVATIONS, Entry("own", 2, "m", "two numbers")
-    for given in ({"own": np.zeros((1, 3))}, {}):
+    for given, words in (
+        ({"own": np.zeros((1, 3))}, r"'own' .* declares \(2,\)"),
+        ({}, r"'own' .* declares \(2,\)"),
+        ({"own": np.zeros((1, 2), dtype=int)}, "of int64, .* declares float"),
+        ({"own": [[0.0, 0.0]]}, r"'own' of an observation is \[\[.* an array \(N"),
+        ({"own": np.array([[0.0, np.nan]])}, "nan.* must be finite"),
+        (np.zeros((1, 2)), "observation 'own' returns is .* a mapping"),
+    ):
 
         def own(frame, given=given):
             return given
@@ -57,7 +64,7 @@ def test_an_own_row_returns_what_it_declares(environment):
         table.row(entry)(own)
         try:
             task = twin(environment.task, observation="own")
-            with pytest.raises(ValueError, match=r"'own' .* declares \(2,\)"):
+            with pytest.raises(ValueError, match=words):
                 suite.environment(task).reset()
         finally:
             del table["own"]

@@ -345,6 +345,18 @@ def test_a_simulation_that_has_diverged_does_not_keep_others_from_beginning():
         judging.path_distances(groups, head, np.array([1]))
 
 
+@pytest.mark.parametrize("given", [False, [False] * 3, np.zeros(3), np.zeros(2, bool)])
+def test_a_failure_is_a_truth_value_of_each_simulation(anatomy, given):
+    class Limited(Cannulation):
+        def failure(self, measurement):
+            return given
+
+    task = Limited.to(anatomy, anatomy.goal("bca"))
+    measured = measurement(task, np.tile(task.goal, (3, 1)), mean_sum=np.zeros(3))
+    with pytest.raises(ValueError, match="Limited returns .*failed"):
+        judging.judge([(task, slice(None))], measured)
+
+
 def test_an_episode_ends_by_its_objective_or_its_physics(anatomy):
     class Limited(Cannulation):
         def failure(self, measurement):

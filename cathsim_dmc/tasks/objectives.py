@@ -237,8 +237,8 @@ class Cannulation(Shiftable, Routed):
     def outcome(self, measurement: Measurement) -> Outcome:
         """Judges a control step."""
         success, failed = self.success(measurement), self.failure(measurement)
-        if failed is not None:
-            success = success & ~failed
+        if np.shape(failed) == success.shape:  # `judge` refuses others, but None
+            success = success & ~np.asarray(failed, dtype=bool)
         any_success = np.count_nonzero(success)
         terms = {}
         for name, weight in self.weights.items():

@@ -243,26 +243,42 @@ class ObservationTable(dict[str, ObservationKind]):
         return tuple(dict.fromkeys([*names, *read]))
 
     def observe(self, names: Sequence[str], frame: Frame) -> Observation:
-        """Computes the named rows; arrays may share memory with the frame."""
-        rows = [self[name].observe(frame) for name in names]
-        return {key: value for row in rows for key, value in row.items()}
+        """Computes the named rows; arrays may share memory with the frame.
+
+        Raises:
+            ValueError: if a row is no mapping.
+        """
+        rows = {name: self[name].observe(frame) for name in names}
+        for name, row in rows.items():
+            if not isinstance(row, Mapping):
+                what = "a mapping of its entries to arrays (N, ...)"
+                bounds.refuse(f"what observation {name!r} returns", row, what)
+        return {key: value for row in rows.values() for key, value in row.items()}
 
     def check(
         self, observation: Observation, wanted: Mapping[str, specs.Array]
     ) -> None:
-        """Raise ValueError if arrays (N, ...) do not have a simulation's specs."""
+        """Raise ValueError if arrays (N, ...) do not fit a simulation's specs."""
         for key in sorted(observation.keys() | wanted.keys()):
-            found = observation[key].shape[1:] if key in observation else None
+            value, entry = observation.get(key), f"entry {key!r} of an observation"
+            if value is not None and not isinstance(value, np.ndarray):
+                bounds.refuse(entry, value, "an array (N, ...)")
+            found = None if value is None else value.shape[1:]
             spec = wanted[key].shape if key in wanted else None
-            if found != spec:
+            if value is None or found != spec:
                 raise ValueError(
-                    f"entry {key!r} of an observation has the shape {found} for one "
-                    f"simulation, and its row declares {spec}; return what it declares"
+                    f"{entry} has the shape {found} for one simulation, and its row "
+                    f"declares {spec}; return what it declares"
                 )
-            if observation[key].dtype != wanted[key].dtype:
+            if value.dtype != wanted[key].dtype:
                 raise ValueError(
-                    f"entry {key!r} of an observation is of {observation[key].dtype}, "
-                    f"and its row declares {wanted[key].dtype}; return what it declares"
+                    f"{entry} is of {value.dtype}, and its row declares "
+                    f"{wanted[key].dtype}; return what it declares"
+                )
+            if value.dtype.kind == "f" and not np.isfinite(value).all():
+                raise ValueError(
+                    f"{entry} is {bounds.shown(value)} at the start of an episode; its "
+                    "numbers must be finite"
                 )
 
     def entries(self, names: Iterable[str]) -> list[Entry]:
