@@ -355,30 +355,30 @@ class SingleStepper(Stepper):
 
     def step(self) -> None:
         """Does a physics step, and keeps its contacts."""
-        self._advance_into(self._rows[self._substep])
+        self.advance()
         self._substep += 1
 
     def run(self) -> None:
         """Does all physics steps of a control step."""
         for row in self._rows:
-            self._advance_into(row)
+            self._advance(row)
         self._substep = self.substeps
 
     def advance(self) -> None:
         """Does a physics step; none after a warning, as in a batch."""
+        self._advance(self._rows[self._substep])
+
+    def _advance(self, row: np.ndarray) -> None:
         if not self.stopped:
             mujoco.mj_step(self._model, self.data)
             self.stopped = self.warnings.tobytes() != self._known_warnings
-
-    def _advance_into(self, row: np.ndarray) -> None:
-        self.advance()
         row[:] = 0.0 if self.stopped else self._sensor
 
     def _run(self, indices: np.ndarray, parts: int) -> np.ndarray:
         self.stopped, self._known_warnings = False, self._warnings_before.tobytes()
         rows = np.empty((self.substeps * parts, self._rows.shape[1]))
         for row in rows:
-            self._advance_into(row)
+            self._advance(row)
         self._rows[:] = rows[parts - 1 :: parts]
         return rows[None]
 
