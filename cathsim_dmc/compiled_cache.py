@@ -30,7 +30,7 @@ _MARKS = (
 # Other files with constants that compiled functions contain.
 _CONSTANTS = ("anatomy/motion.py", "imaging/carm.py", "imaging/options.py")
 _SEAL = hashlib.sha256().digest_size
-# A process that was interrupted while it compiled holds its lock; s.
+# For a lock, s; a process that is stopped while it compiles keeps its lock.
 _LONGEST_WAIT = 60.0
 
 
@@ -82,11 +82,28 @@ def keep_together() -> None:
     ]
 
 
+def _acquired(path: Path) -> filelock.FileLock:
+    """Returns a lock, which is not held if it cannot be acquired."""
+    lock = filelock.FileLock(path, _LONGEST_WAIT)
+    # A timeout is an OSError, too.
+    with contextlib.suppress(OSError, NotImplementedError):
+        lock.acquire()
+    return lock
+
+
 class _Files(caching.IndexDataCacheFile):
     """Cache files of one function; damaged or outdated files are not read.
 
     numba writes the index first, so after a full disk it may name a file of older code.
     """
+
+    def save(self, key: Any, data: Any) -> None:
+        """Saves the code of one signature; all signatures share the index."""
+        lock = _acquired(Path(f"{self._index_path}.lock"))
+        try:
+            super().save(key, data)
+        finally:
+            lock.release(force=True)
 
     def _load_index(self) -> dict:
         try:
@@ -130,10 +147,7 @@ class _Cache(caching.FunctionCache):
         compiled_ahead.start(self._cache_path)
         kind = hashlib.sha256(repr(sig).encode()).hexdigest()[:16]
         name = f"{self._impl.filename_base}-{kind}.lock"
-        self._lock = filelock.FileLock(Path(self._cache_path, name), _LONGEST_WAIT)
-        # A timeout is an OSError, too.
-        with contextlib.suppress(OSError, NotImplementedError):
-            self._lock.acquire()
+        self._lock = _acquired(Path(self._cache_path, name))
         found = super().load_overload(sig, target_context)
         if found is None:
             _tell_of_compiling()

@@ -8,6 +8,7 @@ import logging
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import filelock
@@ -307,13 +308,26 @@ def test_what_another_process_compiles_is_waited_for(run, folder, monkeypatch):
     for path in kept:
         path.unlink()
     assert run() == (42, 1)
-    assert [lock.is_locked for lock in taken] == [False, False]
+    # Of the function in both runs, and of its index in the first.
+    assert [lock.is_locked for lock in taken] == [False, False, False]
+
+
+def test_signatures_saved_at_the_same_time_are_all_kept(tmp_path):
+    def save(first):
+        own = compiled_cache._Files(str(tmp_path), "function", b"stamp")
+        for number in range(first, first + 20):
+            own.save(number, number)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(save, range(0, 80, 20)))
+    found = compiled_cache._Files(str(tmp_path), "function", b"stamp")
+    assert [found.load(number) for number in range(80)] == list(range(80))
 
 
 @KINDS
 def test_a_process_that_never_ends_is_not_waited_for(run, folder, monkeypatch, caplog):
     run()
-    (lock,) = files(folder, "lock")
+    lock = next(path for path in files(folder, "lock") if ".nbi" not in path.name)
     for path in files(folder, "nb?"):
         path.unlink()
     monkeypatch.setattr(compiled_cache, "_LONGEST_WAIT", 0.1)
