@@ -78,6 +78,9 @@ def test_an_ended_simulation_stays_as_it_ended_until_its_reset():
     skipping.reset()
     first = skipping.step(push.clone())["next", "reward"][0]
     assert first == once["reward"][0, 0] + once["reward"][0, 1] + then["reward"][0, 0]
+    with pytest.raises(ValueError, match="of 1 simulations, 2 are to be restored"):
+        env.restore(env.snapshot(np.array([0])))
+    assert not steps(1)["reward"][0].any()
     env.reset()
     assert not steps(1)["done"].any() and steps(1)["reward"].all()
 

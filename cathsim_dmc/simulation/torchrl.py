@@ -147,8 +147,9 @@ class BatchedEnv(EnvBase):
         **kwargs,
     ) -> TensorDict:
         if snapshot is not None:
+            step = self.simulation.restore(snapshot)
             self._ended[:] = False
-            return self._tensors(self.simulation.restore(snapshot))
+            return self._tensors(step)
         chosen = None
         if tensordict is not None and "_reset" in tensordict.keys():
             mask = tensordict["_reset"].reshape(self.batch_size).cpu().numpy()
