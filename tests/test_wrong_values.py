@@ -317,15 +317,21 @@ def test_wrong_arguments_of_entities_are_refused(build, words):
     "changes",
     [
         *({"friction": 0.1}, {"physics_timestep": 2e-3}, {"device": "steerable_4f"}),
-        *({"vessel": "living"}, {}),
+        {"vessel": "living"},
+        {"randomisation": {"goal_shift": [0.0, 0.01]}},
+        {},
     ],
 )
 def test_a_task_has_the_options_of_its_scene(shared_environment, changes):
     task = shared_environment(TASK).task
     config, objective = dataclasses.replace(CONFIG, **changes), task.objective
     if changes:
-        with pytest.raises(ValueError, match=f"config has {next(iter(changes))}=.*bui"):
+        refused = f"config has {next(iter(changes))}.*=.*the scene was built"
+        with pytest.raises(ValueError, match=refused):
             Navigation(task.scene, objective, config)
+        other = dataclasses.replace(task.scene, config=config)
+        with pytest.raises(ValueError, match="the scene was built"):
+            Navigation(task.scene, objective, others=[(other, objective)])
     with pytest.raises(ValueError, match="config is {}.*a NavigationConfig"):
         Navigation(task.scene, objective, {})
     assert Navigation(task.scene, objective).config is task.scene.config

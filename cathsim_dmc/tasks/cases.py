@@ -154,12 +154,14 @@ def compile_together(
         config: Options of the task.
 
     Raises:
-        ValueError: if the scenes differ in more than wall and places.
+        ValueError: if the scenes differ in more than wall and places, or were built
+            with other options.
     """
     found: list[Case] = []
     sizes: dict[str, int] = {}  # lengths of the fields that differ in any case
     first, host = None, None
     for scene, objective in scenes:
+        scene.check(config)
         root = scene.arena.mjcf_model
         root.option.timestep = config.physics_timestep
         spec = mujoco.MjSpec.from_string(root.to_xml_string(), assets=root.get_assets())

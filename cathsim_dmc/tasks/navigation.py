@@ -77,7 +77,7 @@ class Navigation(composer.Task, NotCopied):
             name: Name of the task in texts; None for the name of the class.
 
         Raises:
-            ValueError: if the scene was built with other options, the objective does
+            ValueError: if a scene was built with other options, the objective does
                 not support the randomisation, or the scenes differ in more than their
                 anatomies.
         """

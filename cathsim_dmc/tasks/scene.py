@@ -1,6 +1,7 @@
 """The scene of a navigation task: entities and their placement."""
 
 import dataclasses
+import operator
 from collections.abc import Sequence
 
 import numpy as np
@@ -36,7 +37,7 @@ _DENSE_LINKS = 50
 _SHAPING = (
     "device", "devices", "lead", "lumen_friction", "rotation", "friction", "shaft_link",
     "working_length", "sheath_clearance", "physics_timestep", "solver_tolerance",
-    "vessel",
+    "vessel", "randomisation.farthest_shift",
 )  # fmt: skip
 
 # Cameras and their axes, right and up: the published top view, and one from the side.
@@ -130,7 +131,7 @@ class Scene:
         """Raises ValueError if options that shape a scene are not those of this one."""
         bounds.instance("config", config, NavigationConfig)
         for name in _SHAPING:
-            given, own = getattr(config, name), getattr(self.config, name)
+            given, own = map(operator.attrgetter(name), (config, self.config))
             if given != own:
                 raise ValueError(
                     f"config has {name}={given!r}, but the scene was built with "
