@@ -8,6 +8,7 @@ import pytest
 from conftest import OBSERVATIONS, twin
 
 from cathsim_dmc import suite
+from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.observation_kind import Entry, Sizes
 
@@ -118,3 +119,22 @@ def test_values_lie_in_the_ranges_of_the_table(environment):
             values = np.stack([t.observation[entry.key] for t in timesteps])
             assert entry.low <= values.min(), entry.key
             assert values.max() <= entry.high, entry.key
+
+
+def test_a_simulation_that_has_diverged_does_not_keep_others_from_beginning(
+    environment,
+):
+    def own(frame):
+        return {"own": given}
+
+    table, given = observations.OBSERVATIONS, np.zeros((2, 1))
+    table.row(Entry("own", 1, "m", "a number"))(own)
+    try:
+        batch = BatchSimulation(twin(environment.task, observation="own"), 2)
+        batch.reset()
+        given[0] = np.nan
+        assert np.isnan(batch.reset(np.array([1])).observation["own"][0])
+        with pytest.raises(ValueError, match="'own' of an observation is .*nan"):
+            batch.reset(np.array([0]))
+    finally:
+        del table["own"]

@@ -256,9 +256,17 @@ class ObservationTable(dict[str, ObservationKind]):
         return {key: value for row in rows.values() for key, value in row.items()}
 
     def check(
-        self, observation: Observation, wanted: Mapping[str, specs.Array]
+        self,
+        observation: Observation,
+        wanted: Mapping[str, specs.Array],
+        begun: np.ndarray,
     ) -> None:
-        """Raise ValueError if arrays (N, ...) do not fit a simulation's specs."""
+        """Raise ValueError if arrays (N, ...) do not fit a simulation's specs.
+
+        Args:
+            begun: (K,) numbers of the simulations that begin an episode, whose entries
+                must be finite; the others may have diverged.
+        """
         for key in sorted(observation.keys() | wanted.keys()):
             value, entry = observation.get(key), f"entry {key!r} of an observation"
             if value is not None and not isinstance(value, np.ndarray):
@@ -275,9 +283,10 @@ class ObservationTable(dict[str, ObservationKind]):
                     f"{entry} is of {value.dtype}, and its row declares "
                     f"{wanted[key].dtype}; return what it declares"
                 )
-            if value.dtype.kind == "f" and not np.isfinite(value).all():
+            first = value[begun]
+            if first.dtype.kind == "f" and not np.isfinite(first).all():
                 raise ValueError(
-                    f"{entry} is {bounds.shown(value)} at the start of an episode; its "
+                    f"{entry} is {bounds.shown(first)} at the start of an episode; its "
                     "numbers must be finite"
                 )
 

@@ -241,7 +241,7 @@ class Rollout(Restorable):
         begun, old = set(indices.tolist()), enumerate(self._errors)
         self._errors = tuple(None if n in begun else error for n, error in old)
         step = self._step(indices, begins=True)
-        observations.check(step.observation, self._specs)
+        observations.check(step.observation, self._specs, indices)
         self._open[indices] = False
         return step
 
