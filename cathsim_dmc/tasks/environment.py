@@ -91,10 +91,10 @@ class Environment(composer.Environment, NotCopied):
         return self._legacy_step or self._raise_exception_on_physics_error
 
     def _substep(self, action):
-        """Does a physics step with its hooks; after a warning it keeps zeros alone.
+        """Does a physics step with its hooks; after a warning it only keeps zeros.
 
-        The stepper repeats a control step with a warning; composer would end the
-        episode.
+        The stepper repeats a control step with a warning, for which composer would end
+        the episode.
         """
         stepper = self.task.stepper
         if self._composed:
