@@ -1,8 +1,8 @@
 """A second process that compiles for a first load, beside the process that loads.
 
-Almost half of what a first load compiles is the collider. Meanwhile the second process
-loads a task without collisions, see `first_load`, which compiles the rest. Each
-function is compiled once: `compiled_cache` holds a lock while it is.
+Almost half of what a first load compiles is the collider. While this process compiles
+it, the second one loads a task without collisions (`first_load`), which compiles the
+rest. `compiled_cache` locks each function, so that only one process compiles it.
 """
 
 import atexit
