@@ -283,11 +283,10 @@ class ObservationTable(dict[str, ObservationKind]):
                     f"{entry} is of {value.dtype}, and its row declares "
                     f"{wanted[key].dtype}; return what it declares"
                 )
-            first = value[begun]
-            if first.dtype.kind == "f" and not np.isfinite(first).all():
+            if value.dtype.kind == "f" and not np.isfinite(value[begun]).all():
                 raise ValueError(
-                    f"{entry} is {bounds.shown(first)} at the start of an episode; its "
-                    "numbers must be finite"
+                    f"{entry} is {bounds.shown(value[begun])} at the start of an "
+                    "episode; its numbers must be finite"
                 )
 
     def entries(self, names: Iterable[str]) -> list[Entry]:
