@@ -242,9 +242,9 @@ def test_entries_that_networks_cannot_read_are_refused():
         with pytest.raises(ValueError, match=f"entry '{entry.key}'.*must be"):
             entry.spec(Sizes())
     spec = {"near": Entry("near", 1, "m", "").spec(Sizes())}
-    table.check({"near": np.zeros((2, 1))}, spec)
+    table.check({"near": np.zeros((2, 1))}, spec, np.arange(2))
     with pytest.raises(ValueError, match="'near' .* is of bool, .* declares float64"):
-        table.check({"near": np.zeros((2, 1), bool)}, spec)
+        table.check({"near": np.zeros((2, 1), bool)}, spec, np.arange(2))
 
 
 def test_the_base_bears_what_pushes_and_turns_the_device():
