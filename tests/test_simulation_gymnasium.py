@@ -14,7 +14,11 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 import cathsim_dmc.gym  # noqa: E402
 from cathsim_dmc import suite  # noqa: E402
-from cathsim_dmc.simulation.gymnasium import CathSimEnv, CathSimVectorEnv  # noqa: E402
+from cathsim_dmc.simulation.gymnasium import (  # noqa: E402
+    CathSimEnv,
+    CathSimVectorEnv,
+    env_spec,
+)
 from cathsim_dmc.tasks import physics_errors  # noqa: E402
 
 TASK = "cathsim/simple1_bca-v0"
@@ -34,6 +38,7 @@ def run(env, steps, seed):
 
 def test_every_task_has_an_id():
     named = set(cathsim_dmc.gym.IDS.values())
+    assert {env_spec(name).id for name in named} == set(cathsim_dmc.gym.IDS)
     # Another test may have registered the task of the example since.
     assert set(suite.SUITE) - named <= {"gentle_type1_lcca"}
     assert named <= set(suite.SUITE)
@@ -126,9 +131,11 @@ def _everywhere(objective):
 def test_render_shows_the_image_of_the_episodes_machine():
     drawn = {"view": [4, 5], "gain": [0.85, 0.9]}
     options = {"observation": "image", "randomisation": drawn}
+    options["fluoroscopy"] = {"size": 32, "biplane": "LATERAL"}
     env = gymnasium.make(TASK, render_mode="rgb_array", **options)
     image = env.reset(seed=3)[0]["image"]
-    np.testing.assert_array_equal(env.render(), np.repeat(image, 3, axis=-1))
+    row = np.concatenate([image[..., 0], image[..., 1]], axis=1)
+    np.testing.assert_array_equal(env.render(), np.stack([row] * 3, axis=-1))
     assert env.metadata["render_fps"] == 25  # a control step takes 40 ms
 
 
@@ -208,6 +215,7 @@ def test_make_vec_is_the_batch_and_equals_the_single_environments(mode):
     for name in ("observation_space", "action_space", "single_observation_space"):
         assert getattr(many, name) == getattr(single, name)
     assert_alike(many.reset(seed=5), single.reset(seed=5))
+    assert many.np_random_seed == 5
     many.action_space.seed(0)
     ended = np.zeros(3, bool)
     for index in range(11):
@@ -231,22 +239,26 @@ def test_make_vec_is_the_batch_and_equals_the_single_environments(mode):
         results = [env.step(action) for env in (many, single)]
         assert_alike(*results)
         assert many.observation_space.contains(results[0][0])
+        masks = [v for k, v in results[0][4].items() if k.startswith("_")]
+        assert len({id(each) for each in masks}) == len(masks)  # each may be changed
         ended = results[0][2] | results[0][3]
 
 
-def test_a_physics_error_ends_an_episode_of_a_vector_as_of_a_single_one():
+def test_a_physics_error_ends_an_episode_of_a_vector_as_of_a_single_one(monkeypatch):
     nxt = gymnasium.vector.AutoresetMode.NEXT_STEP
     many, single = vector(nxt, count=2), vector(nxt, "sync", 2)
     many.reset(seed=0), single.reset(seed=0)
     many.simulation.batch.qvel[1] = np.nan
     single.envs[1].unwrapped.environment.physics.data.qvel[:] = np.nan
     ends = []
-    for _ in range(3):
+    usual = physics_errors.MAX_FORCE
+    for limit in (usual, -1.0, usual):  # an error in both while the second one waits
+        monkeypatch.setattr(physics_errors, "MAX_FORCE", limit)
         action = many.action_space.sample()
         results = [env.step(action) for env in (many, single)]
         assert_alike(*results)
         ends.append(results[0][2].tolist())
-    assert ends == [[False, True], [False, False], [False, False]]
+    assert ends == [[False, True], [True, False], [False, False]]
 
 
 @pytest.mark.parametrize(
@@ -257,6 +269,7 @@ def test_a_physics_error_ends_an_episode_of_a_vector_as_of_a_single_one():
         ({"autoreset_mode": "Never"}, "SameStep"),
         ({"dtype": "int8"}, "dtype"),
         ({"num_envs": 0}, "num_simulations"),
+        ({"num_threads": -1}, "num_threads"),
         ({"max_episode_steps": 3, "max_steps": 4}, "max_episode_steps is 3; .*be 4"),
         ({"max_episode_steps": 0}, "max_steps is 0"),
         ({"task_kwargs": {"max_steps": 3}}, "'task_kwargs'.*options themselves"),
@@ -279,6 +292,10 @@ def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
         many.step(many.action_space.sample())
     with pytest.raises(gymnasium.error.ResetNeeded):
         many.render()
+    many.render_mode = None
+    with pytest.warns(UserWarning, match="without a render_mode"):
+        assert many.render() is None
+    many.render_mode = "rgb_array"
     for seed in (-1, [1], [1, "a"], 1.5):
         with pytest.raises(ValueError, match="seed"):
             many.reset(seed=seed)
@@ -315,8 +332,8 @@ def test_a_vector_takes_the_seed_of_its_task():
     def start(**options):
         return CathSimVectorEnv(2, "simple1_bca", num_threads=1, **options).reset
 
-    seen = start()(seed=5)[0]["position"]
-    for random in (5, np.int64(5), [5, 6]):
+    seen = start()(seed=0)[0]["position"]
+    for random in (0, np.int64(0), [0, 1]):
         np.testing.assert_array_equal(start(random=random)()[0]["position"], seen)
     assert not np.array_equal(*(start()()[0]["position"] for _ in range(2)))
     with pytest.raises(ValueError, match="random is 1.5"):
@@ -343,6 +360,8 @@ def test_torchrl_takes_the_id():
     rollout = env.rollout(20)
     assert rollout["next", "truncated"].flatten().tolist() == [False] * 4 + [True]
     assert rollout["image"].shape == (5, 128, 128, 1)
+    repeats = torchrl_envs.GymEnv(TASK, max_steps=4, frame_skip=2)
+    assert len(repeats.rollout(9)) == 2
 
 
 def test_torchrl_takes_the_vector():
