@@ -163,6 +163,17 @@ def test_the_record_follows_the_simulation(env, episode):
     np.testing.assert_array_equal(episode.catheter[:, 2], episode.body_pos[:, link])
 
 
+def test_the_goal_of_a_record_is_the_shifted_one():
+    plain = suite.make_task("simple1_bca").objective.goal
+    options = {"randomisation": {"goal_shift": (3e-3, 5e-3)}}
+    env = suite.load("cathsim", "simple1_bca", options)
+    made = EpisodeRecorder(env).record_episode(bend_and_push, seed=1, max_steps=2)
+    goal, shift = made.meta["goal_position"], made.meta["conditions"]["goal_shift"]
+    assert np.linalg.norm(goal - plain) == pytest.approx(shift, rel=0.05)
+    distance = np.linalg.norm(made.head - goal, axis=-1)
+    np.testing.assert_allclose(made.meta["distance"], distance)
+
+
 def test_sides_of_the_patient_are_told_where_they_are_known(env, monkeypatch):
     here = env.task.scene.anatomy
     assert EpisodeRecorder(env).present().meta["upright"] is True  # a phantom
