@@ -1,6 +1,7 @@
 """The tasks as Gymnasium environments."""
 
 import functools
+import importlib
 import re
 import runpy
 import warnings
@@ -39,6 +40,9 @@ def run(env, steps, seed):
 def test_every_task_has_an_id():
     named = set(cathsim_dmc.gym.IDS.values())
     assert {env_spec(name).id for name in named} == set(cathsim_dmc.gym.IDS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # such as that an id is overridden
+        importlib.reload(cathsim_dmc.gym)
     # Another test may have registered the task of the example since.
     assert set(suite.SUITE) - named <= {"gentle_type1_lcca"}
     assert named <= set(suite.SUITE)
@@ -292,10 +296,6 @@ def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
         many.step(many.action_space.sample())
     with pytest.raises(gymnasium.error.ResetNeeded):
         many.render()
-    many.render_mode = None
-    with pytest.warns(UserWarning, match="without a render_mode"):
-        assert many.render() is None
-    many.render_mode = "rgb_array"
     for seed in (-1, [1], [1, "a"], 1.5):
         with pytest.raises(ValueError, match="seed"):
             many.reset(seed=seed)
@@ -311,12 +311,19 @@ def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
     for _ in range(15):  # until the motion has its full amplitude
         many.step(np.zeros_like(many.action_space.low))
         one.step(np.zeros_like(one.action_space.low))
+    for env in (many, one):
+        env.render_mode = None
+        with pytest.warns(UserWarning, match="without a render_mode"):
+            assert env.render() is None
+        env.render_mode = "rgb_array"
     shown = many.render()
     assert len(shown) == 2 and shown[0].shape == (32, 64, 3)
     np.testing.assert_array_equal(shown[1], one.render())
     state = one.snapshot()
     many.close()
-    one.close()
+    for _ in range(2):  # the second time, nothing is left to free
+        one.close()
+        assert one.environment._physics is None
     with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="make another"):
         one.reset()
     with pytest.raises(gymnasium.error.ResetNeeded):
