@@ -185,6 +185,8 @@ def test_a_seed_repeats_the_episode(env, episode):
     recorder = EpisodeRecorder(env, "navigate", {"goal": "bca"})
     again = recorder.record_episode(bend_and_push, seed=2, max_steps=STEPS)
     assert same(again, episode)
+    pushes = iter([bend_and_push(None)] * STEPS)  # then StopIteration
+    assert same(recorder.record_episode(lambda seen: next(pushes), seed=2), episode)
     for seed in (3, None):
         other = recorder.record_episode(bend_and_push, seed=seed, max_steps=1)
         assert other.seed == seed

@@ -1,3 +1,4 @@
+import functools
 import types
 
 import numpy as np
@@ -121,7 +122,8 @@ def test_a_policy_of_images_names_those_of_another_size():
 
 def test_episodes_that_are_ended_early_begin_anew_while_others_go_on():
     """The first by who looks on, the second by itself; the third ends all."""
-    ends, begun, reset = iter([[0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 1]]), [], []
+    none, second, third = [0, 0, 0], [0, 1, 0], [0, 0, 1]
+    ends, begun, reset = iter([none, second, none, third, none]), [], []
 
     def step(action=None):
         ended = np.zeros(3, bool) if action is None else np.array(next(ends), bool)
@@ -133,13 +135,19 @@ def test_episodes_that_are_ended_early_begin_anew_while_others_go_on():
         return step()
 
     simulation = types.SimpleNamespace(num_simulations=3, step=step, reset=restart)
+    play = functools.partial(
+        episodes.play, simulation, lambda observation: np.zeros((3, 1)),
+        lambda mask: begun.append([*mask]),
+    )  # fmt: skip
     played = []
-    for turn in episodes.play(
-        simulation, lambda observation: np.zeros((3, 1)), lambda m: begun.append([*m])
-    ):
+    for turn in play():
         played.append(turn.running.tolist())
         if len(played) == 2:
             turn.running[0] = False
     assert reset == [None, [0], [1]]
     assert begun == [[True] * 3, [True, False, False], [False, True, False]]
     assert played[2:] == [[False, True, True], *[[False, False, True]] * 2]
+    turns = play()
+    next(turns).running[0] = False  # before its first step
+    next(turns)
+    assert begun[3:] == [[True] * 3]
