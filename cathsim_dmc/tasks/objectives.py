@@ -237,7 +237,8 @@ class Cannulation(Shiftable, Routed):
     def outcome(self, measurement: Measurement) -> Outcome:
         """Judges a control step."""
         success, failed = self.success(measurement), self.failure(measurement)
-        if np.shape(failed) == success.shape:  # `judge` refuses others, but None
+        # `judge` refuses a failure of another shape or type.
+        if failed is not None and np.shape(failed) == success.shape:
             success = success & ~np.asarray(failed, dtype=bool)
         any_success = np.count_nonzero(success)
         terms = {}
