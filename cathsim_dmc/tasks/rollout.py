@@ -241,7 +241,9 @@ class Rollout(Restorable):
         begun, old = set(indices.tolist()), enumerate(self._errors)
         self._errors = tuple(None if n in begun else error for n, error in old)
         step = self._step(indices, begins=True)
-        observations.check(step.observation, self._specs, indices)
+        # Composer observes before the first episode, where nothing has its place.
+        placed = indices if self.begun else indices[:0]
+        observations.check(step.observation, self._specs, placed)
         self._open[indices] = False
         return step
 
