@@ -27,6 +27,7 @@ SNIPPETS = [
             "index",
             "concepts",
             "how-to",
+            "own_tasks",
             "own_training",
             "gymnasium",
             "forces",
