@@ -57,12 +57,21 @@ class _Compiled:
         """The device function for kernels of numba-cuda; see `for_cuda`."""
         from numba import cuda
 
+        return cuda.jit(device=True)(self._calling("on_cuda"))
+
+    @functools.cached_property
+    def interpreted(self) -> Any:
+        """The function that Python interprets; see `interpreted`."""
+        return self._calling("interpreted")
+
+    def _calling(self, form: str) -> types.FunctionType:
+        """The function, which calls the forms of compiled functions with that name."""
         function, own = self._function, dict(self._function.__globals__)
         for name in _names(function.__code__):
             if isinstance(own.get(name), _Compiled):
-                own[name] = own[name].on_cuda
+                own[name] = getattr(own[name], form)
         held = (
-            types.CellType(cell.cell_contents.on_cuda)
+            types.CellType(getattr(cell.cell_contents, form))
             if isinstance(cell.cell_contents, _Compiled)
             else cell
             for cell in function.__closure__ or ()
@@ -75,7 +84,7 @@ class _Compiled:
             tuple(held) or None,
         )
         made.__module__, made.__qualname__ = function.__module__, function.__qualname__
-        return cuda.jit(device=True)(made)
+        return made
 
     @property
     def cache_path(self) -> str | None:
@@ -133,6 +142,32 @@ def for_cuda(function: Any) -> Any:
             "functions for a GPU need numba-cuda; install the extra gpu: "
             "pip install '.[gpu]'"
         ) from error
+
+
+def interpreted(function: Any) -> Any:
+    """Returns a compiled function, with those that it calls, as functions of Python.
+
+    A few calls for small arrays, as when a scene is made, take less time than the
+    compilation. Results are equal bit for bit. Calls through a module
+    (`module.function`) are not replaced.
+    """
+    return function.interpreted
+
+
+def compile_first(function: Any) -> None:
+    """Makes this process interpret all functions until it calls a function.
+
+    That function, and those called after it, are compiled.
+    """
+    compiled_call = _Compiled.__call__
+
+    def call(self: _Compiled, *arguments: Any) -> Any:
+        if self is function:
+            _Compiled.__call__ = compiled_call
+        chosen = self._compiled if self is function else self.interpreted
+        return chosen(*arguments)
+
+    _Compiled.__call__ = call
 
 
 def _names(code: types.CodeType) -> set[str]:

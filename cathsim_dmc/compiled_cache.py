@@ -192,7 +192,7 @@ def _tell_of_compiling() -> None:
         _told.add("compiling")
         print(
             "compiling for this machine, once; the result is cached: the whole physics "
-            "takes about 10 s, that of coaxial devices 20 s",
+            "takes about 10 s, that of coaxial devices 15 s",
             file=sys.stderr,
         )
 

@@ -58,7 +58,7 @@ ALLOWED = {
     "physics": {"anatomy", "collision", "laws", "entities"},
     "tasks": {"anatomy", "collision", "imaging", "laws", "entities", "physics"},
     "suite": _TASK,
-    "first_load": {"collision", "suite"},
+    "first_load": {"collision", "physics", "suite"},
     "simulation": _TASK | {"suite"},
     "policies": _FACE,
     "recording": _FACE,

@@ -78,8 +78,6 @@ class Bore:
 class _Table:
     """Table of the process's fields by key, which compiled functions read."""
 
-    collides = True
-
     def __init__(self):
         from cathsim_dmc.collision import loops, table
 
@@ -138,17 +136,12 @@ class _Table:
 
     def _collide_by(self, module: types.ModuleType) -> None:
         # The function of `moving` handles walls at rest, too.
-        address = module.of_link.address if self.collides else 0
+        address = module.of_link.address  # 0 for no contacts
         for kind in (_CAPSULE, _SPHERE):
             self._functions[kind * _TYPES + _BOX] = address
 
 
 _made_table = functools.cache(_Table)
-
-
-def leave_out_collider() -> None:
-    """Makes walls give no contacts in this process, which then compiles no collider."""
-    _Table.collides = False
 
 
 def _get_table() -> _Table:

@@ -351,7 +351,14 @@ class NotCompiledError(ValueError):
 
 
 class Callback:
-    """A function that C calls, compiled when its address is first requested."""
+    """A function that C calls, compiled when its address is first requested.
+
+    Attributes:
+        left_out: Whether its address is 0 in this process, which then does not compile
+            it.
+    """
+
+    left_out = False
 
     def __init__(self, function: Callable, signature: str, cache: bool):
         self._function, self._signature, self._cache = function, signature, cache
@@ -374,8 +381,8 @@ class Callback:
 
     @property
     def address(self) -> int:
-        """Address of the compiled function."""
-        return int(self.made.address or 0)
+        """Address of the compiled function; 0 for none."""
+        return 0 if self.left_out else int(self.made.address or 0)
 
     @property
     def ctypes(self) -> Any:

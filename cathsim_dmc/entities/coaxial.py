@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc.compiled import interpreted
 from cathsim_dmc.entities import stack_memory
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.device import Device
@@ -70,15 +71,15 @@ class Stack:
     def overlap(self, gaps: ArrayLike) -> laws.Overlap:
         """`Overlap` of devices whose ends are `gaps` (K,) from the chain's end, m."""
         found, scratch = stack_memory.overlap(self.tables), stack_memory.scratch
-        laws.overlap(
-            np.array(gaps, np.float64), self.tables, scratch(self.tables), found
-        )
+        gaps = np.array(gaps, np.float64)
+        interpreted(laws.overlap)(gaps, self.tables, scratch(self.tables), found)
         return found
 
     def links(self, overlap: laws.Overlap, friction: float) -> laws.Links:
         """`Links` for a Coulomb coefficient of an uncoated device on the wall."""
         found = stack_memory.links(self.tables)
-        laws.links(overlap, self.link_lengths, friction, self.sections, found)
+        lengths, sections = self.link_lengths, self.sections
+        interpreted(laws.links)(overlap, lengths, friction, sections, found)
         return found
 
 

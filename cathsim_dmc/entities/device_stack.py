@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cathsim_dmc import bounds
+from cathsim_dmc.compiled import interpreted
 from cathsim_dmc.entities import devices as library
 from cathsim_dmc.entities.armature import hinge_armatures
 from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
@@ -76,7 +77,8 @@ class DeviceStack(Chain):
         self.start_gaps = lead * np.arange(len(self.devices), dtype=np.float64)
         overlap = self.stack.overlap(self.start_gaps)
         rest = np.empty((len(self.stack.spans), 2))
-        unloaded_hinges(overlap.rest.sum(axis=0).astype(complex), rest)
+        bends = overlap.rest.sum(axis=0).astype(complex)
+        interpreted(unloaded_hinges)(bends, rest)
         # Any device may lead, so each hinge has the least armature of all devices.
         alone = [hinge_armatures(one, self.stack.link_lengths) for one in self.devices]
         tip = self.stack.nodes <= self.devices[0].tip_length + 1e-9

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cathsim_dmc.compiled import compiled
+from cathsim_dmc.compiled import compiled, interpreted
 from cathsim_dmc.entities import stack_memory
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.laws import coaxial
@@ -133,12 +133,12 @@ def write_still(
         turns += np.asarray(rotation)[:, None]
     overlap = stack.overlap(entity.start_gaps if gaps is None else gaps)
     shape, chain = np.empty(len(stack.spans), complex), stack_memory.chain(stack.tables)
-    coaxial.rest_angles(overlap.rest, turns, shape)
-    unloaded_hinges(shape, chain.rest)
+    interpreted(coaxial.rest_angles)(overlap.rest, turns, shape)
+    interpreted(unloaded_hinges)(shape, chain.rest)
     links = stack.links(overlap, entity.friction)
     chain = chain._replace(overlap=overlap, links=links)
     fields = fields_of(lambda name: getattr(model, name))
-    write(fields, places_of(model, entity), chain, 1.0, 1.0)
+    interpreted(write)(fields, places_of(model, entity), chain, 1.0, 1.0)
 
 
 @compiled

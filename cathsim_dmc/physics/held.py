@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.random import RandomState
 
+from cathsim_dmc.compiled import interpreted
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.laws import sheath
 from cathsim_dmc.physics.effects import Draw, Effect, World
@@ -69,7 +70,9 @@ class Held:
         """
         fields = fields_of(lambda name: getattr(model, name))
         free, places = sheath.Hinges._make(self.nominal), self.ends + start_depth
-        sheath.hold(self.joints, places, float(insertion), free, fields, self.out)
+        interpreted(sheath.hold)(
+            self.joints, places, float(insertion), free, fields, self.out
+        )
 
     @contextlib.contextmanager
     def at(
