@@ -123,7 +123,7 @@ class Scene:
             robot=Robot(device_radius=radius),
             config=config,
         )
-        scene._attach(config)
+        scene._attach()
         scene._add_cameras(drawn)
         return scene
 
@@ -148,8 +148,9 @@ class Scene:
         for name, axes in VIEWS.items():
             self.arena.add_camera(name, centre, distance, axes)
 
-    def _attach(self, config: NavigationConfig):
-        moving, own = config.vessel.motion is not None, config.effects_on(self.catheter)
+    def _attach(self):
+        moving = self.config.vessel.motion is not None
+        own = self.config.effects_on(self.catheter)
         if user_data := effects.userdata_size(own, self.catheter):
             self.arena.mjcf_model.size.nuserdata = user_data
         if len(self.catheter.links) <= _DENSE_LINKS or moving:
