@@ -277,7 +277,7 @@ def measure(given: argparse.Namespace, report: Report) -> None:
             report.attempt("speed", speed, *case, seconds=seconds)
 
     def trained(name: str, seconds: float) -> None:
-        if "ppo" in only:
+        if "ppo" in only and device.startswith("cuda"):  # trainings need a GPU
             case = name, device, given.runs, given.out
             report.attempt("training", training, *case, seconds=seconds)
 
