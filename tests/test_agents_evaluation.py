@@ -10,7 +10,13 @@ from dm_control.composer.variation import distributions
 from tensordict import TensorDict
 
 from cathsim_dmc import __version__, suite
-from cathsim_dmc.agents import evaluate, evaluation, policies, protocols
+from cathsim_dmc.agents import (
+    evaluate,
+    evaluation,
+    evaluation_files,
+    policies,
+    protocols,
+)
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.analysis.force_statistics import FIGURES, EpisodeForces, Statistics
@@ -205,6 +211,26 @@ def test_what_is_told_of_an_episode_is_of_its_own_environment():
     assert [first.path_ratio, second.path_ratio] == pytest.approx([1.2, 1.3])
     assert first.forces.max_force == pytest.approx(0.2)
     assert second.forces.max_force == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("failed", [True, False, None])
+def test_an_episode_that_the_objective_ended_is_not_one_given_up(failed):
+    info = {name: torch.zeros(1, 1, 1) for name in (*NAMES, "path_ratio")}
+    info |= dict.fromkeys(("success", "physics_error"), torch.zeros(1, 1, 1).bool())
+    if failed is not None:  # not every environment has this figure
+        info["failed"] = torch.full((1, 1, 1), failed)
+    ends = torch.ones(1, 1, 1).bool()
+    after = {"reward": torch.zeros(1, 1, 1), "done": ends, "terminated": ends}
+    (episode,) = EpisodeTracker(1).add(
+        TensorDict({"next": {**after, "info": info}}, [1, 1])
+    )
+    assert (episode.failed, episode.given_up) == (bool(failed), not failed)
+    settings = {"protocol": None, "task_kwargs": {}}
+    result = EvaluationResult("type1_lcca", "random", (0,), (episode,), settings)
+    row = result.to_dict()["episodes"][0]
+    assert evaluation_files.outcome(row) == episode
+    assert evaluation_files.outcome({**row, "failed": False}).given_up
+    assert result.summary().get("failed") == (1.0 if failed else None)
 
 
 def test_force_figures_are_those_of_the_steps():

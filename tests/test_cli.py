@@ -282,10 +282,10 @@ def test_an_evaluation_reports_each_episode(cathsim):
 @pytest.mark.parametrize(
     ("kind", "end"),
     [("success", "goal reached"), ("physics_error", "physics error"),
-     ("given_up", "given up or failed"), (None, "out of time")],
+     ("given_up", "given up"), ("failed", "failed"), (None, "out of time")],
 )  # fmt: skip
 def test_a_report_says_how_an_episode_ended(kind, end):
-    states = {name: name == kind for name in ("success", "physics_error")}
+    states = {name: name == kind for name in ("success", "failed", "physics_error")}
     states["terminated"] = kind is not None
     forces = EpisodeForces(mean_sum=Statistics(0.1, 0.2, 0.75))
     episode = EpisodeOutcome(

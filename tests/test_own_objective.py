@@ -135,6 +135,7 @@ def test_an_objective_ends_an_episode_as_failed_in_both_paths():
     over = step.wall_force.mean_sum > Limited.limit
     assert over.any() and min(rewards) < -5
     assert (step.outcome.failed == over).all() and not step.outcome.success.any()
+    assert (step.info()["failed"] == over).all()
     environment = suite.environment(limited())
     episode = cathsim_dmc.record(environment, "push", seed=0, max_steps=30)
     assert episode.termination == "failed" and not episode.success
@@ -151,6 +152,9 @@ def test_a_failure_outweighs_the_success_of_a_cannulation():
     step = batch.step(pushing(0)[0][:1])
     assert step.terminated.all() and not step.outcome.success.any()
     assert "success" in step.outcome.terms and step.outcome.terms["success"] == 0
+    # Failures of the objective are not those of the physics.
+    for error, failed in (None, True), ("diverged", False):
+        assert step._replace(errors=(error,)).failed.tolist() == [failed]
 
 
 def test_what_the_batch_cannot_honour_is_refused():

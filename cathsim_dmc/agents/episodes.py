@@ -24,6 +24,7 @@ class EpisodeOutcome:
         physics_error: Whether the simulation diverged, which ended it.
         path_ratio: Length of the head's path divided by the shortest way to the goal;
             below 1 where the head cuts the corner of the route at an ostium.
+        failed: Whether the objective ended it without success, as at a limit of force.
     """
 
     env: int
@@ -34,11 +35,13 @@ class EpisodeOutcome:
     forces: EpisodeForces
     physics_error: bool
     path_ratio: float
+    failed: bool = False
 
     @property
     def given_up(self) -> bool:
-        """Whether the task ended it: by its option `give_up`, or as failed."""
-        return self.terminated and not (self.success or self.physics_error)
+        """Whether the task ended it by its option `give_up`."""
+        others = self.success or self.failed or self.physics_error
+        return self.terminated and not others
 
 
 class EpisodeTracker:
@@ -62,6 +65,9 @@ class EpisodeTracker:
         after, info = batch["next"], batch["next", "info"]
         names = "success", "physics_error", "path_ratio"
         success, error, ratio = (read(info[name]) for name in names)
+        failed = np.zeros(batch.shape, bool)
+        if "failed" in info.keys():  # not in every environment of `make_env`
+            failed = read(info["failed"])
         names = "reward", "done", "terminated"
         reward, done, terminated = (read(after[name]) for name in names)
         forces = [read(info[name]) for name in NAMES]
@@ -86,6 +92,7 @@ class EpisodeTracker:
                         forces=self.forces.finish(env),
                         physics_error=bool(error[env, step]),
                         path_ratio=float(ratio[env, step]),
+                        failed=bool(failed[env, step]),
                     )
                 )
                 self.reward[env] = self.length[env] = 0

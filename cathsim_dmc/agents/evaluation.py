@@ -85,7 +85,7 @@ def evaluate(
             are counted from there; None for the starts of the task.
         make_env: Function with the arguments of `environments.make_env`; "info" of its
             environment has "success", "physics_error", "path_ratio" and the forces
-            `physics.forces.NAMES`.
+            `physics.forces.NAMES`, and may have "failed".
         on_cluster: Whether the processes of a Ray cluster play the episodes, in groups
             of `num_threads` processors each (None for one); the observer is then None
             or a `ContactLog`. The result is the same, bit for bit, on processors of

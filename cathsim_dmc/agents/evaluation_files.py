@@ -110,6 +110,8 @@ def outcome(
             }
         ),
         path_ratio=number("path_ratio", row["path_ratio"], 0.0),
+        # Older files count episodes that the objective ended as given up.
+        failed=bounds.switch("failed", row.get("failed", False)),
         **{name: bounds.switch(name, row[name]) for name in switches},
     )
 

@@ -173,6 +173,8 @@ class EvaluationResult:
             mean, deviation = self.mean_sd(f"forces.{quantity}.{name}")
             result["forces"][quantity][name] = {"mean": mean, "sd": deviation}
         result["physics_errors"] = sum(e.physics_error for e in self.episodes)
+        if failed := sum(e.failed for e in self.episodes):
+            result["failed"] = failed / count
         result |= {"success": successes / count, "success_ci95": interval}
         result["safe_success"] = {
             f"{limit:g} N": self.safe_success(limit) for limit in SAFE_FORCES

@@ -82,8 +82,9 @@ def print_episodes(result: EvaluationResult) -> None:
 def _outcome(
     seed: int, conditions: Mapping[str, Any], episode: EpisodeOutcome
 ) -> dict[str, str]:
-    missed = "given up or failed" if episode.given_up else "out of time"
-    end = "goal reached" if episode.success else missed
+    ends = ("success", "goal reached"), ("failed", "failed"), ("given_up", "given up")
+    reached = (text for name, text in ends if getattr(episode, name))
+    end = next(reached, "out of time")
     forces = episode.forces
     largest = forces.largest_sum
     return {

@@ -353,7 +353,7 @@ class Navigation(composer.Task, NotCopied):
         if step.terminated[0]:
             if step.outcome.success[0]:
                 return "success"
-            return "failed" if np.any(step.outcome.failed) else "given_up"
+            return "failed" if step.failed[0] else "given_up"
         return "truncated" if step.truncated[0] else None
 
     @property

@@ -21,7 +21,8 @@ def info_types(terms: Sequence[str], living: bool = False) -> dict[str, type]:
         living: Whether there are figures of the vessel.
     """
     numbers = *_INFO, *(INFO if living else ()), *(f"reward_{name}" for name in terms)
-    return {**dict.fromkeys(numbers, float), "success": bool, "physics_error": bool}
+    switches = "success", "failed", "physics_error"
+    return {**dict.fromkeys(numbers, float), **dict.fromkeys(switches, bool)}
 
 
 class Step(NamedTuple):
@@ -60,6 +61,13 @@ class Step(NamedTuple):
         """(N,) bool, whether the physics failed."""
         return np.array([error is not None for error in self.errors])
 
+    @property
+    def failed(self) -> np.ndarray:
+        """(N,) bool, whether the objective has ended the episode without success."""
+        success, fails = self.outcome.success, self.outcome.failed
+        ends = np.zeros_like(success) if fails is None else fails & ~success
+        return ends & ~self.physics_error
+
     def info(self) -> dict[str, np.ndarray]:
         """Figures beside the observation, arrays (N,): for logs and wrappers.
 
@@ -67,8 +75,8 @@ class Step(NamedTuple):
         "wall_force_max" and their means and peaks within the control step in N (see
         `forces.WallForce`); "path_ratio"; of a living vessel "heart_phase",
         "breath_phase", "blood_speed" (at the head, m/s), "indentation" (m) and
-        "wall_work" (J); "reward_<term>" for each weighted term; and "success" and
-        "physics_error" (bool).
+        "wall_work" (J); "reward_<term>" for each weighted term; and "success", "failed"
+        (by the objective) and "physics_error" (bool).
         """
         return {
             "distance": self.distance,
@@ -79,5 +87,6 @@ class Step(NamedTuple):
             **({} if self.vessel is None else self.vessel.info()),
             **{f"reward_{name}": term for name, term in self.outcome.terms.items()},
             "success": self.outcome.success,
+            "failed": self.failed,
             "physics_error": self.physics_error,
         }
