@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cathsim_dmc import suite
+from cathsim_dmc import compiled_cache, suite
 from cathsim_dmc.imaging.biplane_loops import carried
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import biplane_sight
@@ -121,3 +121,11 @@ def test_a_frame_is_carried_without_turning_about_the_line():
     np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(frame[:, 2], tip, atol=1e-9)
     np.testing.assert_allclose(frame[:, 1], [0.0, 1.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_process_that_has_compiled_loads_a_task(monkeypatch):
+    """It rehearses an episode, and observes before that episode has begun."""
+    monkeypatch.setattr(compiled_cache, "has_compiled", lambda: True)
+    batch = BatchSimulation(suite.make_task("simple1_bca", **OPTIONS), 1)
+    assert np.isfinite(batch.reset().observation["biplane_points"]).all()

@@ -38,7 +38,10 @@ def rehearse(rollout: Rollout, stepper: Any, num_actions: int) -> None:
     # With OpenGL started, the process could not be forked. Cameras compile nothing.
     rollout.views.leave_out_cameras()
     everyone = np.arange(stepper.num_simulations)
-    rollout.start(everyone)  # compiles while `first_load` compiles what follows
+    # As composer does before the first episode: this process compiles the readings
+    # while `first_load` compiles what follows.
+    stepper.forward_unactuated(everyone)
+    rollout.start(everyone)
     rollout.begin(everyone, [RandomState(0) for _ in everyone])
     stepper.forward_unactuated(everyone)
     rollout.start(everyone)
