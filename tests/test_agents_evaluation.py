@@ -617,6 +617,10 @@ def test_an_evaluation_goes_on_from_a_snapshot(tmp_path, cathsim):
     ):
         with pytest.raises(ValueError, match=text):
             evaluate("push", "simple1_bca", start=snapshot, **wrong)
+    with pytest.raises(ValueError, match=r"have ended in its simulations \[0, 1\];"):
+        options = {"max_steps": 12, "randomisation": drawn}
+        ended = {"start": simulation.snapshot(), "task_kwargs": options}
+        evaluate("push", "simple1_bca", **ended, num_threads=1)
 
 
 @pytest.mark.parametrize(("protocol", "most"), [("published", 94), ("varied", 16)])

@@ -85,6 +85,39 @@ def test_an_ended_simulation_stays_as_it_ended_until_its_reset():
     assert not steps(1)["done"].any() and steps(1)["reward"].all()
 
 
+def test_a_snapshot_of_an_end_is_restored_as_ended():
+    options = {"num_threads": 1, "observation": ["tracking", "image"], "seed": 4}
+    env = BatchedEnv("simple1_bca", 2, task_kwargs={"max_steps": 3}, **options)
+    push = TensorDict({"action": torch.ones(2, 21)}, batch_size=[2])
+    second = TensorDict({"_reset": torch.tensor([[False], [True]])}, batch_size=[2])
+    env.reset()
+    env.step(push.clone())
+    env.reset(second)
+    for _ in range(2):
+        env.step(push.clone())
+    end = env.snapshot()
+    assert env.ended.tolist() == [True, False]
+    then = env.step(push.clone())["next"]  # the second ends here
+    env.step(push.clone())
+    assert env.ended.all()
+    both = env.snapshot()
+    for name, array in end.arrays.items():
+        np.testing.assert_array_equal(both.arrays[name][0], array[0])
+    for snapshot, ended in ((end, [True, False]), (both, [True, True])):
+        env.restore(snapshot)
+        assert env.ended.tolist() == ended
+        again = env.step(push.clone())["next"]
+        assert (again.exclude("reward") == then.exclude("reward")).all()
+        assert (again["reward"][:, 0] == 0).tolist() == ended
+    # The next episode does not depend on how long a simulation has waited.
+    begun = env.reset()
+    env.restore(both)
+    assert (env.reset()["image"] == begun["image"]).all()
+    longer = BatchedEnv("simple1_bca", 2, task_kwargs={"max_steps": 4}, **options)
+    longer.restore(both)
+    assert not longer.ended.any() and longer.step(push)["next", "reward"].all()
+
+
 @pytest.mark.parametrize("option", ["observation", "random"])
 def test_what_is_an_argument_is_no_option(option):
     with pytest.raises(ValueError, match=f"without {option}, for which there is"):

@@ -327,6 +327,13 @@ def _first_episodes(
     outcomes: dict[int, EpisodeOutcome] = {}
     begun = np.ones(count, dtype=bool)
     state = env.reset() if start is None else env.reset(snapshot=start)
+    base = getattr(env, "base_env", env)
+    if start is not None and base.ended.any():
+        over = bounds.shown(np.flatnonzero(base.ended).tolist())
+        raise ValueError(
+            f"the episodes of start have ended in its simulations {over}; choose "
+            "others with start[...], or take the snapshot before their end"
+        )
     running = begun
     while running.any():
         state = env.maybe_reset(state)

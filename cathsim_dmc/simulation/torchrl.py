@@ -1,6 +1,7 @@
 """The batched simulation as a TorchRL environment."""
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,11 @@ class BatchedEnv(EnvBase):
     bool), all (N, 1).
 
     A simulation whose episode has ended stays as it ended, with a reward of 0, until it
-    is reset: transforms such as `FrameSkipTransform` step on.
+    is reset: transforms such as `FrameSkipTransform` step on. So does one that is
+    restored from a snapshot of its end.
 
     Attributes:
-        simulation: The simulations underneath.
+        simulation: The simulations underneath, which are stepped on after their end.
     """
 
     simulation: BatchSimulation
@@ -85,6 +87,7 @@ class BatchedEnv(EnvBase):
         super().__init__(device=place, batch_size=[num_envs])
         self._ended = np.zeros(num_envs, dtype=bool)
         self._last = TensorDict()  # the last step in which an episode ended
+        self._kept: dict[int, Snapshot] = {}  # ends of simulations stepped on since
         self._declare_specs(self.simulation.task)
 
     def _declare_specs(self, task: Navigation) -> None:
@@ -112,11 +115,18 @@ class BatchedEnv(EnvBase):
         return f"BatchedEnv({self._task_name!r}, {count}, device={str(self.device)!r})"
 
     def snapshot(self, indices: np.ndarray | None = None) -> Snapshot:
-        """The state of some or all simulations; see `BatchSimulation.snapshot`."""
+        """The state of some or all simulations; see `BatchSimulation.snapshot`.
+
+        That of a simulation whose episode has ended is the state of its end.
+        """
+        self._put_back(range(len(self._ended)))
         return self.simulation.snapshot(indices)
 
     def restore(self, snapshot: Snapshot) -> TensorDictBase:
         """Restores a snapshot of N simulations; returns what `reset` does.
+
+        Where an episode has ended by the task's rules and time limit, which `ended`
+        tells, the next step returns "done" and a reward of 0.
 
         With transforms, call `reset(snapshot=snapshot)` of the transformed environment,
         so that they process the observation.
@@ -125,6 +135,11 @@ class BatchedEnv(EnvBase):
             ValueError: if the snapshot is of another task or number of simulations.
         """
         return self.reset(snapshot=snapshot)
+
+    @property
+    def ended(self) -> np.ndarray:
+        """(N,) bool, simulations whose episode has ended and which wait for a reset."""
+        return self._ended.copy()
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Closes the environment and frees GPU memory."""
@@ -148,7 +163,8 @@ class BatchedEnv(EnvBase):
     ) -> TensorDict:
         if snapshot is not None:
             step = self.simulation.restore(snapshot)
-            self._ended[:] = False
+            self._kept.clear()
+            self._ended, self._last = step.terminated | step.truncated, self._all(step)
             return self._tensors(step)
         chosen = None
         if tensordict is not None and "_reset" in tensordict.keys():
@@ -156,18 +172,17 @@ class BatchedEnv(EnvBase):
             if not mask.any():  # TorchRL then keeps its present entries of all
                 return self.observation_spec.zero()
             chosen = np.flatnonzero(mask)
-        self._ended[slice(None) if chosen is None else chosen] = False
+        begins = np.arange(len(self._ended)) if chosen is None else chosen
+        self._put_back(begins)  # with its random state
+        self._ended[begins] = False
         return self._tensors(self.simulation.reset(chosen))
 
     def _step(self, tensordict: TensorDict) -> TensorDict:
         # Numpy has neither bfloat16 nor gradients.
         action = tensordict["action"].detach().cpu().double()
+        self._keep()
         step = self.simulation.step(action.numpy())
-        result = self._tensors(step)
-        result["reward"] = self._tensor(step.outcome.reward)[:, None]
-        result["terminated"] = self._tensor(step.terminated)[:, None]
-        result["truncated"] = self._tensor(step.truncated)[:, None]
-        result["done"] = result["terminated"] | result["truncated"]
+        result = self._all(step)
         if self._ended.any():
             waiting = torch.as_tensor(np.flatnonzero(self._ended), device=self.device)
             result[waiting] = self._last[waiting]
@@ -176,6 +191,30 @@ class BatchedEnv(EnvBase):
         if ends.any():
             self._ended |= ends
             self._last = result.clone()
+        return result
+
+    def _keep(self) -> None:
+        """Keeps the ends of simulations that are about to be stepped on."""
+        new = np.array([n for n in np.flatnonzero(self._ended) if n not in self._kept])
+        # `snapshot` raises where a device has none, or an effect's state has no copy.
+        with contextlib.suppress(NotImplementedError, TypeError):
+            if len(new):
+                ends = self.simulation.snapshot(new)
+                self._kept |= {n: ends[k] for k, n in enumerate(new.tolist())}
+
+    def _put_back(self, indices: Iterable[int]) -> None:
+        """Puts simulations that were stepped on after their end back to it."""
+        for index in sorted(self._kept.keys() & {*map(int, indices)}):
+            self.simulation.restore(self._kept[index], np.array([index]))
+            del self._kept[index]
+
+    def _all(self, step: Step) -> TensorDict:
+        """Entries of a control step."""
+        result = self._tensors(step)
+        result["reward"] = self._tensor(step.outcome.reward)[:, None]
+        result["terminated"] = self._tensor(step.terminated)[:, None]
+        result["truncated"] = self._tensor(step.truncated)[:, None]
+        result["done"] = result["terminated"] | result["truncated"]
         return result
 
     def _tensors(self, step: Step) -> TensorDict:
@@ -202,6 +241,7 @@ class BatchedEnv(EnvBase):
         return torch.as_tensor(values).to(self.device)
 
     def _set_seed(self, seed: int | None) -> None:
+        self._put_back(range(len(self._ended)))
         self.simulation.seed(0 if seed is None else seed)
 
     @property
