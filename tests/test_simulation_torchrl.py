@@ -124,6 +124,18 @@ def test_what_is_an_argument_is_no_option(option):
         BatchedEnv("simple1_bca", 2, task_kwargs={option: 3})
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("num_envs", 0), ("num_envs", 2.0), ("seed", "3"), ("seed", -1)]
+)
+def test_a_wrong_number_is_told_by_the_name_of_its_argument(name, value, batched):
+    given = {"num_envs": 2, name: value}
+    with pytest.raises(ValueError, match=f"^{name} is {value!r}; it must be an int"):
+        BatchedEnv("simple1_bca", **given)
+    if name == "seed":
+        with pytest.raises(ValueError, match=f"^seed is {value!r}; it must be an int"):
+            batched.set_seed(value)
+
+
 def test_batched_env(batched):
     check_env_specs(batched)
     assert batched.batch_size == (ENVS,)

@@ -226,6 +226,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         mode = bounds.choice("autoreset_mode", mode, modes)
         self.autoreset_mode = AutoresetMode(mode)
         self.metadata = {**CathSimEnv.metadata, "autoreset_mode": self.autoreset_mode}
+        bounds.whole("num_envs", num_envs, 1, bounds.MOST_SIMULATIONS)
         self.simulation = BatchSimulation(
             suite.make_task(task, **task_kwargs), num_envs, num_threads=num_threads
         )
@@ -349,7 +350,7 @@ def _require_open(closed: bool) -> None:
 
 def _seeds(seed: Any, count: int) -> Sequence[int | None]:
     """One seed, or None, for each of `count` simulations; ValueError for others."""
-    if not isinstance(seed, Sequence | np.ndarray):
+    if isinstance(seed, str) or not isinstance(seed, Sequence | np.ndarray):
         return bounds.seeds("seed", seed, count)
     known = bounds.seeds("seed", [0 if one is None else one for one in seed], count)
     return [

@@ -75,13 +75,15 @@ class BatchedEnv(EnvBase):
                 own = f"without {given}, for which there is the argument {argument}"
                 bounds.refuse("task_kwargs", options, own)
         options["observation"] = observation
+        bounds.whole("num_envs", num_envs, 1, bounds.MOST_SIMULATIONS)
+        seeds = bounds.seeds("seed", seed, num_envs)
         self._task_name, self._options = task_name, options
         self.simulation = _simulation(
             suite.make_task(task_name, **options),
             num_envs,
             bounds.text("device", device),
             num_threads=num_threads or 0,
-            seeds=seed,
+            seeds=seeds,
         )
         place = "cpu" if device.startswith("warp:") else device
         super().__init__(device=place, batch_size=[num_envs])
@@ -241,8 +243,9 @@ class BatchedEnv(EnvBase):
         return torch.as_tensor(values).to(self.device)
 
     def _set_seed(self, seed: int | None) -> None:
+        seeds = bounds.seeds("seed", 0 if seed is None else seed, len(self._ended))
         self._put_back(range(len(self._ended)))
-        self.simulation.seed(0 if seed is None else seed)
+        self.simulation.seed(seeds)
 
     @property
     def action_groups(self) -> tuple[int, ...]:
