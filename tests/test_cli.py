@@ -292,7 +292,9 @@ def test_a_report_says_how_an_episode_ended(kind, end):
         env=0, reward=1.0, length=50, forces=forces, path_ratio=1.5, **states
     )
     row = result_tables._outcome(7, {"arch": 3, "device": "wire"}, episode)
-    assert (row["seed"], row["arch"], row["device"]) == ("7", "3", "wire")
+    assert (row["seed"], row["anatomy"], row["device"]) == ("7", "arch 3", "wire")
+    drawn = {"anatomy": "type2"}  # of a pool of anatomies
+    assert result_tables._outcome(7, drawn, episode)["anatomy"] == "type2"
     assert (row["end"], row["time, s"], row["path ratio"]) == (end, "2.0", "1.50")
     assert (row["mean force, mN"], row["largest sum, N"]) == ("100", "0.75")
 

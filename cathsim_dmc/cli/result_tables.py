@@ -87,9 +87,10 @@ def _outcome(
     end = next(reached, "out of time")
     forces = episode.forces
     largest = forces.largest_sum
+    arch = f"arch {conditions['arch']}" if "arch" in conditions else "–"
     return {
         "seed": str(seed),
-        "arch": str(conditions.get("arch", "–")),
+        "anatomy": conditions.get("anatomy", arch),
         "device": str(conditions.get("device") or "–"),
         "end": "physics error" if episode.physics_error else end,
         "time, s": f"{episode.length * CONTROL_TIMESTEP:.1f}",
