@@ -8,6 +8,7 @@ import synthetic_env
 import torch
 from dm_control.composer.variation import distributions
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 
 from cathsim_dmc import __version__, suite
 from cathsim_dmc.agents import (
@@ -567,6 +568,39 @@ def test_the_table_says_which_force_is_which(capsys, monkeypatch):
     for wrong in ("forces.sum.maen", "forces", "forces.sum", "lenght", 3, "policy"):
         with pytest.raises(ValueError, match=r"the figure is .*length.*peak_sum.*mean"):
             result.values(wrong)
+
+
+def test_a_policy_that_does_not_fit_is_told_what_it_was_given():
+    class Mute(Policy):
+        name = "mute"
+
+        def act(self, observation):
+            return None
+
+    def fails(policy, kind, words):
+        with pytest.raises(kind, match=words) as caught:
+            evaluate(
+                policy,
+                "simple1_bca",
+                2,
+                observation="tracking",
+                num_threads=1,
+                task_kwargs={"max_steps": 2},
+            )
+        return " ".join(getattr(caught.value, "__notes__", ()))
+
+    for network in (torch.nn.Linear(49, 21), lambda many: many["tracking_goal"]):
+        told = fails(network, (TypeError, KeyError), ".")
+        assert "{'observation_vector': (2, 49)" in told and "lambda seen" in told
+    module = TensorDictModule(torch.nn.Linear(49, 21), ["observation_vector"], ["act"])
+    fails(module, TypeError, "answered with a TensorDict; .* as 'action': .*act")
+
+    def infinite(many):
+        return torch.full((2, 21), float("inf"))
+
+    fails(infinite, ValueError, r"infinite returned .* in the rows \[0, 1\]")
+    fails(Mute(), ValueError, "mute returned None, no array")
+    fails(Mute, TypeError, "policy is the class Mute; give an instance")
 
 
 def test_a_function_of_one_observation_is_told_what_to_do():

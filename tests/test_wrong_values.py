@@ -154,6 +154,10 @@ def test_own_policies_are_policies_that_act(monkeypatch):
         ValueError, match=r"POLICIES\['function'\]\(seed\) is .*a Policy"
     ):
         make_policy("function")
+    for wrong in (object(), lambda: None):
+        monkeypatch.setitem(POLICIES, "wrong", wrong)
+        with pytest.raises(ValueError, match=r"POLICIES\['wrong'\] is .* of a seed"):
+            make_policy("wrong")
     monkeypatch.setitem(POLICIES, "idler", lambda seed: type("Idler", (Policy,), {})())
     with pytest.raises(NotImplementedError, match=r"Idler lacks act\(observation\)"):
         make_policy("idler").act(None)

@@ -352,8 +352,10 @@ def _first_episodes(
 
 
 def _checked(policy: Policy, given: Any, env: EnvBase) -> torch.Tensor:
-    """Returns actions of a policy as (N, A) float32; ValueError for another shape."""
-    actions = torch.as_tensor(given).to(torch.float32)
+    """Returns actions of a policy as (N, A) float32; ValueError for others."""
+    text = f"the policy {policy.name} returned {bounds.shown(given)}, no array"
+    with files.refused(ValueError, text, (TypeError, ValueError, RuntimeError)):
+        actions = torch.as_tensor(given).to(torch.float32)
     if actions.shape != env.action_spec.shape:
         count, entries = env.action_spec.shape
         raise ValueError(
@@ -361,5 +363,12 @@ def _checked(policy: Policy, given: Any, env: EnvBase) -> torch.Tensor:
             f"must be ({count}, {entries}), a row for each of the {count} episodes, "
             "which are played in parallel. A function f of one observation is called "
             "for each: lambda many: torch.stack([f(one) for one in many])"
+        )
+    odd = ~actions.isfinite().all(-1)
+    if odd.any():
+        rows = bounds.shown(odd.nonzero().ravel().tolist())
+        raise ValueError(
+            f"the policy {policy.name} returned numbers that are not finite, in the "
+            f"rows {rows}"
         )
     return actions

@@ -66,19 +66,23 @@ class FunctionPolicy(Policy):
             observation = self._recalled(observation)
         middle = set_exploration_type(ExplorationType.DETERMINISTIC)
         with middle, _evaluating(self._function):
-            answer: Any = self._function(observation)
+            try:
+                answer: Any = self._function(observation)
+            except Exception as error:
+                error.add_note(_called(self.name, observation))
+                raise
         if "is_init" in self._keys and isinstance(answer, TensorDictBase):
             written = answer.get("next", TensorDict())
             kept = {key: written.get(key, None) for key in self._keys}
             self._memory = {k: one for k, one in kept.items() if one is not None}
             self._begun = torch.zeros(answer.batch_size, dtype=torch.bool)
-        action = answer["action"] if isinstance(answer, TensorDictBase) else answer
         with files.refused(
             TypeError,
             f"policy {self.name} answered with a {type(answer).__name__}; it must be "
             "actions (N, A) or a TensorDict with them as 'action'",
-            (TypeError, ValueError, RuntimeError),
+            (TypeError, ValueError, RuntimeError, KeyError),
         ):
+            action = answer["action"] if isinstance(answer, TensorDictBase) else answer
             return torch.as_tensor(action, dtype=torch.float32).numpy()
 
     def _recalled(self, observation: TensorDictBase) -> TensorDictBase:
@@ -87,6 +91,18 @@ class FunctionPolicy(Policy):
         if begun is None:
             begun = torch.ones(observation.batch_size, dtype=torch.bool)
         return observation.copy().update({**self._memory, "is_init": begun[:, None]})
+
+
+def _called(name: str, observation: TensorDictBase) -> str:
+    """Says what a function that has failed was called with."""
+    inputs = (environments.VECTOR, environments.PIXELS)
+    shapes = {
+        key: tuple(observation[key].shape) for key in inputs if key in observation
+    }
+    return (
+        f"the policy {name} was called with a TensorDict, with {shapes}; a network of "
+        f"a tensor is given as lambda seen: network(seen[{environments.VECTOR!r}])"
+    )
 
 
 @contextlib.contextmanager
@@ -218,6 +234,8 @@ def load_policy(policy: PolicyLike, seed: int = 0, scripted: bool = True) -> Pol
         return policy
     if isinstance(policy, Checkpoint):
         return TrainedPolicy(policy)
+    if isinstance(policy, type):
+        raise TypeError(f"policy is the class {policy.__name__}; give an instance")
     if callable(policy):
         return FunctionPolicy(policy)
     if not isinstance(policy, str | Path):

@@ -1,5 +1,6 @@
 """Scripted policies and the base class of all policies; numpy without torch."""
 
+import inspect
 from collections.abc import Callable
 
 from cathsim_dmc import bounds
@@ -30,7 +31,12 @@ def make_policy(name: str, seed: int = 0) -> Policy:
             `POLICIES` makes no policy.
     """
     make = POLICIES[bounds.choice("policy", name, POLICIES)]
-    made = make(bounds.seed("seed", seed))
+    seed = bounds.seed("seed", seed)
+    try:
+        inspect.signature(make).bind(seed)
+    except TypeError:
+        bounds.refuse(f"POLICIES[{name!r}]", make, "a class or function of a seed")
+    made = make(seed)
     return bounds.instance(f"POLICIES[{name!r}](seed)", made, Policy)
 
 
