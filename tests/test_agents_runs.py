@@ -104,6 +104,18 @@ def test_a_full_disk_names_the_file(tmp_path, trained, small_disk, name, full):
     assert run(small_ppo(), tmp_path / "run", resume=True).frames == 1_024
 
 
+def test_what_is_no_function_is_refused_before_the_work(tmp_path):
+    with pytest.raises(ConfigError, match="on_checkpoint is 'x'; it must be a functi"):
+        run(small_ppo(), tmp_path / "run", on_checkpoint="x")
+    assert not (tmp_path / "run").exists()
+    made = synthetic_env.make_env("any", num_envs=1)
+    for wrong in (made, None):
+        with pytest.raises(ValueError, match="make_env is .*; it must be a function"):
+            evaluate("push", "simple1_bca", 1, make_env=wrong)
+    with pytest.raises(ValueError, match="of make_env is None; it must be an EnvBase"):
+        evaluate("push", "simple1_bca", 1, make_env=lambda *_, **options: None)
+
+
 @pytest.mark.parametrize("content", [b"", b"\xff", b"seconds\n1\n", b"frames\nmany\n"])
 def test_metrics_that_cannot_be_read_stop_a_run(tmp_path, trained, content):
     shutil.copytree(trained / "ppo", tmp_path / "run")

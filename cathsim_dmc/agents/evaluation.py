@@ -111,6 +111,8 @@ def evaluate(
                 "simulation_device (--simulation-device), or on_cluster (--ray)"
             )
         cluster.connect()
+    if isinstance(make_env, EnvBase) or not callable(make_env):
+        bounds.refuse("make_env", make_env, "a function, as agents.make_env is")
     make = functools.partial(make_env, **place)
     if out_dir is not None:
         # Checked first: an evaluation that cannot be written would be lost.
@@ -261,6 +263,7 @@ def _play(group: _Group, observer: Observer | None) -> list[EpisodeOutcome]:
         num_envs=len(seeds), num_threads=group.num_threads,
         seed=seeds if group.varied else seeds[0], task_kwargs=group.part.task_kwargs,
     )  # fmt: skip
+    bounds.instance("the environment of make_env", env, EnvBase)
     if group.errors is not None:
         environments.record_errors(env, group.errors)
     first = group.rows.start

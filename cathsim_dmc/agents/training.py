@@ -111,6 +111,8 @@ def train(
             "resume=True (--resume) too, or leave it out"
         )
     run = Path(out_dir)
+    call = on_checkpoint or (lambda checkpoint: None)
+    require(callable(call), "on_checkpoint", call, "a function of a directory, or None")
     check_usable(config)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_only_process(run))
@@ -135,7 +137,6 @@ def train(
         log = TrainingLog(run, learner, state, progress)
         stack.callback(log.close)
         interruption = stack.enter_context(noted_interruption(progress))
-        call = on_checkpoint or (lambda checkpoint: None)
         return _loop(run, iter(collector), learner, log, interruption, call)
 
 
