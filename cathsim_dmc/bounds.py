@@ -211,6 +211,12 @@ def text(name: str, value: Any) -> str:
     return value
 
 
+def several(name: str, value: Any, allowed: str) -> list[Any]:
+    """Returns the elements of an iterable that is neither a text nor empty."""
+    listed = isinstance(value, Iterable) and not isinstance(value, str | bytes)
+    return (list(value) if listed else []) or refuse(name, value, allowed)
+
+
 def choice(name: str, value: Any, choices: Sequence[str] | Mapping[str, Any]) -> str:
     """Returns one of the names in `choices`."""
     if not isinstance(value, str) or value not in choices:

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc import bounds
+
 _PARTIAL = ".partial"
 # Largest unpacked size of a file: bytes, or multiple of its size, whichever is larger.
 # Positions and forces compress to a third or less, zeros to a thousandth.
@@ -21,6 +23,13 @@ _UNPACKED, _RATIO = 2**28, 100
 _BLOCK = 2**20  # bytes
 _HEADER_1 = np.lib.format.read_array_header_1_0
 _HEADER_2 = np.lib.format.read_array_header_2_0
+
+
+def as_path(name: str, value: Any) -> Path:
+    """Return the path of a file or folder; ValueError for other values than paths."""
+    if not isinstance(value, str | os.PathLike):
+        bounds.refuse(name, value, "a path, a str or a pathlib.Path")
+    return Path(value)
 
 
 @contextlib.contextmanager
@@ -41,7 +50,7 @@ def atomic_path(
         OSError: see `require_file`.
         RuntimeError: if the block ends without having written anything.
     """
-    path = Path(path)
+    path = as_path("path", path)
     if suffix is not None and path.suffix != suffix:
         raise ValueError(f"the file name must end in {suffix}, got {path.name!r}")
     _check_folder(path.parent)
@@ -67,7 +76,7 @@ def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         OSError: if `path` exists with something in it, or cannot be written.
     """
-    path = Path(path)
+    path = as_path("path", path)
     require_folder(path.parent)
     temporary = _temporary(path)
     temporary.mkdir()
@@ -98,7 +107,7 @@ def require_folder(folder: str | os.PathLike[str], make: bool = False) -> Path:
         NotADirectoryError: the folder or one of its parents is a file.
         PermissionError: it is read-only, or takes no new file for another reason.
     """
-    folder = Path(folder)
+    folder = as_path("folder", folder)
     if make:
         require_place(folder)
         with contextlib.suppress(FileExistsError):  # a file, see below
@@ -151,7 +160,7 @@ def require_place(folder: str | os.PathLike[str]) -> Path:
     Raises:
         OSError: as `require_folder`, for the folder or its nearest existing parent.
     """
-    place = Path(folder)
+    place = as_path("folder", folder)
     _refuse_home(place)
     while not (place.exists() or place.is_symlink()) and place != place.parent:
         place = place.parent
@@ -172,7 +181,7 @@ def require_file(
         OSError: as `require_folder`; IsADirectoryError if `path` is a directory.
         ValueError: `path` is a device or a pipe, which a new file would replace.
     """
-    path = Path(path)
+    path = as_path("path", path)
     require_place(path.parent) if later else require_folder(path.parent, make)
     _check_target(path)
     return path
@@ -187,7 +196,7 @@ def _check_target(path: Path) -> None:
 
 def _refuse_special(path: str | os.PathLike[str]) -> None:
     """Raise ValueError for a device, whose data may never end, or a pipe."""
-    path = Path(path)
+    path = as_path("path", path)
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ValueError(f"{path} is a device or a pipe; give the name of a file")
 
@@ -203,7 +212,7 @@ def require_source(path: str | os.PathLike[str], what: str) -> Path:
             directory.
         ValueError: it is a device or a pipe.
     """
-    path = Path(path)
+    path = as_path("path", path)
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a directory; give {what}")
     if not path.exists():

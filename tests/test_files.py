@@ -4,14 +4,23 @@ import codecs
 import errno
 import io
 import os
+import re
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cathsim_dmc import files
+from cathsim_dmc import agents, files, suite
+from cathsim_dmc.agents.comparison import Comparison
+from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.scan.importer import import_scan
+from cathsim_dmc.anatomy.tree_file import read_tree
 from cathsim_dmc.bridge import Log
+from cathsim_dmc.recording import dataset, image_set
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.simulation import mjcf
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 
 def names(folder):
@@ -37,6 +46,45 @@ def test_wrong_paths_are_refused_before_the_work(tmp_path):
     with pytest.raises(FileNotFoundError, match="no directory"):
         with files.atomic_path(tmp_path / "missing" / "a.txt"):
             raise AssertionError
+
+
+@pytest.mark.parametrize("given", [None, 3, ["a.npz"], b"a.npz"])
+@pytest.mark.parametrize(
+    ("name", "use"),
+    [
+        ("path", files.write_text),
+        ("directory", lambda path, _: Anatomy.load(path)),
+        ("mesh_path", lambda path, _: import_scan(path)),
+        ("path", lambda path, _: read_tree(path)),
+        ("path", lambda path, _: Episode.load(path)),
+        ("path", lambda path, _: Snapshot.load(path)),
+        ("path", lambda path, _: agents.EvaluationResult.load(path)),
+        ("a path", lambda path, _: Comparison.of([path])),
+        ("out", lambda path, _: image_set.write(path)),
+        ("out", lambda path, _: agents.record_demonstrations("type1_bca", path)),
+        ("path", lambda path, _: dataset.export([], path)),
+        ("directory", lambda path, _: mjcf.write_mjcf("type1_bca", path)),
+    ],
+)
+def test_what_is_no_path_is_refused_by_name(name, use, given):
+    words = f"{name} is {given!r}; it must be a path, a str or a pathlib.Path"
+    with pytest.raises(ValueError, match=re.escape(words)):
+        use(given, "text")
+
+
+@pytest.mark.parametrize("given", ["study", [], None])
+def test_one_text_is_no_list_of_paths(given):
+    words = f"paths is {given!r}; it must be a list of at least one file or folder"
+    with pytest.raises(ValueError, match=re.escape(words)):
+        Comparison.of(given)
+    with pytest.raises(ValueError, match="episodes is .* a list of .* Episode"):
+        dataset.export(given, "out")
+
+
+def test_an_anatomy_is_named_by_its_directory(tmp_path):
+    file = files.write_text(tmp_path / "anatomy.npz", "text")
+    with pytest.raises(ValueError, match="npz', which is a file; give a directory"):
+        suite.load_anatomy(file)
 
 
 def test_a_home_that_no_shell_has_expanded_is_refused(tmp_path, monkeypatch):

@@ -106,7 +106,7 @@ def test_what_cannot_be_repeated_is_refused(episodes, tmp_path):
     other = dataclasses.replace(second, task="type1_lcca")
     moved = dataclasses.replace(first, reward=first.reward + 1e-3)
     for given, options, message in (
-        ([], {}, "0 episodes"),
+        ([], {}, "at least one Episode"),
         ([first, other], {}, "of its own"),
         ([dataclasses.replace(first, seed=None)], {}, "seed None"),
         ([moved], {}, "does not repeat"),

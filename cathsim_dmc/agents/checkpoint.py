@@ -63,7 +63,7 @@ class Checkpoint:
     @classmethod
     def open(cls, path: str | Path) -> "Checkpoint":
         """Open a checkpoint, or the newest of a run; CheckpointError if damaged."""
-        path = Path(path)
+        path = files.as_path("path", path)
         if not (path / _DESCRIPTION).exists():
             found = checkpoints_in(path)
             if not found:

@@ -65,7 +65,7 @@ class Comparison:
     _repr_markdown_ = __repr__  # of a notebook
 
     @classmethod
-    def of(cls, paths: Sequence[str | Path], baseline: bool = True) -> "Comparison":
+    def of(cls, paths: Iterable[str | Path], baseline: bool = True) -> "Comparison":
         """Reads files of evaluations, and those in folders.
 
         Args:
@@ -74,7 +74,7 @@ class Comparison:
                 one row.
 
         Raises:
-            ValueError: a file holds no evaluation.
+            ValueError: a file holds no evaluation, or there is no list of paths.
             OSError: there is no such file, or none in a folder.
         """
         rows: list[Row] = []

@@ -92,7 +92,7 @@ def record_demonstrations(
         FileNotFoundError: the directory around `out` does not exist.
         ModuleNotFoundError: minari is not installed.
     """
-    out = Path(out)
+    out = files.as_path("out", out)
     bounds.whole("episodes", episodes, 1)
     bounds.seeds("seed", seed, episodes)
     bounds.number("noise", noise, 0.0, 1.0)

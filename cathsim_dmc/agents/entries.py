@@ -62,7 +62,7 @@ def read(path: str | Path) -> Entry:
     Raises:
         ValueError: the file cannot be listed; says why.
     """
-    path = Path(path)
+    path = files.as_path("path", path)
     with files.refused(ValueError, f"{path.name} is not listed", _WRONG):
         if path.stat().st_size > MOST_BYTES:
             raise ValueError(f"it is larger than {MOST_BYTES / 1e6:.0f} MB")

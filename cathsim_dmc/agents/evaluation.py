@@ -116,7 +116,7 @@ def evaluate(
     make = functools.partial(make_env, **place)
     if out_dir is not None:
         # Checked first: an evaluation that cannot be written would be lost.
-        files.require_place(out_dir)
+        files.require_place(files.as_path("out_dir", out_dir))
         error_dir = error_dir or Path(out_dir) / "errors"
     groups = plan.groups(num_threads, error_dir, make, start)
     if on_cluster:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ def read(path: str | Path) -> dict[str, dict[str, Any]]:
         ValueError: the file holds no evaluation; says what is wrong.
         OSError: there is no such file.
     """
-    path = Path(path)
+    path = files.as_path("path", path)
     if path.is_dir():
         path = path / FILE
     files.require_source(path, _WANTED)
@@ -128,17 +128,19 @@ def _statistics(
     return Statistics(**found)
 
 
-def found_in(paths: Sequence[str | Path]) -> list[Path]:
+def found_in(paths: Iterable[str | Path]) -> list[Path]:
     """Returns the files of evaluations among files and folders, without repetitions.
 
     Args:
         paths: Files in any order, and folders, which are searched with their folders.
 
     Raises:
+        ValueError: there is no list of paths.
         FileNotFoundError: a folder holds no evaluation.
     """
     found: dict[Path, None] = {}
-    for path in map(Path, paths):
+    for one in bounds.several("paths", paths, "a list of at least one file or folder"):
+        path = files.as_path("a path", one)
         inside = sorted(path.rglob(FILE)) if path.is_dir() else [path]
         if not inside:
             raise FileNotFoundError(f"no {FILE} in the folder {path}; give {_WANTED}")

@@ -96,7 +96,7 @@ def write_onnx(
         FileExistsError: the directory exists.
         ModuleNotFoundError: the extra `onnx` is not installed.
     """
-    directory = Path(directory)
+    directory = files.as_path("directory", directory)
     extras.require("onnx", "onnx", "onnxscript", "onnxruntime")
     if directory.exists():
         raise FileExistsError(f"{directory} exists; give a directory that does not")

@@ -51,7 +51,7 @@ def submit(
             damaged, of another task or of other episodes.
         CheckpointError: there is no such policy, or it is damaged.
     """
-    out = Path(out)
+    out = files.as_path("out", out)
     if out.suffix != ".json":
         raise ValueError(f"the submission is to be written to {out}; give a .json file")
     if task is not None:

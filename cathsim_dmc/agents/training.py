@@ -110,7 +110,7 @@ def train(
             "without_replay=True (--without-replay) is for a run that is resumed; give "
             "resume=True (--resume) too, or leave it out"
         )
-    run = Path(out_dir)
+    run = files.as_path("out_dir", out_dir)
     call = on_checkpoint or (lambda checkpoint: None)
     require(callable(call), "on_checkpoint", call, "a function of a directory, or None")
     check_usable(config)

@@ -244,7 +244,7 @@ class Anatomy:
             ValueError: if the file is damaged, of another format, or has an invalid
                 entry; names the file and the entry.
         """
-        path = Path(directory) / _FILE
+        path = files.as_path("directory", directory) / _FILE
         if not path.is_file():
             raise FileNotFoundError(
                 f"no {_FILE} in {path.parent}; give a directory written by `cathsim "

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.parts import Surface
-from cathsim_dmc.files import atomic_path, require_file
+from cathsim_dmc.files import as_path, atomic_path, require_file
 from cathsim_dmc.pictures import figure as drawing
 from cathsim_dmc.pictures.anatomies import Picture
 from cathsim_dmc.pictures.films import MP4, check_film, write_mp4
@@ -70,7 +70,7 @@ def animate(
     bounds.whole("width", width, _NARROWEST, bounds.MOST_PIXELS)
     bounds.whole("quality", quality, 0, 100)
     bounds.instance("surface", surface, Surface)
-    path = Path(path)
+    path = as_path("path", path)
     check_film(path)
     require_file(path)
     seconds = np.clip(episode.time[-1] - episode.time[0], _SHORTEST, _LONGEST)

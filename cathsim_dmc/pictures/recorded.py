@@ -74,7 +74,7 @@ def record(
 
 def _checked(path: str | os.PathLike[str]) -> Path:
     """Returns the path; raises if no file of its kind can be written there."""
-    target = Path(path)
+    target = files.as_path("path", path)
     if target.suffix not in FORMATS:
         raise ValueError(
             f"the recording is to be written to {target}; give a file that ends in "

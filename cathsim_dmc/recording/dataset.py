@@ -13,6 +13,7 @@ import numpy as np
 
 from cathsim_dmc import bounds, extras, suite
 from cathsim_dmc.files import (
+    as_path,
     atomic_directory,
     fill,
     refused,
@@ -60,7 +61,7 @@ def write(
         OSError: the directory around it is missing or read-only, or the disk is full.
         ModuleNotFoundError: minari is not installed.
     """
-    path = Path(path)
+    path = as_path("path", path)
     check_free(path)
     extras.require("gym", "minari")
     import minari
@@ -232,13 +233,15 @@ def export(
         FileExistsError: the directory exists.
         ModuleNotFoundError: gymnasium or minari is not installed.
     """
-    check_free(Path(path))
+    check_free(as_path("path", path))
     extras.require("gym", "gymnasium", "minari", "h5py")
     from minari.data_collector import EpisodeBuffer
 
     from cathsim_dmc.simulation import gymnasium
 
-    episodes = [bounds.instance("an episode", each, Episode) for each in episodes]
+    episodes = bounds.several("episodes", episodes, "a list of at least one Episode")
+    for each in episodes:
+        bounds.instance("an episode", each, Episode)
     task, options = _common(episodes)
     further = bounds.options("task_kwargs", task_kwargs)
     rewarded = further.get("reward", options.get("reward")) == options.get("reward")

@@ -89,7 +89,7 @@ def write(
     """
     extras.require("gym", "h5py")  # before hours of simulation
 
-    out, options = Path(out), options or ImageSetOptions()
+    out, options = files.as_path("out", out), options or ImageSetOptions()
     count = os.cpu_count() or 1
     if processes is not None:
         count = bounds.whole("processes", processes, 1, bounds.MOST_THREADS)

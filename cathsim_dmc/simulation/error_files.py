@@ -125,7 +125,7 @@ class ErrorFiles:
         options: Mapping[str, Any] | None = None,
     ):
         """Takes the task's name and options, from which a replay makes it."""
-        self.folder, self._task = Path(folder), task
+        self.folder, self._task = files.as_path("folder", folder), task
         self._options = json_options.as_texts(options or {})
         self._whole = not json_options.split(options or {})[1]
 

@@ -19,7 +19,7 @@ from lxml import etree
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.anatomy.export import check_wall, wall_pieces
 from cathsim_dmc.entities.sheath import CLEARANCE, Sheath
-from cathsim_dmc.files import atomic_directory, require_place
+from cathsim_dmc.files import as_path, atomic_directory, require_place
 from cathsim_dmc.physics.forces import CONTACT_SIZE
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation
@@ -64,7 +64,7 @@ def write_mjcf(
         FileExistsError: the directory exists.
         ModuleNotFoundError: CoACD is selected and not installed.
     """
-    directory = Path(directory)
+    directory = as_path("directory", directory)
     if directory.exists():
         raise FileExistsError(f"{directory} exists; give a directory that does not")
     require_place(directory.parent)

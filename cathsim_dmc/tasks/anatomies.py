@@ -41,10 +41,12 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str | None = None) -> An
         )
     if isinstance(anatomy, Anatomy):
         return anatomy
-    if not Path(anatomy).is_dir():
+    path = Path(anatomy)
+    if not path.is_dir():
+        kind = ", which is a file" if path.exists() else ""
         raise ValueError(
-            f"no anatomy at {str(anatomy)!r}; give a directory written by `cathsim "
-            "phantom import`, `build` or `generate`, or one of "
+            f"no anatomy at {str(anatomy)!r}{kind}; give a directory written by "
+            "`cathsim phantom import`, `build` or `generate`, or one of "
             f"{', '.join(phantoms.PHANTOMS)}"
         )
     return Anatomy.load(anatomy)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cathsim_dmc import bounds
+from cathsim_dmc import bounds, files
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.parts import FileFrame, Inlet, Surface
@@ -52,8 +52,8 @@ def import_scan(
     """Turn the surface of a lumen into an anatomy.
 
     Args:
-        mesh_path: lumen surface (OBJ, STL, PLY or VTP); vessel ends open or capped.
-            Or a label map (NIfTI, NRRD), whose unit and frame are its own.
+        mesh_path: lumen surface (OBJ, STL, PLY, VTP or VTK); vessel ends open or
+            capped. Or a label map (NIfTI, NRRD, MHA), whose unit and frame are its own.
         centreline_paths: 3D Slicer markups or tables x,y,z[,radius], one per branch;
             the branch is called after the file (centreline-LCCA.mrk.json: "lcca").
             Without any they are computed, and named if the arch identifies them.
@@ -88,6 +88,7 @@ def import_scan(
             not agree with the surface; says how to mend it.
     """
     started = time.monotonic()
+    mesh_path = files.as_path("mesh_path", mesh_path)
     told = _Told([] if notes is None else notes, progress or (lambda text: None))
     given, changes = _checked(inlet, heart, rename, device)
     name = bounds.text("name", name or stem(mesh_path))
