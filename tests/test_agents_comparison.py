@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from cathsim_dmc import suite
 from cathsim_dmc.agents import EvaluationResult, comparison, evaluate, protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, Statistics
@@ -138,6 +139,23 @@ def test_rows_under_other_rules_are_marked(tmp_path):
     assert "seeds: 11 to 14" in text and "goal_radius: 0.004" in text
     alike = comparison.Comparison.of(files[:2])
     assert "ules" not in "".join(alike.markdown())
+
+
+def test_an_anatomy_is_told_by_its_lumen_not_by_its_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folders = ["scan", "scan", tmp_path / "scan"]
+    for number, (shape, folder) in enumerate(
+        zip(("simple1", "simple2", "simple2"), folders, strict=True)
+    ):
+        scan = suite.load_anatomy(shape)
+        dataclasses.replace(scan, name="scan").save(tmp_path / "scan")
+        options = {"anatomy": folder, "goal": "bca", "max_steps": 2}
+        evaluate("push", "navigate", 1, task_kwargs=options, out_dir=f"study/{number}")
+    found = comparison.Comparison.of(["study"])
+    assert [row.rules for row in found.rows] == [1, 2, 2]
+    one, other = (each["anatomy"] for each in found.differences())
+    assert one != other and one.startswith("scan ")
+    assert "anatomy: scan " in repr(found)
 
 
 def test_the_notes_tell_rules_apart_that_differ_late_in_a_long_value(tmp_path):

@@ -167,6 +167,9 @@ def rules_of(result: EvaluationResult) -> dict[str, Any]:
     }
     given = settings.get("task_kwargs", {})
     options = {**_defaults(result.task), **json_options.as_texts(given)}
+    if settings.get("lumens"):  # the same path may hold another anatomy
+        one, *more = settings["lumens"]
+        options["anatomy"] = [one, *more] if more else one
     return rules | {n: options[n] for n in sorted(options) if n not in _NO_RULES}
 
 

@@ -29,6 +29,7 @@ from cathsim_dmc.agents.results import EvaluationResult, versions
 from cathsim_dmc.agents.training_log import progress_bar
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
+from cathsim_dmc.tasks.anatomies import lumens
 from cathsim_dmc.tasks.config import EVALUATION_SEED
 from cathsim_dmc.tasks.snapshot import Snapshot
 
@@ -141,6 +142,7 @@ class _Plan:
         observation: Name or names of the observations.
         protocol: Name of the conditions.
         parts: Parts of the episodes, each with options of its own.
+        lumens: Those of the option `anatomy`, whose files may change.
     """
 
     player: Policy
@@ -149,6 +151,7 @@ class _Plan:
     observation: str | Sequence[str]
     protocol: str
     parts: Sequence[protocols.Part]
+    lumens: Sequence[str]
 
     @classmethod
     def of(
@@ -176,7 +179,9 @@ class _Plan:
         require_actions(player, task, options)
         observed = observation or player.observation or "internal"
         parts = protocols.parts(conditions, task, options, episodes, seed)
-        return cls(player, task, options, observed, protocol, parts)
+        anatomy = options.get("anatomy")
+        found = [] if anatomy is None else lumens(anatomy)
+        return cls(player, task, options, observed, protocol, parts, found)
 
     def groups(
         self,
@@ -216,6 +221,7 @@ class _Plan:
                 "task_kwargs": self.options,
                 "frames": trained and trained.frames,
                 **({"started": True} if started else {}),
+                **({"lumens": self.lumens} if self.lumens else {}),
             },
             distinct=started or protocols.distinct(self.task, first, count),
             conditions=tuple(drawn),

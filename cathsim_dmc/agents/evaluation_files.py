@@ -64,6 +64,7 @@ def _attributes(values: Mapping[str, Any]) -> dict[str, Any]:
         raise ValueError(f"{len(drawn)} of {len(rows)} episodes have conditions")
     settings = bounds.instance("settings", values["settings"], dict)
     bounds.instance("task_kwargs", settings.get("task_kwargs", {}), dict)
+    bounds.instance("lumens", settings.get("lumens", []), list)
     return {
         "task": bounds.text("task", values["task"]),
         "policy": bounds.text("policy", values["policy"]),

@@ -62,6 +62,12 @@ def anatomy_name(anatomy: str | Path | Anatomy) -> str:
     return anatomy.name if isinstance(anatomy, Anatomy) else Path(anatomy).name
 
 
+def lumens(anatomy: Any) -> list[str]:
+    """Returns name and digest of each lumen that an option `anatomy` names."""
+    given = anatomy if is_pool(anatomy) else [anatomy]
+    return [f"{one.name} {one.digest}" for one in map(load_anatomy, given)]
+
+
 def load_pool(
     anatomy: Any, access: Any, goal: Any
 ) -> tuple[list[Anatomy], list[str | Sequence[float]]]:
