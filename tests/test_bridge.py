@@ -529,6 +529,48 @@ def test_an_episode_after_one_that_the_driver_has_stopped_is_its_own():
     link.close()
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("stop", None, "no class, with the methods start, command, read, stop"),
+        ("name", None, "name of the device is None; it must be a text"),
+        ("period", None, "period of the device is None; it must be a finite number"),
+        ("period", -0.04, "period of the device is -0.04"),
+        ("action", {"name": "a"}, "action of the device is .* dictionaries with name"),
+        ("action", ["insertion"], "action of the device is .* dictionaries with name"),
+        ("observation", [{"key": "a"}], "dictionaries with key, shape, dtype"),
+    ],
+)
+def test_a_device_that_lacks_something_is_refused_before_it_moves(name, value, said):
+    robot = Robot()
+    setattr(robot, name, value)
+    with pytest.raises(ValueError, match=said):
+        bridge.serve(robot, None)
+
+
+def test_a_class_serves_as_no_device():
+    with pytest.raises(ValueError, match="an object, no class"):
+        bridge.serve(Robot, None)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_state_of_another_kind_is_named():
+    robot = Robot()
+    robot.start = lambda seed: None
+    served = Served(robot)
+    with pytest.raises(bridge.BridgeError, match="a state of the device is None; it"):
+        bridge.drive(push, served.address)
+    served.joined()
+
+
+@pytest.mark.parametrize("address", [5555, None])
+def test_what_is_no_address_or_policy_is_refused(address):
+    with pytest.raises(ValueError, match="address is .* host:port"):
+        bridge.drive(push, address)
+    with pytest.raises(ValueError, match="choose is None; it must be a function"):
+        bridge.drive(None, "127.0.0.1:5555")
+
+
 def test_a_watchdog_that_a_period_outlasts_is_refused():
     robot, said = Robot(), "watchdog is 0.02; it must be longer than a period.*0.02 s"
     with pytest.raises(ValueError, match=said):

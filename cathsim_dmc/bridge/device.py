@@ -78,6 +78,27 @@ class Device(Protocol):
         ...
 
 
+_METHODS = "start", "command", "read", "stop"
+_TABLES = {"action": ("name", "unit"), "observation": ("key", "shape", "dtype")}
+
+
+def require_device(device: Any) -> None:
+    """Raise ValueError unless an object has all attributes and methods of `Device`."""
+    own = {name: getattr(device, name, None) for name in (*_METHODS, *_TABLES)}
+    lacking = [name for name in _METHODS if not callable(own[name])]
+    if isinstance(device, type) or lacking:
+        allowed = f"an object, no class, with the methods {', '.join(_METHODS)}"
+        bounds.refuse("device", device, allowed)
+    bounds.text("name of the device", getattr(device, "name", None))
+    period = getattr(device, "period", None)
+    bounds.number("period of the device", period, unit="s", positive=True)
+    for name, keys in _TABLES.items():
+        rows = own[name] if isinstance(own[name], Sequence) else [None]
+        if not all(isinstance(one, Mapping) and {*keys} <= {*one} for one in rows):
+            allowed = f"a list of dictionaries with {', '.join(keys)}"
+            bounds.refuse(f"{name} of the device", own[name], allowed)
+
+
 class SimulatedDevice:
     """A task of the suite as a device."""
 

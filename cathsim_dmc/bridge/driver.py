@@ -83,7 +83,7 @@ class Driven:
 
 def connect(address: str) -> Connection:
     """Connect to "host:port"; ValueError for another text, OSError if none answers."""
-    host, colon, port = address.rpartition(":")
+    host, colon, port = str(address).rpartition(":")
     if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65536:
         bounds.refuse("address", address, "host:port, such as 127.0.0.1:5555")
     try:
@@ -324,11 +324,13 @@ def drive(
         Outcome of the episode.
 
     Raises:
-        ValueError: if the address is invalid, or the watchdog is not longer than a
-            period of the device.
+        ValueError: if `choose` is no function, the address is invalid, or the watchdog
+            is not longer than a period of the device.
         OSError: if no device answers there.
         BridgeError: see `Driver.episode`.
     """
+    if not callable(choose):
+        bounds.refuse("choose", choose, "a function from observation to action")
     options, link = options or DriveOptions(), connect(address)
     try:
         driver = Driver(link, log)

@@ -25,6 +25,7 @@ class Log:
         self._began = time.monotonic()
         self._file = None
         if path is not None:
+            self.require(path)
             self._file = open(files.require_file(path, make=True), "x")
 
     @staticmethod

@@ -18,6 +18,7 @@ from cathsim_dmc.bridge.device import (
     MOST_FRAMES,
     Device,
     State,
+    require_device,
     require_watchdog,
 )
 from cathsim_dmc.bridge.messages import BridgeError, Connection
@@ -80,8 +81,10 @@ def serve(
         state to its action) and "tick" (delay of the start of a period), ms.
 
     Raises:
-        ValueError: if the watchdog is not longer than a period of the device.
+        ValueError: if an attribute or method of the device is missing, it returns no
+            `State`, or the watchdog is not longer than a period of the device.
     """
+    require_device(device)
     done: list[dict[str, Any]] = []
     log, options = log or Log(None), options or ServeOptions()
     if not options.lockstep:
@@ -222,6 +225,7 @@ class _Session:
             state = device.start(self._seed)
             self._heard = due = time.monotonic()
             while True:
+                bounds.instance("a state of the device", state, State)
                 if state.end is not None:
                     bounds.choice("end of a State", state.end, messages.ENDS)
                 over = self._too_much(state.force)
