@@ -72,3 +72,26 @@ def test_the_scale_is_in_mn_and_unknown_sides_of_a_patient_are_not_named(
         assert bar.get_ylim() == (0.0, 500.0) and "mN" in bar.get_ylabel()
         assert ("left" in axes.get_xlabel()) == upright
         assert ("head" in axes.get_ylabel()) == upright
+
+
+@pytest.mark.parametrize(
+    ("position", "force", "said"),
+    [
+        (np.zeros((2, 3)), np.ones(3), r"force is float64 of shape \(3,\)"),
+        (np.zeros((2, 3)), np.ones((2, 3)), r"force is .* it must be .* shape \(2\)"),
+        (np.zeros(3), np.ones(1), r"position is float64 of shape \(3,\)"),
+        (np.full((1, 3), np.nan), np.ones(1), "position is .* finite"),
+        (np.array([[28.0, 8.0, 103.0]]), np.ones(1), "position is 103.0; .* 10 m"),
+    ],
+)
+def test_contacts_of_another_shape_or_unit_are_refused(position, force, said, tmp_path):
+    with pytest.raises(ValueError, match=said):
+        heatmap(position, force, make_tube(), tmp_path / "map.png")
+
+
+def test_a_map_is_a_picture_of_a_surface(tmp_path):
+    position, force = np.zeros((1, 3)), np.ones(1)
+    with pytest.raises(ValueError, match="surface is None; it must be a Surface"):
+        heatmap(position, force, None, tmp_path / "map.png")
+    with pytest.raises(ValueError, match="map.jpg; give a .png file"):
+        heatmap(position, force, make_tube(), tmp_path / "map.jpg")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.files import atomic_path, require_file
 
@@ -59,9 +60,15 @@ def force_map(
         low: (2,) lower corner (x, z) of the map, metres.
         high: (2,) upper corner; the map grows to whole cells.
         cell: Side of a cell, metres.
+
+    Raises:
+        ValueError: if an array has another shape, or a contact is farther than 10 m
+            from the origin, as in millimetres.
     """
-    position = np.asarray(position, dtype=np.float64).reshape(-1, 3)
-    force = np.asarray(force, dtype=np.float64)
+    position = bounds.array("position", position, shape=(-1, 3))
+    force = bounds.array("force", force, shape=(len(position),))
+    farthest = float(np.abs(position).max(initial=0.0))
+    bounds.number("farthest coordinate of position", farthest, 0.0, bounds.FAR, "m")
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     shape = np.maximum(np.ceil((high - low) / cell - 1e-9).astype(int), 1)
     # One more half cell, dropped afterwards, excludes points on the far edges.
@@ -94,11 +101,20 @@ def heatmap(
         path: Target, ``*.png``; written atomically.
         title: Title of the picture.
         upright: Whether +x is the patient's left and +z the head.
+
+    Returns:
+        The drawn map.
+
+    Raises:
+        ValueError: as `force_map`; if `surface` is no `Surface`, or `path` no .png.
+        OSError: if `path` cannot be written.
     """
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
 
-    require_file(path)
+    bounds.instance("surface", surface, Surface)
+    if require_file(path).suffix != ".png":
+        raise ValueError(f"the map is to be written to {path}; give a .png file")
     outline = surface.vertices[:, AP_AXES]
     field = force_map(position, force, outline.min(0) - MARGIN, outline.max(0) + MARGIN)
     x_mm, z_mm = 1e3 * field.x_edges, 1e3 * field.z_edges
