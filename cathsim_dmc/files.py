@@ -325,6 +325,9 @@ def read_arrays(
         _refuse_special(path)
         with open(path, "rb") as stream, zipfile.ZipFile(stream) as archive:
             wanted = [f"{name}.npy" for name in names or ()] or archive.namelist()
+            there = {*archive.namelist()}
+            if lost := [name[:-4] for name in wanted if name not in there]:
+                raise ValueError(f"it lacks the array {lost[0]!r}")
             held = [archive.getinfo(name) for name in wanted]
             stored = os.fstat(stream.fileno()).st_size
             require_room(sum(one.file_size for one in held), stored)
@@ -333,8 +336,6 @@ def read_arrays(
             }
     except FileNotFoundError:
         raise
-    except KeyError as error:
-        raise ValueError(f"it lacks {' '.join(str(error).split())}") from error
     except Exception as error:  # zipfile and numpy fail in many ways
         text = " ".join(str(error).split())
         raise ValueError(text or type(error).__name__) from error

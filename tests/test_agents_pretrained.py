@@ -96,6 +96,9 @@ def _copied(exported, tmp_path):
 
 
 def test_a_missing_file_is_named_as_given(tmp_path):
+    (tmp_path / "bare.safetensors").write_bytes(b"weights")
+    with pytest.raises(CheckpointError, match="has no card: put bare.json, which was"):
+        load_policy(tmp_path / "bare.safetensors")
     with pytest.raises(CheckpointError, match=r"no policy .*none\.safetensors: it is"):
         load_policy(tmp_path / "none.safetensors")
 

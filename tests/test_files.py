@@ -176,7 +176,7 @@ def test_arrays_from_outside_run_nothing(tmp_path):
     np.savez(path, a=np.arange(3), b=np.zeros(2))
     assert files.read_arrays(path, ["a"])["a"].tolist() == [0, 1, 2]
     assert files.read_arrays(path).keys() == {"a", "b"}
-    with pytest.raises(ValueError, match="it lacks .*c"):
+    with pytest.raises(ValueError, match="it lacks the array 'c'"):
         files.read_arrays(path, ["a", "c"])
     np.savez(path, a=np.array([{}], dtype=object))
     with pytest.raises(ValueError, match="allow_pickle=False"):

@@ -630,3 +630,9 @@ def test_effects_that_differ_are_named(task):
     said = r"its effects from number \d on is \[\['Counter'\], .*, here it is \[\['Sing"
     with pytest.raises(ValueError, match=said):
         environment.restore(other.snapshot())
+
+
+def test_a_file_of_another_kind_is_told_from_a_damaged_one(tmp_path):
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    with pytest.raises(ValueError, match="no checksum, so it is a file of another"):
+        Snapshot.load(tmp_path / "other.npz")

@@ -63,7 +63,13 @@ def read_pretrained(
         CheckpointError: the policy is missing or damaged.
     """
     weights = Path(weights)
-    card = read_card(weights.with_suffix(".json"))
+    described = weights.with_suffix(".json")
+    if not described.is_file():
+        raise CheckpointError(
+            f"{weights} has no card: put {described.name}, which was written with it, "
+            "into the same folder"
+        )
+    card = read_card(described)
     data = read_bytes(weights, card["sha256"])
     text = f"{weights} cannot be used"
     with files.refused(CheckpointError, text, (SafetensorError, ValueError)):

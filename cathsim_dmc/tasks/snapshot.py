@@ -208,7 +208,9 @@ def read_arrays(
         held = files.read_arrays(path)
         if any(array.dtype.kind not in _KINDS for array in held.values()):
             raise ValueError("it holds something other than numbers and texts")
-        if str(held.pop(_DIGEST, "")) != _digest(held):
+        if _DIGEST not in held:
+            raise ValueError("it has no checksum, so it is a file of another kind")
+        if str(held.pop(_DIGEST)) != _digest(held):
             raise ValueError("its checksum is wrong")
         meta = dict(json.loads(str(held.pop(_META))))
         found = meta["kind"], meta["format"]
