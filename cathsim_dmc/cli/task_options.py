@@ -26,9 +26,10 @@ class TaskOptions:
         anatomy: Directory of an anatomy, or name of a phantom (`navigate`), repeated
             for several, of which each episode draws one.
         goal: Name of a goal of the anatomy, or a point x,y,z in the lumen in the unit
-            and frame of the file that it was imported from (`navigate`). For random
-            arches "any" cycles through the branches; lcca,any names one for each arch.
-            For several anatomies one name for all, or one for each: lcca,bca.
+            and frame of the file that it was imported from (`navigate`, by default
+            bca). For random arches "any" cycles through the branches; lcca,any names
+            one for each arch. For several anatomies one name for all, or one for each:
+            lcca,bca.
         access: End of the aorta that the device enters: "ascending", or "descending" as
             from the femoral artery (`navigate`). For several anatomies one for all, or
             one for each, none for a scan: ascending,,descending.

@@ -153,6 +153,7 @@ def surface_of(episode: Episode, env: Any) -> Surface:
 
     ValueError if the environment does not have that anatomy.
     """
+    bounds.instance("the episode", episode, Episode)
     task, name = navigation_of(env), episode.meta.get("anatomy")
     for anatomy in (task.scene.anatomy, *task.anatomies):
         if name in (anatomy.name, None):
