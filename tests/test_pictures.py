@@ -360,9 +360,13 @@ def test_an_episode_is_drawn_in_its_own_anatomy(pushed, tmp_path):
         lambda: cathsim_dmc.show(env, other),
         lambda: write(other, env, tmp_path / "other.gif"),
     ):
-        with pytest.raises(ValueError, match="'type2'.*'simple1'.*load the task"):
+        with pytest.raises(ValueError, match="'type2 .*'simple1 .*load the task"):
             draw()
-    kept = {k: v for k, v in episode.meta.items() if k not in ("anatomy", "x_ray")}
+    other = dataclasses.replace(episode, meta=episode.meta | {"lumen": "0badcafe"})
+    with pytest.raises(ValueError, match="'simple1 0badcafe'.*'simple1 [0-9a-f]{8}'"):
+        cathsim_dmc.show(env, other)
+    gone = "anatomy", "lumen", "x_ray"
+    kept = {k: v for k, v in episode.meta.items() if k not in gone}
     old = dataclasses.replace(episode, meta=kept)
     assert cathsim_dmc.show(env, old, views=())
 

@@ -154,15 +154,19 @@ def surface_of(episode: Episode, env: Any) -> Surface:
     ValueError if the environment does not have that anatomy.
     """
     bounds.instance("the episode", episode, Episode)
-    task, name = navigation_of(env), episode.meta.get("anatomy")
+    task = navigation_of(env)
+    given = [episode.meta.get(entry) for entry in ("anatomy", "lumen")]
+    names = []
     for anatomy in (task.scene.anatomy, *task.anatomies):
-        if name in (anatomy.name, None):
+        own = [anatomy.name, anatomy.digest]  # other lumens have the same name
+        if all(one in (None, its) for one, its in zip(given, own, strict=True)):
             return anatomy.surface
-    names = bounds.shown([anatomy.name for anatomy in task.anatomies])
+        names.append(" ".join(own))
+    named = " ".join(filter(None, given))
     raise ValueError(
-        f"the episode of {episode.task!r} was recorded in the anatomy {name!r}, and "
-        f"the environment has {names}; load the task with that anatomy, random arches "
-        "with the same arches, pool and first"
+        f"the episode of {episode.task!r} was recorded in the anatomy {named!r}, and "
+        f"the environment has {bounds.shown(names[1:])}; load the task with that "
+        "anatomy, random arches with the same arches, pool and first"
     )
 
 

@@ -244,6 +244,7 @@ class EpisodeRecorder:
             "goal_radius": float(task.objective.goal_radius),
             "distance": rows["distance"],
             "anatomy": task.scene.anatomy.name,
+            "lumen": task.scene.anatomy.digest,
             "conditions": task.conditions.as_dict(),
             "upright": is_upright(task.scene.anatomy),
             "x_ray": x_ray_meta(task),
