@@ -600,25 +600,39 @@ def test_a_state_of_any_kind_comes_back_to_its_simulations():
         assert mine.normal() == other.normal()
 
 
-@pytest.mark.parametrize("value", [[1.0], np.zeros(3)])
+@pytest.mark.parametrize("value", [[1.0], 1.0, np.zeros(3), np.array([None])])
 def test_a_state_that_cannot_be_kept_is_refused(value):
     class Odd(Effect):
         state = ("numbers",)
         numbers = value
 
-    environment = suite.environment(suite.make_task("simple1_bca", effects=[Odd()]))
-    environment.reset()
-    with pytest.raises(TypeError, match="'numbers' of Odd is .*each of the 1 simul"):
-        environment.snapshot()
+    task = suite.make_task("simple1_bca", effects=[Odd()])
+    with pytest.raises(ValueError, match="'numbers' of Odd is .*each of the 1 simul"):
+        suite.environment(task)
 
 
 def test_a_state_that_an_effect_does_not_have_is_refused():
     class Odd(Effect):
         state = ("numbers",)
 
+    task = suite.make_task("simple1_bca", effects=[Odd()])
+    with pytest.raises(ValueError, match="'numbers' of Odd is missing; it must be an"):
+        suite.environment(task)
+
+
+def test_a_state_that_becomes_another_kind_is_refused():
+    class Odd(Counter):
+        state = ("count",)
+
+        def act(self, action, state):
+            self.count = 1.0
+            return action
+
     environment = suite.environment(suite.make_task("simple1_bca", effects=[Odd()]))
     environment.reset()
-    with pytest.raises(TypeError, match="'numbers' of Odd is missing; it must be an"):
+    environment.snapshot()
+    environment.step(np.zeros(21))
+    with pytest.raises(ValueError, match="'count' of Odd is 1.0; it must be an"):
         environment.snapshot()
 
 

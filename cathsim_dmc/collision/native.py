@@ -376,6 +376,7 @@ class Callback:
             made.compile()
         except NumbaError as error:
             text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+            text = re.sub(r"Failed in nopython mode pipeline \(.*\)", "", text)
             raise NotCompiledError(" ".join(text.split())) from error
         return made
 

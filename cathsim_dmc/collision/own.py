@@ -31,7 +31,8 @@ LINK, LINKS, JOINTS, PLACES = range(72, 104, 8)
 # Geoms of wall and bore of the sheath, and offset of the parameters of the motion in
 # `userdata`; -1 for none.
 WALL, BORE, MOTION = 104, 112, 120
-# 1 + offset of the parameters of a law that has raised an error, 0 for none.
+# 1 + offset of the parameters of a law that has raised an error, negative if it has
+# written a number that is not finite; 0 for none.
 FAULT = 128
 # Offset of the parameters of a compliant wall in `userdata`, -1 for none.
 SHARING = 136

@@ -50,6 +50,12 @@ def shapes(kind: Any, sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
             f"{kind.__name__} has arrays of {', '.join(sorted(odd))}; sizes are "
             f"numbers or of {', '.join(sizes)}"
         )
+    lengths = [n for array in declared.values() for n in _shape(array.shape, sizes)]
+    if not all(isinstance(n, int) and n > 0 for n in lengths):
+        raise ValueError(
+            f"{kind.__name__} has arrays of the lengths {lengths}; they must be whole "
+            "numbers above 0, or names of sizes"
+        )
     return {
         name: _shape(declared[name].shape, sizes) if name in declared else ()
         for name in kind._fields

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.collision import native
+from cathsim_dmc.collision.law_checks import WRITTEN, finite, nothing
 from cathsim_dmc.collision.native import (
     address_of,
     contact_at,
@@ -342,12 +343,16 @@ def made(law: Callable, kind: Any, acts_in: str) -> Any:
     # It is not kept on disk, because the law may differ between processes.
     apply = compiled(law, cache=False, checked=True)
     state_of = links_of if acts_in == "control" else device_of
+    written = compiled(WRITTEN[acts_in], cache=False)
 
     def guarded(given, time, state, layout, start):
+        sound = finite(written(state))
         try:
-            apply(given, time, state)
+            nothing(apply(given, time, state))
         except Exception:  # noqa: BLE001  C has no exceptions
             native.longs(layout + FAULT)[0] = start + 1
+        if sound and not finite(written(state)):
+            native.longs(layout + FAULT)[0] = -1 - start
 
     guarded = compiled(guarded, cache=False)
 

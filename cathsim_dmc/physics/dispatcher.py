@@ -11,6 +11,7 @@ import ctypes
 import functools
 import hashlib
 import inspect
+import logging
 import threading
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -26,6 +27,7 @@ from cathsim_dmc.compiled import compiled
 from cathsim_dmc.physics import adapters
 from cathsim_dmc.physics.readings import ModelIndex
 
+_LOG = logging.getLogger(__name__)
 _BEFORE = {
     "mjcb_passive": native.symbol("cathsim_before_passive", 1),
     "mjcb_control": native.symbol("cathsim_before_control", 1),
@@ -176,13 +178,24 @@ class Layout:
         rows = [(law.address, law.start) for law in found]
         return np.array([len(rows), *np.ravel(rows)], np.int64)
 
-    def raise_fault(self) -> None:
-        """Raises RuntimeError if a law has raised an error since the last call."""
+    def raise_fault(self, diverged: bool) -> None:
+        """Raises RuntimeError if a law has failed since the last call.
+
+        Args:
+            diverged: Whether the physics has diverged, so that a law may have got
+                numbers too large for it: that it writes NaN is then logged alone.
+        """
         fault = own.FAULT // 8
-        if not self._row[fault]:
+        code, self._row[fault] = int(self._row[fault]), 0
+        if not code:
             return
-        start, self._row[fault] = int(self._row[fault]) - 1, 0
-        (name,) = (law.name for law in self._laws if law.start == start)
+        (name,) = (law.name for law in self._laws if law.start == abs(code) - 1)
+        if code < 0:
+            text = f"the law of {name} writes a number that is not finite"
+            if not diverged:
+                raise RuntimeError(f"{text}, which MuJoCo may ignore")
+            _LOG.error(text)
+            return
         raise RuntimeError(
             f"the law of {name} has raised an error in a physics step, most likely an "
             "index beyond an array of its parameters or of the device; compare its "

@@ -17,10 +17,10 @@ import mujoco
 import numpy as np
 from numpy.random import RandomState
 
-from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.laws import parameters as declared
+from cathsim_dmc.physics.effect_checks import check_state
 from cathsim_dmc.physics.readings import ModelIndex, Readings
 
 
@@ -113,10 +113,10 @@ class Effect:
         step_fields: Those of `model_fields` that `act` writes. Fields that the device
             writes in every control step, such as those of its hinges, are refused:
             `restart` or options of the task set them.
-        state: Names of its attributes, arrays with a leading axis N, that are its state
-            beside parameters and fields. A snapshot saves them and restores them in
-            place. It does not save quantities that MuJoCo derives; `act` reads these
-            from its argument `state`.
+        state: Names of its attributes, arrays of numbers with a leading axis N, made in
+            `bind`, that are its state beside parameters and fields. A snapshot saves
+            them and restores them in place. It does not save quantities that MuJoCo
+            derives; `act` reads these from its argument `state`.
         parameters: NamedTuple class of the parameters of its law, see
             `laws.parameters`; None for none.
         law: Static method law(parameters, time, state) of plain loops, which numba
@@ -124,10 +124,11 @@ class Effect:
             simulation, time in s, and a state by `acts_in`. In "control" it adds to
             `xfrc_applied` of `laws.device.Links`, in "passive" to `qfrc_passive` of
             `laws.device.Device`, in "contact" it changes `solref` of
-            `laws.device.Contact`. None for none.
+            `laws.device.Contact`. It returns nothing and writes finite numbers. None
+            for none.
         acts_in: "control", "passive" or "contact".
         adapter: Name of a function of `physics.adapters` in place of `law`.
-        world: The simulations, set by `bind`.
+        world: The simulations, set before `bind`.
     """
 
     data_fields: tuple[str, ...] = ()
@@ -142,7 +143,6 @@ class Effect:
 
     def bind(self, world: World) -> None:
         """Takes the simulations that it acts on, before their first episode."""
-        self.world = world
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Takes the anatomy of one simulation, before an episode begins in it.
@@ -191,19 +191,6 @@ def copied(effect: Effect) -> Effect:
         if isinstance(value, np.ndarray) and value.flags.writeable:
             vars(one)[name] = value.copy()
     return one
-
-
-def check_action(effect: Effect, action: Any, shape: tuple[int, ...]) -> None:
-    """Raises ValueError unless `act` of an effect returns numbers (shape), finite."""
-    name = f"act of {type(effect).__name__} returns"
-    if action is None:
-        raise ValueError(f"{name} None; return the action that takes effect")
-    try:
-        bounds.array("it", action, shape=shape)
-    except ValueError as error:
-        raise ValueError(
-            f"{name} another value than the action that takes effect: {error}"
-        ) from None
 
 
 def _kind(effect: Effect) -> Any:
@@ -274,7 +261,8 @@ class Layout:
             places: `dispatcher.Places` of the device; None for those of a task's scene.
 
         Raises:
-            ValueError: if the scene was built for other effects.
+            ValueError: if the scene was built for other effects, or an effect lacks a
+                state that it names.
             RuntimeError: if one of MuJoCo's callbacks is a Python function.
         """
         from cathsim_dmc.physics import dispatcher  # late, as numba takes long
@@ -297,7 +285,10 @@ class Layout:
                 parameters = views(kind, self._user[:, start : start + count], sizes)
                 laws += dispatcher.laws(effect, kind, start)
                 start += count
-            effect.bind(dataclasses.replace(world, parameters=parameters))
+            effect.world = dataclasses.replace(world, parameters=parameters)
+            effect.bind(effect.world)
+            for name in effect.state:
+                check_state(effect, name, world.num_simulations)
         places = places or dispatcher.Places.of(world.model, world.index)
         self._callbacks = dispatcher.layout(world.model, places, laws)
         self._stand = dispatcher.stand
@@ -311,6 +302,10 @@ class Layout:
         self._stand()
         self._user[indices, -1] = self._callbacks.label
 
-    def raise_fault(self) -> None:
-        """Raises RuntimeError if a law has raised an error since the last call."""
-        self._callbacks.raise_fault()
+    def raise_fault(self, diverged: bool = False) -> None:
+        """Raises RuntimeError if a law has failed since the last call.
+
+        That is an error in it, or, unless the physics has diverged, a number that is
+        not finite.
+        """
+        self._callbacks.raise_fault(diverged)

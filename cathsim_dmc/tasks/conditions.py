@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cathsim_dmc.physics.effect_checks import check_conditions
 from cathsim_dmc.physics.effects import Draw, Effect
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.snapshot import Snapshot
@@ -104,9 +105,9 @@ class DrawnConditions:
                 continue
             values = numbers.astype(int if name in _WHOLE else float).tolist()
             found[name] = tuple(values) if len(values) > 1 else values[0]
-        drawn = {
-            n: x for effect in effects for n, x in effect.conditions(index).items()
-        }
+        drawn: dict[str, float] = {}
+        for effect in effects:
+            drawn |= check_conditions(effect, effect.conditions(index))
         return Conditions(scene.anatomy.name, scene.goal.name, effects=drawn, **found)
 
     def completed(self, snapshot: Snapshot) -> Snapshot:

@@ -14,6 +14,7 @@ from cathsim_dmc.entities.contact import FRICTION, MOST_FRICTION
 from cathsim_dmc.entities.device import LONGEST, Device
 from cathsim_dmc.entities.device_stack import LEAD, LUMEN_FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.physics.effect_checks import check_declared
 from cathsim_dmc.physics.effects import Effect, copied
 from cathsim_dmc.physics.held import Released
 from cathsim_dmc.physics.randomisation import (
@@ -150,7 +151,10 @@ class NavigationConfig:
         if not isinstance(self.effects, Sequence) or not all(
             isinstance(effect, Effect) for effect in self.effects
         ):
-            bounds.refuse("effects", self.effects, "a list of physics.effects.Effect")
+            allowed = "a list of objects of physics.effects.Effect, such as [Mine()]"
+            bounds.refuse("effects", self.effects, allowed)
+        for effect in self.effects:
+            check_declared(effect)
         object.__setattr__(self, "effects", tuple(self.effects))
 
     def effects_on(self, chain: Chain) -> list[Effect]:

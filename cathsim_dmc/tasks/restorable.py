@@ -17,6 +17,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.imaging.angiograph import Deviation
+from cathsim_dmc.physics.effect_checks import check_state
 from cathsim_dmc.physics.effects import Effect, Layout
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks.cases import Case
@@ -72,20 +73,6 @@ def _named(device: Device) -> str:
     return f"{device.name} {hashlib.sha256(repr(device).encode()).hexdigest()[:8]}"
 
 
-def _check_state(holder: Any, name: str, value: Any, count: int) -> None:
-    """Raise TypeError if a state that an effect names cannot be restored."""
-    missing = not hasattr(holder, name)
-    wrong = isinstance(value, list) or (
-        isinstance(value, np.ndarray) and value.shape[:1] != (count,)
-    )
-    if isinstance(holder, Effect) and (missing or wrong):
-        is_now = "missing" if missing else bounds.shown(value)
-        raise TypeError(
-            f"the state {name!r} of {type(holder).__name__} is {is_now}; "
-            f"it must be an array with a row for each of the {count} simulations"
-        )
-
-
 class Restorable:
     """The part of a `Rollout` that takes and restores snapshots."""
 
@@ -131,7 +118,7 @@ class Restorable:
         Raises:
             RuntimeError: if no episode has begun, or a step is half done.
             NotImplementedError: if the stepper has no snapshots.
-            TypeError: if an effect names a state that cannot be restored.
+            ValueError: if an effect names a state that cannot be restored.
         """
         if not self._stepper.has_snapshots:
             raise NotImplementedError(
@@ -145,8 +132,9 @@ class Restorable:
             for attribute in holder.state:
                 if attribute == "_random_states" and not random:
                     continue
+                if isinstance(holder, Effect):
+                    check_state(holder, attribute, len(self._open))
                 value = getattr(holder, attribute, None)
-                _check_state(holder, attribute, value, len(self._open))
                 arrays |= packed(f"{name}.{attribute}", value, indices)
         fields = {name for effect in self.effects for name in effect.model_fields}
         kept = self._stepper.kept(indices, sorted(fields))

@@ -17,7 +17,8 @@ from cathsim_dmc.imaging.angiograph import Deviation, Planes
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics import vessel as vessels
-from cathsim_dmc.physics.effects import Layout, World, check_action, of_kind
+from cathsim_dmc.physics.effect_checks import check_action, check_begun
+from cathsim_dmc.physics.effects import Layout, World, of_kind
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import ModelIndex, Readings, merged, part
 from cathsim_dmc.physics.single_device import SingleDevice
@@ -145,6 +146,8 @@ class Rollout(Restorable):
             self._draw(index, random_states[index])
         # After `_draw`, because loading an anatomy resets the simulation.
         self._layout.begin(indices)
+        for effect in self.effects[-1 - len(self._config.effects) : -1]:
+            check_begun(effect, indices)
         self._devices.pose_robot()
         self._choose_objectives()
         self.steps[indices] = 0
@@ -230,7 +233,7 @@ class Rollout(Restorable):
 
         Raises:
             ValueError: if an observation is not as its row declares.
-            RuntimeError: if a law has raised an error in the forward pass.
+            RuntimeError: if a law has failed in the forward pass.
         """
         self._layout.raise_fault()
         # The others have not moved and keep their measurements.
@@ -254,10 +257,10 @@ class Rollout(Restorable):
             logs: whether physics errors are logged.
 
         Raises:
-            RuntimeError: if a law has raised an error in a physics step.
+            RuntimeError: if a law has failed in a physics step.
         """
         force, warned = self._stepper.end()
-        self._layout.raise_fault()
+        self._layout.raise_fault(bool(warned.any()))
         self.steps += 1
         before, everyone = self.resting.head, np.arange(len(self.steps))
         self._measure(force, everyone)
