@@ -24,6 +24,7 @@ from cathsim_dmc.tasks import observations, placement, registered
 from cathsim_dmc.tasks.anatomies import load_anatomy as load_anatomy
 from cathsim_dmc.tasks.anatomies import load_arches as load_arches  # for users, too
 from cathsim_dmc.tasks.anatomies import load_arches_to, load_pool
+from cathsim_dmc.tasks.cases import check_parts
 from cathsim_dmc.tasks.config import NavigationConfig, refuse_replaced
 from cathsim_dmc.tasks.definition import OF_ARCHES
 from cathsim_dmc.tasks.definition import TaskDefinition as TaskDefinition
@@ -60,15 +61,12 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
 
     Raises:
         ValueError: if the name is taken or has other characters than letters, digits
-            and _ : . -, the task is not a `Navigation`, or an option of the objective
-            has the name of an option that all tasks have.
+            and _ : . -, or an option of the objective has the name of an option that
+            all tasks have.
     """
     if not re.fullmatch(r"[\w:.-]+", bounds.text("name", name)):
         bounds.refuse("name", name, "of letters, digits and the signs _ : . -")
     bounds.instance("definition", definition, TaskDefinition)
-    kind = definition.task
-    if not isinstance(kind, type) or not issubclass(kind, Navigation):
-        bounds.refuse("task of the definition", kind, "Navigation, or a subclass of it")
     if taken := sorted({*_TAKEN, *_CONFIG_FIELDS} & {*definition.objective_options}):
         raise ValueError(
             f"the objective of {name!r} has the options {', '.join(taken)}, which are "
@@ -161,6 +159,7 @@ def make_task(
     def room(number: int) -> tuple[Scene, Objective]:
         anatomy, goal = anatomies[number], goals[number]
         objective = definition.objective(anatomy, goal, **chosen)
+        check_parts(objective)
         looks: dict[str, Any] = {"one_goal": mixed, "drawn": number == 0}
         looks["goal_radius"] = objective.goal_radius
         return Scene.build(anatomy, goal, config, **looks), objective

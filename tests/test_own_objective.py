@@ -248,17 +248,15 @@ def test_an_objective_that_lacks_something_is_told_what(name):
     scene = suite.make_task("simple1_lcca").scene
     parts = {n: v for n, v in vars(Advance).items() if n != name and n[0] != "_"}
     parts |= {} if name == "goal" else {"goal": scene.goal.position}
-    task = Navigation(scene, type("Partial", (), parts)(), NavigationConfig())
     with pytest.raises(ValueError, match=rf"Partial lacks {name}; .*path_distance"):
-        suite.environment(task)
+        Navigation(scene, type("Partial", (), parts)(), NavigationConfig())
 
 
 @pytest.mark.parametrize("goal", [None, "lcca", np.zeros(2), np.full(3, np.nan)])
 def test_a_goal_that_is_no_place_is_refused(goal):
     scene = suite.make_task("simple1_lcca").scene
-    task = Navigation(scene, Advance(goal), NavigationConfig())
     with pytest.raises(ValueError, match=r"goal of Advance is .*finite.*3\)"):
-        suite.environment(task)
+        Navigation(scene, Advance(goal), NavigationConfig())
 
 
 @pytest.mark.parametrize(
@@ -321,3 +319,49 @@ def test_a_route_that_ends_at_a_goal_which_moves_on_is_refused(example, monkeypa
 def test_a_name_that_no_environment_may_have_is_refused(name):
     with pytest.raises(ValueError, match="name is .*letters, digits"):
         suite.register(name, suite.TaskDefinition("", "simple1", "bca"))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"description": None}, "description is None"),
+        ({"options": [("max_steps", 3)]}, "options is .*a mapping of names"),
+        ({"objective": "Cannulation"}, "objective is 'Cannulation'.*Cannulation.to"),
+        ({"objective": Cannulation}, "objective is .*a function.*Cannulation.to"),
+        ({"random_arch": "yes"}, "random_arch is 'yes'"),
+        ({"random_arch": True}, "anatomy is 'simple1', but random_arch draws it"),
+    ],
+)
+def test_a_wrong_definition_is_refused(given, words):
+    right = suite.TaskDefinition("", "simple1", "bca")
+    with pytest.raises(ValueError, match=words):
+        dataclasses.replace(right, **given)
+
+
+def test_a_function_that_makes_no_objective_is_refused(monkeypatch):
+    definition = suite.TaskDefinition("", "simple1", "bca", objective=lambda a, g: None)
+    monkeypatch.setitem(suite.TASKS, "makes_none", definition)
+    with pytest.raises(ValueError, match="the objective NoneType lacks goal, goal_rad"):
+        suite.make_task("makes_none")
+
+
+def test_an_objective_or_a_goal_of_another_anatomy_is_refused():
+    own, other = suite.load_anatomy("simple1"), suite.load_anatomy("type2")
+    config = NavigationConfig()
+    scene = Scene.build(own, "bca", config)
+    right = Cannulation.to(own, scene.goal)
+    away = dataclasses.replace(right, goal=right.goal + 0.1)
+    elsewhere = Cannulation.to(own, own.goals["lcca"])
+    for wrong in (Cannulation.to(other, other.goals["bca"]), elsewhere, away):
+        with pytest.raises(ValueError, match="but the scene has the goal 'bca' of"):
+            Navigation(scene, wrong, config)
+    Navigation(scene, right, config)
+    moved = dataclasses.replace(scene.goal, arc_length=scene.goal.arc_length + 3e-3)
+    for make in (Cannulation.to, lambda a, g: Scene.build(a, g, config)):
+        with pytest.raises(ValueError, match="has an arc_length of .*goal_at"):
+            make(own, moved)
+    with pytest.raises(ValueError, match="anatomy is 'simple1'; it must be an Anatomy"):
+        Cannulation.to("simple1", scene.goal)
+    for shift in (5, -1e-3, None):
+        with pytest.raises(ValueError, match="farthest_shift is"):
+            Cannulation.to(own, scene.goal, farthest_shift=shift)

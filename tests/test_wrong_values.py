@@ -308,7 +308,7 @@ AXIS, CONFIG = straight(0.2), NavigationConfig()
         (lambda: Scene.build("type1", "lcca", {}), "config is {}.*a NavigationConfig"),
         (lambda: Scene.build("type1", "lcca", CONFIG), "anatomy is 'type1'"),
         (lambda: Navigation("type1", None), "scene is 'type1'.*a Scene"),
-        (lambda: Cannulation.to(None, "bca"), "goal is 'bca'.*a Goal"),
+        (lambda: Cannulation.to(None, "bca"), "anatomy is None.*an Anatomy"),
         (lambda: suite.make_task(TASK, random=np.random), "RandomState, or an integer"),
     ],
 )
@@ -371,3 +371,13 @@ def test_objects_with_arrays_are_compared_by_identity():
     assert one in {one} and other not in {one}
     for kind in (Cannulation, Route, Plan, CoaxialPlan, CoaxialEnds, Draw, Contacts):
         assert kind.__eq__ is object.__eq__ and kind.__hash__ is object.__hash__
+
+
+@pytest.mark.parametrize("options", [{"device": 1}, {"devices": ["wire"]}])
+def test_a_device_may_be_an_object(options):
+    with pytest.raises(ValueError, match="must be a Device, or one of steerable_5f"):
+        suite.make_task(TASK, **options)
+    with pytest.raises(ValueError, match=r"\(names or objects of Device\)"):
+        suite.make_task(TASK, devices="wire_035_glide")
+    glide = devices.DEVICES["wire_035_glide"]
+    assert suite.make_task(TASK, devices=[glide]).config.devices == (glide,)

@@ -24,6 +24,8 @@ from cathsim_dmc.anatomy.parts import End, FileFrame, Goal, Inlet, Surface
 _FORMAT = {"format": "cathsim-anatomy", "version": 3, "units": "m", "frame": "LPS"}
 _FILE = "anatomy.npz"
 _LEAST_ROOM = 0.5e-3  # m, around a goal
+# Largest difference of a goal's arc length from that of its position, m.
+_MOST_GAP = 2e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -155,6 +157,20 @@ class Anatomy:
                 own.append((float(depths[key]), key, arc))
         _, key, arc = max(own)
         return Goal(name, key, position, arc)
+
+    def check_goal(self, goal: Goal) -> None:
+        """Raises ValueError unless a goal is a place of this anatomy."""
+        name, at = bounds.instance("goal", goal, Goal).name, goal.position
+        place = f"goal {name!r} at {np.round(at, 4).tolist()} m"
+        self.check_inside(place, at)
+        arc = self.tree.vessel(goal.vessel).centreline.locate(at)
+        if abs(arc - goal.arc_length) > _MOST_GAP:
+            raise ValueError(
+                f"{place} has an arc_length of {1e3 * goal.arc_length:.1f} mm, but the "
+                f"place is at {1e3 * arc:.1f} mm of {goal.vessel!r} in {self.name!r}; "
+                f"give a goal of this anatomy, one of {', '.join(self.goals)}, or "
+                "Anatomy.goal_at(position)"
+            )
 
     def check_inside(self, what: str, position: np.ndarray) -> None:
         """Raises ValueError if a position (3,), m, LPS, is outside the lumen."""

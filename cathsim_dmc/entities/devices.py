@@ -239,7 +239,9 @@ def get(device: "str | Device", option: str = "device") -> Device:
     """
     if isinstance(device, Device):
         return device
-    return DEVICES[bounds.choice(option, device, DEVICES)]
+    if not isinstance(device, str) or device not in DEVICES:
+        bounds.refuse(option, device, f"a Device, or one of {', '.join(DEVICES)}")
+    return DEVICES[device]
 
 
 def discretised(given: "Discretisation | None") -> "Discretisation":

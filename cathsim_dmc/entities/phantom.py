@@ -48,7 +48,7 @@ class Phantom(composer.ModelWrapperEntity):
             marked: goals that get a site, by the name of the site; None for all.
         """
         bounds.instance("anatomy", anatomy, Anatomy)
-        bounds.number("goal_radius", goal_radius, unit="m", positive=True)
+        bounds.number("goal_radius", goal_radius, 0.0, 1.0, "m", positive=True)
         self.anatomy, self._friction = anatomy, friction
         root = mjcf.RootElement(model="phantom")
         super()._build(root)

@@ -47,12 +47,7 @@ class Case:
         config: NavigationConfig,
         fields: Fields | None = None,
     ):
-        """Settles the device; `fields` are the model fields that `write` copies.
-
-        Raises:
-            ValueError: if the objective lacks something, or its goal is no place.
-        """
-        _check_objective(objective)
+        """Settles the device; `fields` are the model fields that `write` copies."""
         self.scene, self.objective = scene, objective
         index = ModelIndex(model, scene.catheter, scene.robot)
         if isinstance(scene.catheter, DeviceStack):
@@ -112,8 +107,8 @@ def objectives_of(
     return found, goals
 
 
-def _check_objective(objective: Objective) -> None:
-    """Raise ValueError if an objective lacks an attribute, or its goal is no place."""
+def check_parts(objective: Objective) -> None:
+    """Raises ValueError if an objective lacks an attribute, or its goal is no place."""
     name = type(objective).__name__
     parts = "goal", "goal_radius", "terms", "outcome", "path_distance"
     if lacking := [part for part in parts if not hasattr(objective, part)]:
@@ -123,6 +118,23 @@ def _check_objective(objective: Objective) -> None:
         )
     shape = (3,) if np.shape(objective.goal) == (3,) else (-1, 3)
     bounds.array(f"the goal of {name}", objective.goal, shape=shape)
+
+
+def check_objective(objective: Objective, scene: Scene) -> None:
+    """Raises ValueError if an objective lacks a part, or is that of another scene."""
+    check_parts(objective)
+    if not isinstance(objective, Cannulation):
+        return
+    anatomy, goal, kind = scene.anatomy, scene.goal, type(objective).__name__
+    line, own = objective.branch, anatomy.tree.vessel(goal.vessel).centreline
+    depths = anatomy.lumen(np.reshape(objective.goal, (-1, 3)))
+    if not np.array_equal(line.points, own.points) or not (depths > 0.0).all():
+        raise ValueError(
+            f"the objective is a {kind} with the goal "
+            f"{np.round(objective.goal, 4).tolist()} m, but the scene has the goal "
+            f"{goal.name!r} of {anatomy.name!r}; give {kind}.to(scene.anatomy, "
+            "scene.goal)"
+        )
 
 
 def check_shift(objective: Objective, ranges: Randomisation) -> None:
@@ -155,13 +167,14 @@ def compile_together(
 
     Raises:
         ValueError: if the scenes differ in more than wall and places, or were built
-            with other options.
+            with other options, or an objective is that of another scene.
     """
     found: list[Case] = []
     sizes: dict[str, int] = {}  # lengths of the fields that differ in any case
     first, host = None, None
     for scene, objective in scenes:
         scene.check(config)
+        check_objective(objective, scene)
         root = scene.arena.mjcf_model
         root.option.timestep = config.physics_timestep
         spec = mujoco.MjSpec.from_string(root.to_xml_string(), assets=root.get_assets())

@@ -179,8 +179,8 @@ class NavigationConfig:
             bounds.refuse(
                 "devices",
                 self.devices,
-                "None, or names of devices from the innermost outwards, such as "
-                "['wire_035_glide', 'berenstein_5f']",
+                "None, or a list of devices (names or objects of Device) from the "
+                "innermost outwards, such as ['wire_035_glide', 'berenstein_5f']",
             )
         object.__setattr__(self, "devices", tuple(self.devices))
         if len(self.devices) == 1:

@@ -5,6 +5,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation, Objective
@@ -31,6 +32,10 @@ class TaskDefinition:
             None then.
         task: class of the task. A subclass of `Navigation` that overrides hooks of
             composer makes single environments; batches refuse it.
+
+    Raises:
+        ValueError: if a field is of another kind, or an anatomy is given with
+            `random_arch`.
     """
 
     description: str
@@ -41,6 +46,26 @@ class TaskDefinition:
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     random_arch: bool = False
     task: type[Navigation] = Navigation
+
+    def __post_init__(self):
+        if not isinstance(self.description, str):
+            bounds.refuse("description", self.description, "a text")
+        bounds.switch("random_arch", self.random_arch)
+        if self.random_arch and self.anatomy is not None:
+            raise ValueError(
+                f"anatomy is {bounds.shown(self.anatomy)}, but random_arch draws it; "
+                "leave one of the two out"
+            )
+        if not isinstance(self.options, Mapping):
+            allowed = "a mapping of names to values, such as {'max_steps': 200}"
+            bounds.refuse("options", self.options, allowed)
+        made = self.objective
+        of_class = isinstance(made, type) and issubclass(made, Cannulation)
+        if of_class or not callable(made):
+            allowed = "a function of an anatomy and a goal, such as Cannulation.to"
+            bounds.refuse("objective", made, allowed)
+        if not isinstance(self.task, type) or not issubclass(self.task, Navigation):
+            bounds.refuse("task", self.task, "Navigation, or a subclass of it")
 
     @property
     def own_options(self) -> tuple[str, ...]:

@@ -77,9 +77,9 @@ class Navigation(composer.Task, NotCopied):
             name: Name of the task in texts; None for the name of the class.
 
         Raises:
-            ValueError: if a scene was built with other options, the objective does
-                not support the randomisation, or the scenes differ in more than their
-                anatomies.
+            ValueError: if a scene was built with other options, the objective lacks
+                something, is that of another scene or does not support the
+                randomisation, or the scenes differ in more than their anatomies.
         """
         bounds.instance("scene", scene, Scene)
         config = scene.config if config is None else config
@@ -94,6 +94,7 @@ class Navigation(composer.Task, NotCopied):
             config = dataclasses.replace(config, fluoroscopy=aimed)
         self.config = config
         self._random_state = bounds.random_state("random", random)
+        cases.check_objective(objective, scene)
         cases.check_shift(objective, config.randomisation)
         self.num_actions = len(scene.catheter.action_names)
         self.observation_names = observations.resolve(

@@ -212,7 +212,8 @@ class Cannulation(Shiftable, Routed):
                 mm, less in a short branch.
             farthest_shift: Largest shift of the goal away from the ostium, m.
         """
-        bounds.instance("goal", goal, Goal)
+        bounds.instance("anatomy", anatomy, Anatomy).check_goal(goal)
+        bounds.number("farthest_shift", farthest_shift, 0.0, _FARTHEST, "m")
         vessel = anatomy.tree.vessel(goal.vessel)
         if goal_radius is None:
             goal_radius = min(GOAL_RADIUS, anatomy.goal_room(goal))

@@ -103,9 +103,7 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal | Sequence[float]") -> Goal
                 f"goal {goal.name}: {where}, where a device starts; give a place "
                 "farther in, or import with another inlet"
             )
-    bounds.instance("goal", goal, Goal)
-    place = np.round(goal.position, 4).tolist()
-    anatomy.check_inside(f"goal {goal.name!r} at {place} m", goal.position)
+    anatomy.check_goal(goal)
     return goal
 
 
