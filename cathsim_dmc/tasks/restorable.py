@@ -44,6 +44,7 @@ def describe(
     Devices and sheath may not: a snapshot holds stiffnesses of hinges, those held by
     the sheath too, and masses of links, some of which keep their values of the start.
     """
+    flow = config.vessel.flow
     starts, numbered = {}, []  # numbered by the case number that a state holds
     for case in cases:
         anatomy, start = case.scene.anatomy, 1e3 * case.scene.placement.start
@@ -62,6 +63,7 @@ def describe(
             for effect in effects
         ],
         "timestep": model.opt.timestep,
+        **({"split of the flow": flow.split} if flow else {}),
         **({"cases": numbered} if len(cases) > 1 else {}),
     }
 
