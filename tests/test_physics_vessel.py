@@ -395,3 +395,31 @@ def test_a_flow_without_inflow_is_the_limit_of_a_small_one():
     still, slow = pushed(0.0), pushed(1e-12)
     np.testing.assert_allclose(still[0], slow[0], atol=1e-9)
     np.testing.assert_array_equal(still[1], 0.0)
+
+
+def test_a_surface_of_no_simulation_or_before_an_episode_is_refused():
+    batch = BatchSimulation(suite.make_task("simple1_bca", vessel="living"), 2)
+    with pytest.raises(RuntimeError, match="no episode has begun; call reset"):
+        batch.rollout.moving.surface(0)
+    batch.reset()
+    assert np.isfinite(batch.rollout.moving.surface(1).vertices).all()
+    for index in (2, -1, None, 0.0):
+        with pytest.raises(ValueError, match="^index is .*an integer from 0 to 1"):
+            batch.rollout.moving.surface(index)
+
+
+def test_a_snapshot_of_another_split_of_the_flow_is_refused():
+    split, made = {"flow": {"split": "murray"}}, []
+    for chosen in ({"flow": True}, split):
+        made.append(BatchSimulation(suite.make_task("simple1_bca", vessel=chosen), 1))
+        made[-1].reset()
+    one, other = made
+    for mine, its in ((one, other), (other, one)):
+        with pytest.raises(ValueError, match="its split of the flow is 'm"):
+            mine.restore(its.snapshot())
+    one.restore(one.snapshot())
+
+
+def test_a_wrong_name_of_a_vessel_tells_that_a_mapping_is_allowed():
+    with pytest.raises(ValueError, match="silicone, living, or a mapping with some of"):
+        suite.make_task("simple1_bca", vessel="flow=1")

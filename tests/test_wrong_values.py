@@ -381,3 +381,13 @@ def test_a_device_may_be_an_object(options):
         suite.make_task(TASK, devices="wire_035_glide")
     glide = devices.DEVICES["wire_035_glide"]
     assert suite.make_task(TASK, devices=[glide]).config.devices == (glide,)
+
+
+@pytest.mark.parametrize("name", ["readings", "wall_force", "devices", "info"])
+def test_what_an_episode_has_is_refused_before_one_has_begun(name):
+    environment = suite.load("cathsim", TASK)
+    with pytest.raises(RuntimeError, match=r"no episode has begun; call reset\(\)"):
+        found = getattr(environment.task, name)
+        found()
+    environment.reset()
+    getattr(environment.task, name)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.random import RandomState
 
-from cathsim_dmc import rows
+from cathsim_dmc import bounds, rows
 from cathsim_dmc.anatomy import Anatomy, Surface
 from cathsim_dmc.anatomy.motion import PARAMETERS, Motion
 from cathsim_dmc.compiled import compiled
@@ -200,7 +200,15 @@ class Moving(Effect):
         return self._motions[index].lattice, self._numbers(index), time
 
     def surface(self, index: int) -> Surface:
-        """Present surface of the lumen of one simulation."""
+        """Present surface of the lumen of one simulation.
+
+        Raises:
+            ValueError: if there is no simulation of that index.
+            RuntimeError: if no episode has begun in it.
+        """
+        index = bounds.whole("index", index, 0, self.world.num_simulations - 1)
+        if not self.world.parameters.rate[index]:
+            raise RuntimeError("no episode has begun; call reset() first")
         parameters, time = self.warp(index)[1:]
         return self._motions[index].surface(parameters, time, self._surfaces[index])
 

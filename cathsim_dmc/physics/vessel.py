@@ -107,9 +107,9 @@ class VesselOptions:
         """Builds it from a preset's name or a mapping; ValueError if invalid."""
         if isinstance(value, VesselOptions):
             return value
-        if isinstance(value, str):
-            value = PRESETS[bounds.choice("vessel", value, PRESETS)]
         named = f"one of {', '.join(PRESETS)}, or "
+        if isinstance(value, str) and value in PRESETS:
+            value = PRESETS[value]
         return cls(**bounds.mapping("vessel", value, _KINDS, named))
 
     @property

@@ -280,6 +280,12 @@ class Navigation(composer.Task, NotCopied):
             self._step = self.rollout.start(_ONLY)
         return self._step
 
+    def _measured(self) -> Step:
+        """As `_current`; RuntimeError before the first episode."""
+        if self._compiled and not self.rollout.begun:
+            raise RuntimeError("no episode has begun; call reset() first")
+        return self._current()
+
     def get_reward(self, physics) -> float:
         """Reward of the last control step, 0 if the physics failed in it."""
         del physics
@@ -330,17 +336,17 @@ class Navigation(composer.Task, NotCopied):
     @property
     def readings(self) -> readings.Readings:
         """State of the device after the last control step, without a leading axis."""
-        return copied(part(self._current().readings, 0))
+        return copied(part(self._measured().readings, 0))
 
     @property
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last control step, N, without a leading axis."""
-        return copied(part(self._current().wall_force, 0))
+        return copied(part(self._measured().wall_force, 0))
 
     @property
     def devices(self) -> CoaxialReadings | None:
         """State of coaxial devices, without a leading axis; None for a single one."""
-        self._current()
+        self._measured()
         return copied(part(self.rollout.devices, 0))
 
     @property
@@ -364,7 +370,8 @@ class Navigation(composer.Task, NotCopied):
 
     def info(self) -> dict[str, Any]:
         """Figures of the last control step, or of the start; see `Step.info`."""
-        return {name: value[0].item() for name, value in self._current().info().items()}
+        found = self._measured().info()
+        return {name: value[0].item() for name, value in found.items()}
 
     @property
     def conditions(self) -> Conditions:
