@@ -79,7 +79,8 @@ class NavigationConfig:
         give_up: Whether an episode ends without success when the memory of attempts
             (`tasks.retry`) gives up, as in a lumen too narrow for the device.
         friction: Coulomb coefficient between an uncoated device and the wall; that of a
-            hydrophilic device is this times its `friction_ratio`.
+            hydrophilic device is this times its `friction_ratio`. A `friction` of
+            `randomisation` replaces it.
         shaft_link: Length of the longest link of the shaft, m.
         working_length: Simulated length of the device, m; None for the length that the
             goal requires. Shapes of observations do not depend on it.
