@@ -178,21 +178,21 @@ class Layout:
         rows = [(law.address, law.start) for law in found]
         return np.array([len(rows), *np.ravel(rows)], np.int64)
 
-    def raise_fault(self, diverged: bool) -> None:
+    def raise_fault(self, warned: np.ndarray) -> None:
         """Raises RuntimeError if a law has failed since the last call.
 
         Args:
-            diverged: Whether the physics has diverged, so that a law may have got
-                numbers too large for it: that it writes NaN is then logged alone.
+            warned: (N,) bool, whether MuJoCo has warned. A law may then have got
+                numbers too large for it: that it writes NaN is only logged.
         """
         fault = own.FAULT // 8
-        code, self._row[fault] = int(self._row[fault]), 0
-        if not code:
+        if not self._row[fault]:
             return
+        code, self._row[fault] = int(self._row[fault]), 0
         (name,) = (law.name for law in self._laws if law.start == abs(code) - 1)
         if code < 0:
             text = f"the law of {name} writes a number that is not finite"
-            if not diverged:
+            if not warned.any():
                 raise RuntimeError(f"{text}, which MuJoCo may ignore")
             _LOG.error(text)
             return

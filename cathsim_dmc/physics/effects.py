@@ -302,10 +302,11 @@ class Layout:
         self._stand()
         self._user[indices, -1] = self._callbacks.label
 
-    def raise_fault(self, diverged: bool = False) -> None:
+    def raise_fault(self, warned: np.ndarray) -> None:
         """Raises RuntimeError if a law has failed since the last call.
 
-        That is an error in it, or, unless the physics has diverged, a number that is
-        not finite.
+        Args:
+            warned: (N,) bool, whether MuJoCo has warned: the law may then write numbers
+                that are not finite.
         """
-        self._callbacks.raise_fault(diverged)
+        self._callbacks.raise_fault(warned)

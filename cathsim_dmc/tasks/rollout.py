@@ -235,7 +235,7 @@ class Rollout(Restorable):
             ValueError: if an observation is not as its row declares.
             RuntimeError: if a law has failed in the forward pass.
         """
-        self._layout.raise_fault()
+        self._layout.raise_fault(np.zeros(len(self.steps), dtype=bool))
         # The others have not moved and keep their measurements.
         self._measure(self._stepper.still(indices), indices)
         self._way[indices] = 0.0
@@ -260,7 +260,7 @@ class Rollout(Restorable):
             RuntimeError: if a law has failed in a physics step.
         """
         force, warned = self._stepper.end()
-        self._layout.raise_fault(bool(warned.any()))
+        self._layout.raise_fault(warned)
         self.steps += 1
         before, everyone = self.resting.head, np.arange(len(self.steps))
         self._measure(force, everyone)
