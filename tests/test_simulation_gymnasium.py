@@ -272,7 +272,7 @@ def test_a_physics_error_ends_an_episode_of_a_vector_as_of_a_single_one(monkeypa
         ({"render_mode": ""}, "render_mode"),
         ({"autoreset_mode": "Never"}, "SameStep"),
         ({"dtype": "int8"}, "dtype"),
-        ({"num_envs": 0}, "num_simulations"),
+        ({"num_envs": 0}, "num_envs"),
         ({"num_threads": -1}, "num_threads"),
         ({"max_episode_steps": 3, "max_steps": 4}, "max_episode_steps is 3; .*be 4"),
         ({"max_episode_steps": 0}, "max_steps is 0"),

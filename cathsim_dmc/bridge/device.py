@@ -93,10 +93,11 @@ def require_device(device: Any) -> None:
     period = getattr(device, "period", None)
     bounds.number("period of the device", period, unit="s", positive=True)
     for name, keys in _TABLES.items():
-        rows = own[name] if isinstance(own[name], Sequence) else [None]
+        given: Any = own[name]
+        rows = given if isinstance(given, Sequence) else [None]
         if not all(isinstance(one, Mapping) and {*keys} <= {*one} for one in rows):
             allowed = f"a list of dictionaries with {', '.join(keys)}"
-            bounds.refuse(f"{name} of the device", own[name], allowed)
+            bounds.refuse(f"{name} of the device", given, allowed)
 
 
 class SimulatedDevice:

@@ -54,7 +54,7 @@ def check_state(effect: Any, name: str, count: int) -> None:
         name: Name of the attribute.
         count: Number of simulations.
     """
-    value = getattr(effect, name, None)
+    value: Any = getattr(effect, name, None)
     array = isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
     if not array or value.shape[:1] != (count,):
         is_now = bounds.shown(value) if hasattr(effect, name) else "missing"
