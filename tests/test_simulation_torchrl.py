@@ -9,6 +9,7 @@ from torchrl.envs import DMControlEnv, FrameSkipTransform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from cathsim_dmc import suite
+from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.simulation.torchrl import BatchedEnv
 
@@ -228,3 +229,24 @@ def test_success_is_terminated_in_torchrl():
     assert last["reward"].item() == 10.0
     assert len(rollout) < 60
     env.close()
+
+
+def test_an_ended_simulation_without_a_snapshot_is_stepped_on():
+    class Odd(Effect):
+        """Its state becomes one that no snapshot can keep."""
+
+        state = ("numbers",)
+
+        def bind(self, world):
+            self.numbers = np.zeros(world.num_simulations)
+
+        def act(self, action, state):
+            self.numbers = 1.0
+            return action
+
+    options = {"max_steps": 1, "effects": [Odd()]}
+    env = BatchedEnv("simple1_bca", 1, num_threads=1, task_kwargs=options)
+    state = env.reset().update({"action": torch.zeros(1, 21)})
+    env.step(state.clone())
+    found = env.step(state)["next"]
+    assert found["done"].all() and not found["reward"].any()

@@ -354,8 +354,7 @@ class Callback:
     """A function that C calls, compiled when its address is first requested.
 
     Attributes:
-        left_out: Whether its address is 0 in this process, which then does not compile
-            it.
+        left_out: Whether it is not compiled in this process; its address is 0 then.
     """
 
     left_out = False

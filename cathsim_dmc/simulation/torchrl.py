@@ -199,7 +199,7 @@ class BatchedEnv(EnvBase):
         """Keeps the ends of simulations that are about to be stepped on."""
         new = np.array([n for n in np.flatnonzero(self._ended) if n not in self._kept])
         # `snapshot` raises where a device has none, or an effect's state has no copy.
-        with contextlib.suppress(NotImplementedError, TypeError):
+        with contextlib.suppress(NotImplementedError, TypeError, ValueError):
             if len(new):
                 ends = self.simulation.snapshot(new)
                 self._kept |= {n: ends[k] for k, n in enumerate(new.tolist())}

@@ -94,7 +94,8 @@ class Navigation(composer.Task, NotCopied):
             config = dataclasses.replace(config, fluoroscopy=aimed)
         self.config = config
         self._random_state = bounds.random_state("random", random)
-        cases.check_objective(objective, scene)
+        if others is None:  # `compile_together` checks those of several scenes
+            cases.check_objective(objective, scene)
         cases.check_shift(objective, config.randomisation)
         self.num_actions = len(scene.catheter.action_names)
         self.observation_names = observations.resolve(
