@@ -1,4 +1,4 @@
-"""Policies and data sets by hf:OWNER/NAME, against a folder with the hub's layout.
+"""Policies and datasets by hf:OWNER/NAME, against a folder with the hub's layout.
 
 The hub's own client reads them, from its cache; what it uploads lands in that cache.
 """

@@ -1,6 +1,6 @@
-"""Policies and data sets on the Hugging Face Hub: `hf:OWNER/NAME@COMMIT`.
+"""Policies and datasets on the Hugging Face Hub: `hf:OWNER/NAME@COMMIT`.
 
-Policies are safetensors with a card in JSON, data sets HDF5 or .npz: no file that can
+Policies are safetensors with a card in JSON, datasets HDF5 or .npz: no file that can
 run code is downloaded. Downloads are pinned to a commit and kept in the hub's cache,
 which is also read without a network.
 """
@@ -16,7 +16,7 @@ PREFIX = "hf:"
 _FORM = re.compile(
     r"hf:(?P<repository>[\w.-]+/[\w.-]+)(@(?P<commit>[0-9a-f]{40}))?(#(?P<name>[\w-]+))?"
 )
-# Files of a data set that are downloaded, by their paths in the repository.
+# Files of a dataset that are downloaded, by their paths in the repository.
 _DATASET = ("data/*.hdf5", "data/metadata.json", "*.npz")
 
 
@@ -92,7 +92,7 @@ def policy(text: str) -> Path:
 
 
 def dataset(text: str) -> Path:
-    """Download a data set; return its directory; raises as `policy`."""
+    """Download a dataset; return its directory; raises as `policy`."""
     place = parse(text)
     extras.require("hub", "huggingface_hub")
     from huggingface_hub import snapshot_download

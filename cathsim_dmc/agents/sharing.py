@@ -1,4 +1,4 @@
-"""Upload to a hub: policies with a card and a page, data sets."""
+"""Upload to a hub: policies with a card and a page, datasets."""
 
 import json
 import shutil
@@ -30,11 +30,11 @@ tags: [endovascular-navigation, reinforcement-learning, robotics, mujoco, dm_con
 
 
 def upload(source: str | Path, text: str, *, private: bool = True) -> str:
-    """Upload a policy or a data set to the hub.
+    """Upload a policy or a dataset to the hub.
 
     Args:
         source: A run, a checkpoint, "pretrained:NAME" or a `.safetensors` file with its
-            card; or the directory of a data set or of recorded episodes.
+            card; or the directory of a dataset or of recorded episodes.
         text: "hf:OWNER/NAME".
         private: Whether a repository that is made is private.
 
@@ -69,7 +69,7 @@ def upload(source: str | Path, text: str, *, private: bool = True) -> str:
 
 
 def _data_of(source: str | Path) -> list[Path]:
-    """Return the files of a data set; none if the source is a policy."""
+    """Return the files of a dataset; none if the source is a policy."""
     folder = Path(source)
     if not folder.is_dir() or (folder / "checkpoints").exists():
         return []

@@ -25,7 +25,7 @@ _LONGEST = 1500  # characters of an error
 COMMANDS = {
     "train": ("training:command", "Train an agent."),
     "list": ("listing:show", "List the tasks, or the devices with their properties."),
-    "dataset": ("recordings:dataset", "Write labelled fluoroscopy as a data set."),
+    "dataset": ("recordings:dataset", "Write labelled fluoroscopy as a dataset."),
     "eval": ("agents:evaluate", "Evaluate a policy: success, reward, forces."),
     "table": ("result_tables:table", "Compare evaluations as a table in Markdown."),
     "submit": ("agents:submit", "Write a file for the leaderboard."),
@@ -37,7 +37,7 @@ COMMANDS = {
         "Repeat the control step of a physics error.",
     ),
     "play": ("agents:play", "Cannulate by hand, with the forces on the screen."),
-    "upload": ("sharing:upload", "Upload a policy or a data set to a hub."),
+    "upload": ("sharing:upload", "Upload a policy or a dataset to a hub."),
     "serve": ("bridging:serve", "Serve a task as a device over TCP."),
     "drive": ("bridging:drive", "Drive a device over TCP with a trained policy."),
     "doctor": ("checks:doctor", "Check the installation; list remedies."),

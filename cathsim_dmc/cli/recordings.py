@@ -34,9 +34,9 @@ def dataset(
     Of random arches, or of the anatomies that are given.
 
     Args:
-        out: Folder of the data set; the same command continues an interrupted run.
+        out: Folder of the dataset; the same command continues an interrupted run.
         processes: Number of processes; one per core by default.
-        options: Content of the data set.
+        options: Content of the dataset.
     """
     with told_of_losses():
         done = write(out, options, processes=processes, say=say, on_cluster=ray)

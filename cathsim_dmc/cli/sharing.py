@@ -17,13 +17,13 @@ def upload(
     /,
     public: bool = False,
 ) -> int:
-    """Upload a policy or a data set to the Hugging Face Hub; print its reference.
+    """Upload a policy or a dataset to the Hugging Face Hub; print its reference.
 
     Log in before (`hf auth login`). Extra `hub`.
 
     Args:
         source: Directory of a run or checkpoint, pretrained:NAME or a .safetensors
-            file; or the directory of a data set of `cathsim demos`, or of episodes of
+            file; or the directory of a dataset of `cathsim demos`, or of episodes of
             `cathsim play`.
         place: hf:OWNER/NAME; the repository is created if it does not exist.
         public: Whether a repository that is created is public.

@@ -69,18 +69,18 @@ class WallForce(NamedTuple):
 
     The means correspond to a load cell that is read at 25 Hz. Reward terms, `safe
     success`, the observation `force` and the expert use them, because they hardly
-    depend on the physics step.
+    depend on the time step.
 
     Attributes:
-        sum: (...), sum of the magnitudes of all contacts, last substep.
-        max: (...), largest single contact, last substep; a concave wall may have two
-            contacts at one place.
-        peak_sum: (...), largest sum of any substep of the control step; it depends
-            on the physics step, see `PEAK_NOTE`.
-        peak_max: (...), largest single contact of any substep; likewise.
-        mean_sum: (...), mean over the substeps of the sum over all contacts; `sum`
+        sum: (...), sum of the magnitudes of all contacts, last physics step.
+        max: (...), largest single contact, last physics step; a concave wall may have
+            two contacts at one place.
+        peak_sum: (...), largest sum of any physics step of the control step; it depends
+            on the time step, see `PEAK_NOTE`.
+        peak_max: (...), largest single contact of any physics step; likewise.
+        mean_sum: (...), mean over the physics steps of the sum over all contacts; `sum`
             before the first control step.
-        mean_max: (...), mean over the substeps of the largest single contact.
+        mean_max: (...), mean over the physics steps of the largest single contact.
     """
 
     sum: np.ndarray
@@ -99,7 +99,10 @@ NAMES = tuple(f"wall_force_{name}" for name in WallForce._fields)
 
 
 def wall_force(rows: np.ndarray) -> tuple[WallForce, np.ndarray]:
-    """Summarises the sensor's rows (N, S, K * 14) of the S substeps of a control step.
+    """Summarises the rows of the sensor over a control step.
+
+    Args:
+        rows: (N, S, K * 14) of S physics steps and K contacts.
 
     Returns:
         Forces, arrays (N,), and the depth (N,) of the deepest contact, m.

@@ -20,7 +20,7 @@ class Readings(NamedTuple):
     """State of the device after a control step.
 
     Positions and velocities of joints are those at the end of the step. MuJoCo derives
-    all other quantities at the start of the last substep, one physics step (some 4 ms)
+    all other quantities at the start of the last physics step (some 4 ms)
     earlier. World frame, SI units, float64. J joints, L links.
 
     Attributes:

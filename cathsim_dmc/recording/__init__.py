@@ -1,1 +1,1 @@
-"""Recording of episodes, and their files: npz, Rerun, Minari, image data sets."""
+"""Recording of episodes, and their files: npz, Rerun, Minari, image datasets."""

@@ -106,7 +106,7 @@ def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[An
                     "num_keypoints": known[row],
                 })  # fmt: skip
         if pictures and not (folder := path.with_suffix("")).exists():
-            # Another process of this data set may have written the same ones meanwhile.
+            # Another process of this dataset may have written the same ones meanwhile.
             with (
                 contextlib.suppress(FileExistsError),
                 files.atomic_directory(folder) as temporary,

@@ -1,4 +1,4 @@
-"""A data set of labelled fluoroscopy: a folder with a split by anatomy.
+"""A dataset of labelled fluoroscopy: a folder with a split by anatomy.
 
     OUT/README.md                      data card
     OUT/dataset.json                   options, and the anatomies of each split
@@ -38,7 +38,7 @@ Labels = dict[str, list[Any]]  # as `coco.labels` returns them
 
 @dataclasses.dataclass(frozen=True)
 class _Shard:
-    """One anatomy of a data set."""
+    """One anatomy of a dataset."""
 
     folder: Path
     split: str
@@ -64,7 +64,7 @@ def write(
     say: Callable[[str], None] = lambda text: None,
     on_cluster: bool = False,
 ) -> dict[str, Any]:
-    """Writes a data set, or the missing part of an interrupted one.
+    """Writes a dataset, or the missing part of an interrupted one.
 
     Args:
         out: folder, which must not exist unless a run with these options has begun it.
@@ -76,7 +76,7 @@ def write(
             processors of one kind.
 
     Returns:
-        "path" of the data set; "frames", number of images of each split, with those of
+        "path" of the dataset; "frames", number of images of each split, with those of
         earlier runs; of this run "new", number of images, "seconds", wall time, and
         "processor", time of all processes of this machine, s; "frames_per_second" and
         "frames_per_processor_second", new images per second of either time.
@@ -135,7 +135,7 @@ def _begin(out: Path, options: ImageSetOptions) -> None:
     files.require_folder(out if out.exists() else out.parent)
     described = out / "dataset.json"
     if out.exists() and not described.is_file() and any(out.iterdir()):
-        raise ValueError(f"{out} is not empty and no data set; choose another folder")
+        raise ValueError(f"{out} is not empty and no dataset; choose another folder")
     if described.is_file() and (begun := files.read_text(described)) != text:
         raise ValueError(
             f"{described} says that {out} was begun with other options or another "

@@ -61,7 +61,7 @@ Warp = tuple[np.ndarray, float]
 
 @dataclasses.dataclass(frozen=True)
 class ImageSetOptions:
-    """Content of a data set.
+    """Content of a dataset.
 
     Attributes:
         sequences: Number of motions in each anatomy.
