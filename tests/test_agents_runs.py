@@ -112,6 +112,8 @@ def test_what_is_no_function_is_refused_before_the_work(tmp_path):
     for wrong in (made, None):
         with pytest.raises(ValueError, match="make_env is .*; it must be a function"):
             evaluate("push", "simple1_bca", 1, make_env=wrong)
+        with pytest.raises(ValueError, match="make_env is .*; it must be a function"):
+            run(small_ppo(), tmp_path / "run", make_env=wrong)
     with pytest.raises(ValueError, match="of make_env is None; it must be an EnvBase"):
         evaluate("push", "simple1_bca", 1, make_env=lambda *_, **options: None)
 
@@ -121,7 +123,7 @@ def test_metrics_that_cannot_be_read_stop_a_run(tmp_path, trained, content):
     shutil.copytree(trained / "ppo", tmp_path / "run")
     (tmp_path / "run" / "metrics.csv").write_bytes(content)
     with pytest.raises(ConfigError, match="metrics.csv holds no metrics"):
-        run(small_ppo(), tmp_path / "run", resume=True, make_env=None)
+        run(small_ppo(), tmp_path / "run", resume=True)
     assert (tmp_path / "run" / "metrics.csv").read_bytes() == content
 
 

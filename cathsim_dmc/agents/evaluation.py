@@ -112,8 +112,7 @@ def evaluate(
                 "simulation_device (--simulation-device), or on_cluster (--ray)"
             )
         cluster.connect()
-    if isinstance(make_env, EnvBase) or not callable(make_env):
-        bounds.refuse("make_env", make_env, "a function, as agents.make_env is")
+    environments.require_factory(make_env)
     make = functools.partial(make_env, **place)
     if out_dir is not None:
         # Checked first: an evaluation that cannot be written would be lost.

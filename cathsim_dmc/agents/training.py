@@ -113,6 +113,7 @@ def train(
     run = files.as_path("out_dir", out_dir)
     call = on_checkpoint or (lambda checkpoint: None)
     require(callable(call), "on_checkpoint", call, "a function of a directory, or None")
+    environments.require_factory(make_env)
     check_usable(config)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_only_process(run))

@@ -9,6 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl import envs
 from torchrl.data import Bounded, Composite, Unbounded
 
+from cathsim_dmc import bounds
+
 # All numeric entries of an observation, concatenated in the order of their names.
 # Not called "state": TorchRL gives that name a meaning of its own.
 VECTOR = "observation_vector"
@@ -49,6 +51,12 @@ def make_env(
     options |= {"seed": seed, "device": device}
     env = BatchedEnv(task, num_envs, num_threads=num_threads, **options)
     return standard_observations(env)
+
+
+def require_factory(make_env: Any) -> None:
+    """ValueError unless `make_env` is a function; environments are callable, too."""
+    if isinstance(make_env, envs.EnvBase) or not callable(make_env):
+        bounds.refuse("make_env", make_env, "a function, as agents.make_env is")
 
 
 def record_errors(env: envs.EnvBase, folder: str | Path) -> None:
