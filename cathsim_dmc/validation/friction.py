@@ -161,6 +161,7 @@ class Capstan(NamedTuple):
     free: float = 1.0  # the same without friction: bending dissipates a little
     travel: np.ndarray = np.zeros(1)  # (n,), travel of the base, m
     ratio: np.ndarray = np.zeros(1)  # (n,), ratio of the tensions
+    bent: np.ndarray = np.ones(1)  # (n,), the same without friction, at that travel
 
     @property
     def expected(self) -> float:
@@ -208,7 +209,8 @@ def capstan(friction: float, wrap: float = np.pi) -> Capstan:
     """
     (angle, travel, ratio), (_, way, free) = _pulled(friction, wrap), _pulled(0.0, wrap)
     mean, without = float(ratio[travel > _LEAD].mean()), float(free[way > _LEAD].mean())
-    return Capstan(friction, angle, mean, without, travel, ratio)
+    bent = np.interp(travel, way, free)
+    return Capstan(friction, angle, mean, without, travel, ratio, bent)
 
 
 def _pulled(

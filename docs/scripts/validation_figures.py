@@ -189,17 +189,20 @@ def wall(anatomies, capstans, studies):
     )
     ax.legend(frameon=False, fontsize=8)
     ax = axes[1]
-    for colour, one in zip(COLOURS * 2, capstans, strict=False):
+    for colour, one in zip(style.COLOURS, capstans, strict=False):
+        expected, end = np.log(one.expected), 1e3 * one.travel[-1]
+        ratio = np.log(one.ratio - one.bent + 1)  # the tip bends more easily
+        ax.plot(1e3 * one.travel, ratio, color=colour, linewidth=1)
+        ax.axhline(expected, color=colour, linestyle="--", linewidth=1)
         label = f"μ = {one.friction:g}, {np.degrees(one.angle):.0f}°"
-        ax.plot(1e3 * one.travel, one.ratio, color=colour, label=label)
-        ax.axhline(one.expected, color=colour, linestyle="--", linewidth=1)
+        ax.text(1.03 * end, expected, label, va="center", fontsize=7, clip_on=False)
     ax.set(
         title="Rod pulled over a drum of 50 mm radius",
-        ylim=(1, 2.5),
+        xlim=(0, 1e3 * max(one.travel[-1] for one in capstans)),
+        ylim=(0, 1.2 * np.log(max(one.expected for one in capstans))),
         xlabel="travel of the base, mm",
-        ylabel="tension ratio (dashed: exp μθ)",
+        ylabel="log. of tensions by friction (dashed: μθ)",
     )
-    ax.legend(frameon=False, fontsize=8)
     return figure
 
 
