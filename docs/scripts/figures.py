@@ -30,11 +30,12 @@ ORIGIN = ("command", "date", "machine", "commit")
 QUOTED = re.compile(r"<!-- = (.+?)(?: \{(\S+)\})? -->(.*?)<!-- -->", re.DOTALL)
 REPORT = re.compile(r"<!-- report (\w+) -->")
 # Rows of the table of training.md on force in the reward, and their trainings.
-_LARGEST_SUM = {
+_WITH_FORCE = {
     "imitation": "dagger-internal-published",
     "gentle": "ppo-internal-tuned-gentle",
     "control": "ppo-internal-tuned-control",
 }
+_FORCE_TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
 _VARIED = re.compile(r"\b(?:\w+_\w+|type\d|patient)\b(?: in \w+_\w+)?|\d+(?:\.\d+)?")
 
 
@@ -140,31 +141,31 @@ def figures() -> dict[str, dict]:
             found[name] = {"value": check["value"], "unit": check["unit"], **source}
         for name, value in _leaves(path.stem, report.get("findings", {})):
             found[name] = {"value": value, "unit": "", **source}
-    return found | _largest_sums()
+    return found | _forces_by_reward()
 
 
-def _largest_sums() -> dict[str, dict]:
-    """Largest sum of all wall forces, mean over episodes, of the trained policies."""
+def _forces_by_reward() -> dict[str, dict]:
+    """Forces of the trained policies by seed, means over episodes, mN."""
     found = {}
-    for row, training in _LARGEST_SUM.items():
-        for path in sorted((ROOT / "results").glob(f"*-{training}-seed0.json")):
+    for row, training in _WITH_FORCE.items():
+        for path in sorted((ROOT / "results").glob(f"*-{training}-seed*.json")):
             result = json.loads(path.read_text())
-            task, machine = result["cell"]["task"], result["machine"]
+            cell, machine = result["cell"], result["machine"]
+            if cell["task"] not in _FORCE_TASKS:
+                continue
             model, finished = machine["processor"] or "?", result["finished"]
             commit, mark = result["commit"][:7], result["commit"][40:]
             source = {
-                "command": f"python benchmarks/trainings.py --only {task}-{training}",
+                "unit": "mN",
+                "command": f"python benchmarks/trainings.py --only {path.stem}",
                 "date": finished.partition("T")[0],
                 "machine": f"{machine['cores']} × {model}",
                 "commit": commit + mark,
             }
-            sums = result["evaluation"]["episodes"]["largest_sum"]
-            value = 1e3 * statistics.fmean(sums)
-            found[f"largest sum: {task}: {row}"] = {
-                "value": value,
-                "unit": "mN",
-                **source,
-            }
+            for name, key in (("largest sum", "largest_sum"), ("mean", "mean_force")):
+                value = 1e3 * statistics.fmean(result["evaluation"]["episodes"][key])
+                place = f"{name}: {cell['task']}: {row}, seed {cell['seed']}"
+                found[place] = {"value": value, **source}
     return found
 
 

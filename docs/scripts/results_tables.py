@@ -24,7 +24,8 @@ FAILURES = """\
 
 - The episodes of a task differ only by 1 mm of the start, so a success of 100 % does
   not extend to other conditions: [robustness](robustness.md) and the
-  [leaderboard](leaderboard.md) have distinct conditions. Most rows have one seed.
+  [leaderboard](leaderboard.md) have distinct conditions. Of {trained} pairs of an agent
+  and a task, {once} have one seed.
 - Simulator, walls and force readings of the publication differ ([physics](physics.md)):
   success rates can be compared, forces only in their order of magnitude.
 """
@@ -94,7 +95,8 @@ def failures(table):
         if theirs and ours and np.mean(ours) > theirs["max_force"][0]:
             values = f"{1e3 * np.mean(ours):.0f} / {1e3 * theirs['max_force'][0]:.0f}"
             louder.append((f"`{task}`", name, values))
-    lines = [FAILURES]
+    counts = [len(found) for of_task in table.values() for found in of_task.values()]
+    lines = [FAILURES.format(trained=len(counts), once=counts.count(1))]
     if rows:
         lines += [
             "Policies that miss the goal in some episodes, worst first (seeds):",
