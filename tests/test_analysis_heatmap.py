@@ -59,17 +59,22 @@ def test_the_picture_shows_contacts_where_they_are(tmp_path):
         heatmap(np.zeros((1, 3)), np.ones(1), tube, tmp_path / "map.pdf")
 
 
-def test_the_scale_is_in_mn_and_unknown_sides_of_a_patient_are_not_named(
+def test_the_scales_are_in_mm_and_mn_and_unknown_sides_of_a_patient_are_not_named(
     tmp_path, monkeypatch
 ):
-    drawn = []
+    drawn, tube, path = [], make_tube(), tmp_path / "map.png"
+    ends = 1e3 * np.array([tube.vertices.min(0), tube.vertices.max(0)])[:, [0, 2]]
     monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: drawn.append(self))
     for upright in (True, False):
         place, force = np.zeros((1, 3)), np.full(1, 0.5)
         with contextlib.suppress(RuntimeError):  # nothing is written
-            heatmap(place, force, make_tube(), tmp_path / "map.png", upright=upright)
+            heatmap(place, force, tube, path, title="A map", upright=upright)
         axes, bar = drawn[-1].axes
         assert bar.get_ylim() == (0.0, 500.0) and "mN" in bar.get_ylabel()
+        vessel, *_, cells = axes.collections
+        outline = np.concatenate([one.vertices for one in vessel.get_paths()])
+        np.testing.assert_allclose([outline.min(0), outline.max(0)], ends)
+        assert np.nanmax(cells.get_array()) == 500.0 and axes.get_title() == "A map"
         assert ("left" in axes.get_xlabel()) == upright
         assert ("head" in axes.get_ylabel()) == upright
 

@@ -105,9 +105,11 @@ def test_what_cannot_be_repeated_is_refused(episodes, tmp_path):
     first, second = episodes
     other = dataclasses.replace(second, task="type1_lcca")
     moved = dataclasses.replace(first, reward=first.reward + 1e-3)
+    longer = {**second.meta, "task_kwargs": {"max_steps": 10}}
     for given, options, message in (
         ([], {}, "at least one Episode"),
         ([first, other], {}, "of its own"),
+        ([first, dataclasses.replace(second, meta=longer)], {}, "of its own"),
         ([dataclasses.replace(first, seed=None)], {}, "seed None"),
         ([moved], {}, "does not repeat"),
         ([first], {"max_steps": 2}, "ends at step 1 instead of 5"),

@@ -319,6 +319,7 @@ def test_annotations_of_coco_have_ids_from_one_on(path):
     """COCO's own evaluation takes an annotation of id 0 for an unmatched one."""
     many = [each["id"] for n in (0, 1) for each in coco.labels(path, n)["annotations"]]
     assert min(many) == 1 and len(set(many)) == len(many)
+    assert {type(one) for one in many} == {int}
 
 
 def test_each_image_of_coco_has_its_camera_and_its_sequence(path, rows):
