@@ -156,6 +156,10 @@ def test_an_anatomy_is_told_by_its_lumen_not_by_its_path(tmp_path, monkeypatch):
     one, other = (each["anatomy"] for each in found.differences())
     assert one != other and one.startswith("scan ")
     assert "anatomy: scan " in repr(found)
+    one = found.rows[0].result
+    settings = {**one.settings, "lumens": ["a 1", "b 2"]}
+    pool = comparison.rules_of(dataclasses.replace(one, settings=settings))
+    assert pool["anatomy"] == ["a 1", "b 2"]
 
 
 def test_the_notes_tell_rules_apart_that_differ_late_in_a_long_value(tmp_path):

@@ -327,9 +327,14 @@ def test_the_page_is_written_without_what_is_refused(
     "out, task, message",
     [("one.txt", "type1_lcca", r"give a \.json file"), ("one.json", "none", "task is")],
 )
-def test_bad_submissions_are_refused_before_they_are_played(out, task, message):
+def test_bad_submissions_are_refused_before_they_are_played(
+    monkeypatch, out, task, message
+):
+    monkeypatch.setattr(submission.evaluation, "evaluate", None)
     with pytest.raises(ValueError, match=message):
         submission.submit("push", out, task)
+    with pytest.raises(ValueError, match=r"give a \.npz file"):
+        submission.record_actions("push", out, task)
 
 
 @pytest.fixture(scope="module")

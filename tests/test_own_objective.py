@@ -186,6 +186,7 @@ def test_a_goal_that_cannot_be_shifted_is_refused():
 
 
 NUMBERS = np.zeros(2)
+GOOD = Outcome(NUMBERS, NUMBERS > 0, {"near": NUMBERS})
 
 
 @pytest.fixture(scope="module")
@@ -231,12 +232,11 @@ def test_an_outcome_that_is_none_is_refused_by_the_name_of_its_objective(
     judged, changes, words
 ):
     batch, answer = judged
-    good = Outcome(NUMBERS, NUMBERS > 0, {"near": NUMBERS})
-    answer(good)
+    answer(GOOD)
     assert not batch.step(pushing(0)[0]).terminated.any()
     with pytest.raises(ValueError, match=rf"Advance returns .*{words}.*Outcome\("):
-        answer(good._replace(**changes))
-    for other in (None, "x", tuple(good)):
+        answer(GOOD._replace(**changes))
+    for other in (None, "x", tuple(GOOD)):
         with pytest.raises(ValueError, match=r"Advance returns .*Outcome\("):
             answer(other)
 
@@ -267,23 +267,27 @@ def test_a_goal_that_is_no_place_is_refused(goal):
         [0.1, 0.1],
         np.zeros(3),
         np.zeros((2, 1)),
-        np.full(2, np.nan),
-        -np.ones(2),
+        np.array([0.1, np.nan]),
+        np.array([0.1, -0.1]),
     ],
 )
-def test_a_distance_along_the_route_that_is_none_is_refused(distance):
-    task = advancing()
-    task.objective.path_distance = lambda head: distance
+def test_a_distance_along_the_route_that_is_none_is_refused(
+    judged, monkeypatch, distance
+):
+    batch, answer = judged
+    answer(GOOD)
+    monkeypatch.setattr(batch.task.objective, "path_distance", lambda head: distance)
     words = r"path_distance\(\) of Advance returns .*finite.*\(2,\)"
     with pytest.raises(ValueError, match=words):
-        BatchSimulation(task, 2, num_threads=1).reset()
+        batch.reset()
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_path_ratio_is_finite_where_the_route_has_no_length():
-    task = advancing()
-    task.objective.path_distance = lambda head: np.zeros(2)
-    batch = BatchSimulation(task, 2, num_threads=1)
+def test_a_path_ratio_is_finite_where_the_route_has_no_length(judged, monkeypatch):
+    batch, answer = judged
+    answer(GOOD)
+    own = batch.task.objective
+    monkeypatch.setattr(own, "path_distance", lambda head: np.zeros(2))
     assert batch.reset().path_ratio.tolist() == [0.0, 0.0]
     step = batch.step(np.ones((2, batch.num_actions)))
     assert np.isfinite(step.path_ratio).all() and (step.path_ratio > 0).all()

@@ -401,10 +401,9 @@ def test_drives_get_no_more_than_the_largest_action():
     gained = BatchSimulation(suite.make_task(TASK, effects=[Gain()]), 1)
     plain.reset(), gained.reset()
     push = np.zeros((1, plain.num_actions))
-    push[:, -1] = 1.0
-    for _ in range(6):
+    for push[:, -1] in 6 * [1.0] + 3 * [-1.0]:
         one, other = plain.step(push), gained.step(push)
-        assert gained.rollout._action[0, -1] == 1.0
+        assert gained.rollout._action[0, -1] == push[0, -1]
         np.testing.assert_array_equal(other.readings.head, one.readings.head)
 
 

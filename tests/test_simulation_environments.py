@@ -62,7 +62,7 @@ def test_every_face_takes_its_specs_from_the_table_without_an_episode(monkeypatc
     assert tuple(batched.reset()["info"].keys()) == tuple(task.info_types)
 
 
-def test_a_task_satisfies_torchrl_and_gives_what_was_asked():
+def test_a_task_satisfies_torchrl_and_gives_what_was_asked(tmp_path):
     env = make_env(
         TASK, observation=("sequential", "tracking"), num_envs=2, num_threads=1,
         task_kwargs={"max_steps": 5},
@@ -83,6 +83,8 @@ def test_a_task_satisfies_torchrl_and_gives_what_was_asked():
     # The new episode begins with a history of its own: three equal images.
     fresh = steps["pixels"][:, 5]
     assert torch.equal(fresh[:, 0], fresh[:, 2])
+    environments.record_errors(env, tmp_path)
+    assert env.base_env.simulation.error_files.folder == tmp_path
 
 
 def test_a_task_trains_and_evaluates(tmp_path):
@@ -107,6 +109,14 @@ def test_images_of_different_sizes_are_refused_by_name():
             observation=["image", "endoluminal"],
             task_kwargs={"fluoroscopy": {"size": 64}},
         )
+
+
+def test_images_become_the_channels_in_the_order_of_their_names():
+    images = {
+        name: torch.full((1, 8, 6, n), n).byte() for n, name in ((2, "b"), (1, "a"))
+    }
+    seen = environments.standard(images, 1)[environments.PIXELS]
+    assert seen.shape == (1, 3, 8, 6) and seen[0, :, 0, 0].tolist() == [1, 2, 2]
 
 
 def test_a_policy_of_images_names_those_of_another_size():
