@@ -57,10 +57,11 @@ def test_ppo_learns_to_reach(tmp_path):
     assert rewards[-1] > rewards[1] + 15
 
 
-def test_an_annealed_learning_rate_falls_in_a_line_to_nothing(tmp_path):
+def test_an_annealed_learning_rate_falls_in_a_line_to_nothing(tmp_path, capsys):
     config = small_ppo(anneal=True, num_envs=8, total_frames=1_024, epochs=1)
     sizes = dict.fromkeys(("steps_per_update", "metrics_frames"), 256)
-    run(config.replace(**sizes), tmp_path)
+    run(config.replace(**sizes), tmp_path, progress=True)
+    assert ": 1024 frames [" in capsys.readouterr().err
     rates = [row["learning_rate"] for row in read_metrics(tmp_path / "metrics.csv")]
     assert rates == pytest.approx([1e-3, 0.75e-3, 0.5e-3, 0.25e-3])
 
