@@ -29,6 +29,11 @@ def example():
     return module
 
 
+@pytest.fixture(scope="module")
+def scene():
+    return suite.make_task("simple1_lcca").scene
+
+
 class Advance:
     """No relative of `Cannulation`: pays for insertion, done at 20 mm of it."""
 
@@ -244,8 +249,7 @@ def test_an_outcome_that_is_none_is_refused_by_the_name_of_its_objective(
 @pytest.mark.parametrize(
     "name", ["goal", "goal_radius", "terms", "outcome", "path_distance"]
 )
-def test_an_objective_that_lacks_something_is_told_what(name):
-    scene = suite.make_task("simple1_lcca").scene
+def test_an_objective_that_lacks_something_is_told_what(scene, name):
     parts = {n: v for n, v in vars(Advance).items() if n != name and n[0] != "_"}
     parts |= {} if name == "goal" else {"goal": scene.goal.position}
     with pytest.raises(ValueError, match=rf"Partial lacks {name}; .*path_distance"):
@@ -253,8 +257,7 @@ def test_an_objective_that_lacks_something_is_told_what(name):
 
 
 @pytest.mark.parametrize("goal", [None, "lcca", np.zeros(2), np.full(3, np.nan)])
-def test_a_goal_that_is_no_place_is_refused(goal):
-    scene = suite.make_task("simple1_lcca").scene
+def test_a_goal_that_is_no_place_is_refused(scene, goal):
     with pytest.raises(ValueError, match=r"goal of Advance is .*finite.*3\)"):
         Navigation(scene, Advance(goal), NavigationConfig())
 
