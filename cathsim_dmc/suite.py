@@ -232,7 +232,7 @@ def load(
         domain_name: "cathsim", or any other domain of dm_control.suite.
         task_name: Name of a task of the domain, see `SUITE`.
         task_kwargs: Options of the task: `random` (a seed), and see `make_task`.
-        environment_kwargs: Arguments of `composer.Environment`.
+        environment_kwargs: Arguments of `environment`.
         visualize_reward: Has no effect.
 
     Raises:
@@ -262,7 +262,8 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
 
     Args:
         task: Task that no other environment owns.
-        **environment_kwargs: Arguments of `composer.Environment`.
+        **environment_kwargs: Arguments of `composer.Environment` other than
+            `random_state` and `n_sub_steps`, which the task determines.
 
     Raises:
         ValueError: if another environment owns the task, or it has no such argument.
@@ -270,7 +271,8 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
     if hasattr(task, "rollout"):
         raise ValueError(f"{task!r} has an environment already; make another task")
     known = [*inspect.signature(composer.Environment).parameters][1:]
-    known.remove("random_state")  # the task's
+    for name in ("random_state", "n_sub_steps"):  # the task's
+        known.remove(name)
     bounds.mapping("environment_kwargs", environment_kwargs, known)
     _check_settings(environment_kwargs)
     settings = {
@@ -287,14 +289,11 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
 
 def _check_settings(settings: Mapping[str, Any]) -> None:
     """Checks arguments of `composer.Environment`, which checks none of them."""
-    endless = {"time_limit": math.inf, "n_sub_steps": None}
     for name, value in settings.items():
-        plain = isinstance(value, float | None)  # arrays have no truth value
-        if plain and name in endless and value == endless[name]:
-            continue
         if name == "time_limit":
-            bounds.number(name, value, unit="s", positive=True)
-        elif name in ("max_reset_attempts", "n_sub_steps"):
+            if not (isinstance(value, float) and value == math.inf):
+                bounds.number(name, value, unit="s", positive=True)
+        elif name == "max_reset_attempts":
             bounds.whole(name, value, 1)
         elif name == "delayed_observation_padding":
             bounds.instance(name, value, composer.ObservationPadding)

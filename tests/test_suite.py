@@ -294,10 +294,21 @@ def test_a_task_has_one_environment_with_known_settings(shared_environment):
         suite.environment(task)
     with pytest.raises(ValueError, match="environment_kwargs.*time_limit"):
         suite.environment(twin(task), flat_observation=True)
+    with pytest.raises(ValueError, match="n_sub_steps.*a mapping with some of"):
+        suite.environment(twin(task), n_sub_steps=5)
     with pytest.raises(ValueError, match="lead is 0.2, which only several"):
         suite.make_task("type1_lcca", lead=0.2)
     with pytest.raises(ValueError, match="task is 'type1_bca'"):
         BatchSimulation("type1_bca", 2)
+
+
+def test_time_steps_that_are_set_on_a_task_are_refused():
+    task = suite.make_task("simple1_bca")
+    for steps in (0.02, 4e-3), (0.04, 2e-3):
+        task.set_timesteps(*steps)
+        for make in suite.environment, lambda task: BatchSimulation(task, 1):
+            with pytest.raises(ValueError, match="option physics_timestep"):
+                make(task)
 
 
 def test_a_step_keeps_the_axis_of_the_buffer(shared_environment):

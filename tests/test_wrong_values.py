@@ -60,8 +60,7 @@ def test_checks_return_what_they_are_given_up_to_their_bounds():
     [
         *(("time_limit", value) for value in (-1, 0, math.nan, "a", True, None, [])),
         *(("max_reset_attempts", value) for value in (0, -1, 1.5, "a", None)),
-        *(("n_sub_steps", value) for value in (0, "a")),
-        *((name, np.ones(2)) for name in ("time_limit", "n_sub_steps")),
+        ("time_limit", np.ones(2)),
         ("time_limit", np.timedelta64(1)),
         ("legacy_step", "no"),
         ("fixed_initial_state", 1),
@@ -75,7 +74,7 @@ def test_wrong_settings_of_an_environment_are_refused(name, value):
 
 
 def test_an_environment_may_have_no_time_limit():
-    suite._check_settings({"time_limit": math.inf, "n_sub_steps": None})
+    suite._check_settings({"time_limit": math.inf})
     suite._check_settings({"time_limit": 0.1, "max_reset_attempts": 3})
 
 

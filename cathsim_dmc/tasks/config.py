@@ -171,6 +171,15 @@ class NavigationConfig:
             _check_fields(own, devices, chain.coaxial)
         return [blood, *released, model, delay, *walls, *own, devices]
 
+    def check_timesteps(self, control: float, physics: float) -> None:
+        """Raise ValueError unless a task has the time steps, s, of its options."""
+        if (control, physics) != (CONTROL_TIMESTEP, self.physics_timestep):
+            raise ValueError(
+                f"the task has a control step of {control:g} s and a physics step of "
+                f"{physics:g} s; a control step lasts {CONTROL_TIMESTEP:g} s, and the "
+                "option physics_timestep of suite.make_task sets the physics step"
+            )
+
     def _check_devices(self):
         if self.devices is None:
             self._check_alone("devices")

@@ -110,7 +110,12 @@ class Navigation(composer.Task, NotCopied):
         self._step: Step | None = None
 
     def make_rollout(self, model: mujoco.MjModel, stepper: Stepper) -> Rollout:
-        """Returns a rollout of the task in the simulations of a stepper."""
+        """Returns a rollout of the task in the simulations of a stepper.
+
+        Raises:
+            ValueError: if a time step has been set since the task was made.
+        """
+        self.config.check_timesteps(self.control_timestep, self.physics_timestep)
         chosen = self._cases or [
             cases.Case(self._scene, self._objective, model, self.config)
         ]
@@ -191,7 +196,6 @@ class Navigation(composer.Task, NotCopied):
 
     def action_spec(self, physics) -> dm_env.specs.BoundedArray:
         """Bounds [-1, 1] for each actuator."""
-        del physics
         names = self._scene.catheter.action_names
         return dm_env.specs.BoundedArray(
             shape=(len(names),),
@@ -203,7 +207,6 @@ class Navigation(composer.Task, NotCopied):
 
     def after_compile(self, physics, random_state):
         """Makes the stepper and the rollout of the compiled model."""
-        del random_state
         model = physics.model.ptr
         data, fields = physics.data.ptr, self.data_fields
         if rehearsal.is_due(self.config):
@@ -251,7 +254,6 @@ class Navigation(composer.Task, NotCopied):
 
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
-        del random_state
         self._require(physics)
         self._current()  # measures the start if no observable has done so
         self.rollout.command(bounds.actions(action, (self.num_actions,))[None])
@@ -263,12 +265,10 @@ class Navigation(composer.Task, NotCopied):
 
     def after_substep(self, physics, random_state):
         """Keeps the contacts of a physics step."""
-        del physics, random_state
         self.stepper.keep()
 
     def after_step(self, physics, random_state):
         """Decides reward, success and end of the episode, once."""
-        del physics, random_state
         self._step = self.rollout.finish()
 
     def _current(self) -> Step:
@@ -289,17 +289,14 @@ class Navigation(composer.Task, NotCopied):
 
     def get_reward(self, physics) -> float:
         """Reward of the last control step, 0 if the physics failed in it."""
-        del physics
         return float(self._current().outcome.reward[0])
 
     def get_discount(self, physics) -> float:
         """0 where the task ends the episode; 1 otherwise, also at time-out."""
-        del physics
         return 0.0 if self._current().terminated[0] else 1.0
 
     def should_terminate_episode(self, physics) -> bool:
         """Whether the episode has ended."""
-        del physics
         return self.termination is not None
 
     # State of the task.
