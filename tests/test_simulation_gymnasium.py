@@ -326,11 +326,10 @@ def test_a_vector_refuses_wrong_seeds_and_masks_and_shows_each_simulation():
         assert one.environment._physics is None
     with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="make another"):
         one.reset()
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        one.step(one.action_space.sample())
     step = functools.partial(many.step, many.action_space.sample())
+    alone = functools.partial(one.step, one.action_space.sample())
     restore = functools.partial(one.restore, state)
-    for use in (many.reset, step, many.snapshot, one.snapshot, restore):
+    for use in (many.reset, step, alone, many.snapshot, one.snapshot, restore):
         with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="another"):
             use()
 

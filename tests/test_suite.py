@@ -311,6 +311,21 @@ def test_time_steps_that_are_set_on_a_task_are_refused():
                 make(task)
 
 
+def test_a_closed_environment_says_so(shared_environment):
+    environment = suite.environment(twin(shared_environment("type1_lcca").task))
+    environment.reset()
+    snapshot = environment.snapshot()
+    environment.close()
+    environment.close()
+    for call, *arguments in (
+        (environment.reset,),
+        (environment.step, np.zeros(21)),
+        (environment.restore, snapshot),
+    ):
+        with pytest.raises(RuntimeError, match="is closed; make another one"):
+            call(*arguments)
+
+
 def test_a_step_keeps_the_axis_of_the_buffer(shared_environment):
     task = shared_environment("type1_lcca").task
     environment = suite.environment(twin(task), strip_singleton_obs_buffer_dim=False)

@@ -125,6 +125,7 @@ class CathSimEnv(gymnasium.Env):
 
     def step(self, action: np.ndarray):
         """Advances by one control step; see `gymnasium.Env.step`."""
+        _require_open(self._closed)
         if self._ended is not False:
             raise gymnasium.error.ResetNeeded(
                 "the episode has ended, or none has begun; call reset()"
@@ -172,8 +173,7 @@ class CathSimEnv(gymnasium.Env):
 
     def close(self) -> None:
         """Frees the simulator; closing twice does nothing."""
-        if not self._closed:
-            self.environment.close()
+        self.environment.close()
         self._closed, self._ended = True, None
 
 

@@ -27,7 +27,11 @@ class Environment(composer.Environment, NotCopied):
 
         Returns:
             The first time step.
+
+        Raises:
+            RuntimeError: if the environment is closed.
         """
+        self._require_open()
         self._reset_next_step = True  # also if this reset raises
         before = self._hooks._initialize_episode_mjcf  # noqa: SLF001
         changes = _overridden(self.task, "initialize_episode_mjcf")
@@ -43,7 +47,11 @@ class Environment(composer.Environment, NotCopied):
 
         Returns:
             The time step; the first one of a new episode if the last one has ended.
+
+        Raises:
+            RuntimeError: if the environment is closed.
         """
+        self._require_open()
         enabled = self._observation_updater._enabled_structure  # noqa: SLF001
         self._watched, plain = self._is_watched(), isinstance(enabled, dict)
         if (
@@ -134,7 +142,9 @@ class Environment(composer.Environment, NotCopied):
 
         Raises:
             ValueError: if the snapshot is of another task, or of several simulations.
+            RuntimeError: if the environment is closed.
         """
+        self._require_open()
         task, physics = self.task, self._physics_proxy
         if not task.rollout.begun or task.rollout.half_done.any():
             self.reset()
@@ -146,6 +156,15 @@ class Environment(composer.Environment, NotCopied):
             self._reset_next_step = False
             return dm_env.restart(observation)
         return self._time_step(observation)
+
+    def close(self) -> None:
+        """Frees the simulation; closing twice does nothing."""
+        if self._physics is not None:
+            super().close()
+
+    def _require_open(self) -> None:
+        if self._physics is None:
+            raise RuntimeError("the environment is closed; make another one")
 
     def __repr__(self) -> str:
         """The task and how long a control step is."""
