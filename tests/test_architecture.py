@@ -4,6 +4,7 @@ import ast
 import functools
 import graphlib
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -135,6 +136,14 @@ def home(path):
 
 def test_every_part_is_in_the_contract():
     assert {home(path) for path in modules()} <= set(ALLOWED)
+
+
+def test_the_page_names_files_that_exist():
+    page = (PACKAGE.parent / "docs" / "architecture.md").read_text()
+    named = set(re.findall(r"`(?:[a-z_]+/)*([a-z_]+\.py)`", page))
+    root = PACKAGE.parent
+    there = {path.name for top in (PACKAGE, root / "tests") for path in top.rglob("*")}
+    assert len(named) > 50 and named <= there, named - there
 
 
 def test_the_contract_has_no_circles():
