@@ -41,8 +41,6 @@ __version__ = "0.3.0.dev0"
 # MuJoCo's window library warns at import on a machine without a display. Only viewers
 # need a display, and they raise errors of their own.
 warnings.filterwarnings("ignore", message=".*DISPLAY environment variable is missing.*")
-# TorchRL 0.14 warns of classes of its own at import.
-warnings.filterwarnings("ignore", message=".*WeightUpdaterBase is deprecated.*")
 
 _SUBMODULES = (
     "agents",

@@ -313,6 +313,16 @@ def test_imports_leave_the_environment_as_it_is():
 
 
 @pytest.mark.slow
+def test_agents_warn_of_nothing_after_the_suite():
+    """dm_control has the deprecation warnings of all packages shown."""
+    done = run(
+        "from cathsim_dmc import suite\nfrom cathsim_dmc import agents",
+        MUJOCO_GL="disable",
+    )
+    assert done.returncode == 0 and not done.stderr, done.stderr
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["egl", "osmesa"])
 def test_agents_import_before_dm_control_with_opengl(backend):
     """The other order ends in a segmentation fault inside triton."""

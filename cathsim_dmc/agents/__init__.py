@@ -3,6 +3,7 @@
 # isort: off
 import os
 import sys
+import warnings
 
 # With OpenGL, loading dm_control before torchrl ends in a segmentation fault inside
 # triton. The other order is safe, and so is any order without OpenGL.
@@ -17,7 +18,9 @@ if (
         "MUJOCO_GL=disable"
     )
 
-# Imports the collectors too: after dm_control they print deprecation warnings.
+# TorchRL 0.14 warns of classes of its own at import; dm_control has all deprecation
+# warnings shown, unless a filter is added after its import.
+warnings.filterwarnings("ignore", message=".*WeightUpdaterBase is deprecated.*")
 import torchrl.collectors  # noqa: F401
 
 # isort: on
