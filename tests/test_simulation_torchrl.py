@@ -178,6 +178,11 @@ def test_batched_seeds(batched):
     assert torch.equal(start(2)[:-1], first[1:])
 
 
+def test_a_reset_has_no_seed(batched):
+    with pytest.raises(TypeError, match=r"not seed; set_seed\(seed\)"):
+        batched.reset(seed=3)
+
+
 def test_only_what_is_done_is_reset(batched):
     batched.set_seed(0)
     tensordict = batched.reset()

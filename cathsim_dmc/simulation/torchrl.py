@@ -163,6 +163,11 @@ class BatchedEnv(EnvBase):
         snapshot: Snapshot | None = None,
         **kwargs,
     ) -> TensorDict:
+        if kwargs:
+            raise TypeError(
+                f"reset() of BatchedEnv takes a snapshot, not {', '.join(kwargs)}; "
+                "set_seed(seed) gives the simulations their seeds"
+            )
         if snapshot is not None:
             step = self.simulation.restore(snapshot)
             self._kept.clear()
