@@ -1,4 +1,4 @@
-"""Gymnasium ids of the tasks, registered when this module is imported.
+"""Gymnasium ids of all tasks, from the import of this module on.
 
 `gymnasium.make("cathsim_dmc.gym:cathsim/type1_bca-v0")` imports it by itself, and
 `gymnasium.make_vec` with the same id makes many simulations in one batch.
@@ -15,15 +15,23 @@ except ModuleNotFoundError as error:
 
 VERSION = 0  # the same as in simulation.gymnasium, which is imported late
 # Names of the tasks by Gymnasium id.
-IDS = {f"{suite.DOMAIN}/{task}-v{VERSION}": task for task in suite.SUITE}
+IDS: dict[str, str] = {}
 
 _MODULE = "cathsim_dmc.simulation.gymnasium"
 
-for _id, _task in IDS.items():
-    if _id not in gymnasium.registry:
+
+def _register(task: str) -> None:
+    name = f"{suite.DOMAIN}/{task}-v{VERSION}"
+    IDS[name] = task
+    if name not in gymnasium.registry:
         gymnasium.register(
-            _id,
+            name,
             f"{_MODULE}:CathSimEnv",
             vector_entry_point=f"{_MODULE}:CathSimVectorEnv",
-            kwargs={"task": _task},
+            kwargs={"task": task},
         )
+
+
+for _task in suite.SUITE:
+    _register(_task)
+suite.LISTENERS.append(_register)

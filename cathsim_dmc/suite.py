@@ -10,7 +10,7 @@ import inspect
 import math
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,8 @@ _CONFIG_FIELDS = tuple(field.name for field in dataclasses.fields(NavigationConf
 _TAKEN = "random", "environment_kwargs", "anatomy", "goal", "access", *OF_ARCHES
 
 TASKS: dict[str, TaskDefinition] = {}
+# Functions that are called with the name of each task that is registered.
+LISTENERS: list[Callable[[str], None]] = []
 
 
 def register(name: str, definition: TaskDefinition, *tags: str) -> None:
@@ -83,6 +85,8 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
     factory.__name__, factory.__doc__ = name, definition.description
     SUITE.add(*tags, _TAG)(factory)
     _register_domain()
+    for listen in LISTENERS:
+        listen(name)
 
 
 def known(name: Any, modules: Sequence[str] | None = None) -> str:

@@ -1,6 +1,7 @@
 """Tasks of one's own on the command line: `--import`, entry points, kept names."""
 
 import dataclasses
+import importlib
 import json
 import sys
 import textwrap
@@ -124,6 +125,14 @@ def test_a_task_of_a_class_of_ones_own_is_loaded_by_dm_control(forget):
     assert lasts == [False, False, True]
     with pytest.raises(ValueError, match="Timed overrides should_terminate_episode"):
         BatchSimulation(suite.make_task("own_time"), 2)
+
+
+def test_a_task_of_ones_own_has_an_id_of_gymnasium(forget):
+    gymnasium = pytest.importorskip("gymnasium")
+    ids = importlib.import_module("cathsim_dmc.gym").IDS  # before the task is there
+    suite.register("own_id", suite.TASKS["simple1_bca"])
+    assert ids["cathsim/own_id-v0"] == "own_id"
+    assert gymnasium.spec("cathsim/own_id-v0").kwargs == {"task": "own_id"}
 
 
 OBJECTIVE = """
