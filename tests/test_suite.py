@@ -219,22 +219,31 @@ def test_steps_in_one_loop_are_those_of_composer(shared_environment):
         environment.close()
 
 
-def test_a_subclass_of_the_task_gets_its_after_substep(shared_environment):
+@pytest.mark.parametrize("settings", [{}, {"raise_exception_on_physics_error": True}])
+@pytest.mark.parametrize("calls_super", [True, False])
+def test_a_subclass_of_the_task_gets_its_after_substep(
+    shared_environment, calls_super, settings
+):
     task = shared_environment("type1_lcca").task
     times = []
 
     class Sampled(Navigation):
         def after_substep(self, physics, random_state):
-            super().after_substep(physics, random_state)
+            if calls_super:
+                super().after_substep(physics, random_state)
             times.append(physics.time())
 
-    own = suite.environment(Sampled(task.scene, task.objective, task.config, 0))
+    own = Sampled(task.scene, task.objective, task.config, 0)
+    own = suite.environment(own, **settings)
     alone = suite.environment(twin(task))
     for environment in (own, alone):
         environment.reset()
     seen = [env.step(np.ones(21)).observation for env in (own, alone)]
     assert len(times) == task.substeps
     assert_bitwise_equal(seen[:1], seen[1:])
+    rows = [env.task.stepper.contact_rows for env in (own, alone)]
+    assert rows[1][:, 1:].any()
+    np.testing.assert_array_equal(*rows)
     for environment in (own, alone):
         environment.close()
 

@@ -291,6 +291,7 @@ class SingleStepper(Stepper):
     Attributes:
         data: The simulation.
         stopped: Whether MuJoCo has warned in this control step, which ends it.
+        substep: Number of physics steps of this control step whose contacts are kept.
     """
 
     has_snapshots = True
@@ -312,19 +313,19 @@ class SingleStepper(Stepper):
         self._sensor = data.sensordata[self._contacts]
         # Contacts of each physics step; 0 where there is none.
         self._rows = np.zeros((substeps, len(self._sensor)))
-        self._substep, self._size = 0, mujoco.mj_stateSize(model, _STATE)
+        self.substep, self._size = 0, mujoco.mj_stateSize(model, _STATE)
         self.stopped, self._known_warnings = False, b""  # of the control step
 
     def begin(self, control: np.ndarray) -> None:
         """Begins a control step with the control (1, U) of all its physics steps."""
         super().begin(control)
-        self._substep, self.stopped = 0, False
+        self.substep, self.stopped = 0, False
         self._known_warnings = self._warnings_before.tobytes()
 
     def keep(self) -> None:
         """Keeps the contacts of the last physics step."""
-        self._rows[self._substep] = 0.0 if self.stopped else self._sensor
-        self._substep += 1
+        self._rows[self.substep] = 0.0 if self.stopped else self._sensor
+        self.substep += 1
 
     @property
     def contact_rows(self) -> np.ndarray:
@@ -356,17 +357,17 @@ class SingleStepper(Stepper):
     def step(self) -> None:
         """Does a physics step, and keeps its contacts."""
         self.advance()
-        self._substep += 1
+        self.substep += 1
 
     def run(self) -> None:
         """Does all physics steps of a control step."""
         for row in self._rows:
             self._advance(row)
-        self._substep = self.substeps
+        self.substep = self.substeps
 
     def advance(self) -> None:
         """Does a physics step; none after a warning, as in a batch."""
-        self._advance(self._rows[self._substep])
+        self._advance(self._rows[self.substep])
 
     def _advance(self, row: np.ndarray) -> None:
         if not self.stopped:

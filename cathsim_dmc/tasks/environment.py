@@ -105,6 +105,7 @@ class Environment(composer.Environment, NotCopied):
         the episode.
         """
         stepper = self.task.stepper
+        number = stepper.substep
         if self._composed:
             super()._substep(action)
         elif not self._watched or stepper.stopped:
@@ -113,10 +114,10 @@ class Environment(composer.Environment, NotCopied):
             physics, random_state = self._physics_proxy, self._random_state
             self._hooks.before_substep(physics, action, random_state)
             stepper.advance()
-            if stepper.stopped:
-                stepper.keep()
-            else:
+            if not stepper.stopped:
                 self._hooks.after_substep(physics, random_state)
+        if stepper.substep == number:  # after_substep of a subclass need not call super
+            stepper.keep()
 
     def snapshot(self) -> Snapshot:
         """Returns the state between two steps; an episode continues from it exactly.
