@@ -248,6 +248,20 @@ def test_a_subclass_of_the_task_gets_its_after_substep(
         environment.close()
 
 
+def test_an_episode_that_a_subclass_does_not_begin_is_refused(shared_environment):
+    task = shared_environment("type1_lcca").task
+
+    class Own(Navigation):
+        def initialize_episode(self, physics, random_state):
+            pass
+
+    env = suite.environment(Own(task.scene, task.objective, task.config, 0))
+    env.reset()
+    with pytest.raises(RuntimeError, match="no episode has begun.*super"):
+        env.step(np.zeros(21))
+    env.close()
+
+
 def test_a_warning_beside_a_hook_repeats_the_control_step(shared_environment):
     env = suite.environment(twin(shared_environment("type1_lcca").task))
     times = []

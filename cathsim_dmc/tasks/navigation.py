@@ -255,7 +255,7 @@ class Navigation(composer.Task, NotCopied):
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
         self._require(physics)
-        self._current()  # measures the start if no observable has done so
+        self._measured()  # measures the start if no observable has done so
         self.rollout.command(bounds.actions(action, (self.num_actions,))[None])
 
     @property
@@ -284,7 +284,8 @@ class Navigation(composer.Task, NotCopied):
     def _measured(self) -> Step:
         """As `_current`; RuntimeError before the first episode."""
         if self._compiled and not self.rollout.begun:
-            raise RuntimeError("no episode has begun; call reset() first")
+            own = "initialize_episode of a subclass calls that of super()"
+            raise RuntimeError(f"no episode has begun; call reset() first; {own}")
         return self._current()
 
     def get_reward(self, physics) -> float:
