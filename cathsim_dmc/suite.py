@@ -258,7 +258,7 @@ def load(
     )
 
 
-def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environment:
+def environment(task: Navigation, **environment_kwargs: Any) -> Environment:
     """Returns the composer environment of a task, with the settings of the suite.
 
     The MJCF model of the task is compiled once, here; later changes of the model have

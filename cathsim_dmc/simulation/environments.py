@@ -39,7 +39,8 @@ def make_env(
 
     Returns:
         An environment with "observation_vector" (num_envs, n) float32 and/or
-        "pixels" (num_envs, c, h, w) uint8.
+        "pixels" (num_envs, c, h, w) uint8, and "step_count" (num_envs, 1) int64, the
+        control steps since the episode began.
 
     Raises:
         ValueError: the task or one of its options is unknown.
@@ -150,6 +151,8 @@ class StandardObservation(envs.Transform):
 
 def standard_observations(env: envs.EnvBase) -> envs.TransformedEnv:
     """Wraps an environment so that it observes VECTOR and/or PIXELS, see `standard`.
+
+    It counts the steps of an episode in "step_count", too.
 
     Nested entries (forces and other information) are not part of the observation and do
     not change; double precision becomes single.
