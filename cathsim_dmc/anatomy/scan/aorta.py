@@ -26,6 +26,10 @@ LOOP = np.radians(140.0)  # least bend of an arch with a single visible branch
 # THIRD_OF_TAPERED holds if an end of the aorta is narrower than TAPERED of its width.
 THIRD, THIRD_OF_TAPERED, TAPERED = 0.85, 0.65, 0.7
 TURN_OF_STUMP = np.radians(60.0)  # least bend of an arch cut off past its branches
+# A limb that narrows to less than ARTERY of the width of the aorta before NEAR, and for
+# longer than LASTS (in radii of the aorta), is an artery of the arch: the aorta is cut
+# off beside it. An iliac artery begins farther from the arch.
+ARTERY, NEAR, LASTS = 0.5, 15.0, 3.0
 LEG = 80e-3  # m, compared length of each leg, from 10 mm past the branches
 # Limbs of the bend, m: the part next to the apex that is left out of the direction (at
 # most half), the length from which the direction counts, and the further length that
@@ -84,7 +88,30 @@ def find_aorta(
             f"degrees; an arch bends by {np.degrees(turn):.0f} or more: one of its "
             "limbs may be cut off"
         )
+    if thin := _artery(ways, way):
+        return None, (
+            f"the widest way, from {ends_of_it}, narrows to {mm(2.0 * thin):.1f} mm "
+            "near its bend, as an artery of the arch does: the aorta may be cut off "
+            "beside that"
+        )
     return pair, ""
+
+
+def _artery(ways: Ways, way: np.ndarray) -> float:
+    """Radius, m, of a limb of the path (n,) of nodes that is no aorta; 0 for none."""
+    points, depth = ways.points[way], ways.depth[way]
+    s, bend = arc_lengths(points), Bend.of(points)
+    apex = s[np.linalg.norm(points - bend.line[bend.apex], axis=1).argmin()]
+    wide = float(np.percentile(depth, 75.0))
+    broad = np.flatnonzero(depth > ARTERY * wide)
+    for limb, edge in (
+        (slice(0, broad[0]), s[broad[0]]),
+        (slice(broad[-1] + 1, None), s[broad[-1]]),
+    ):
+        lasts = ways.length(way[limb]) > LASTS * wide
+        if lasts and abs(edge - apex) < NEAR * wide:
+            return float(np.median(depth[limb]))
+    return 0.0
 
 
 @dataclass(frozen=True, eq=False)

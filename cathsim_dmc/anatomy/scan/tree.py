@@ -118,7 +118,10 @@ def _parent(curve, lines, vessels, field) -> tuple[str, int]:
     key = max(at, key=lambda name: at[name])
     # The wide vessel is the parent of curves that leave it side by side.
     while (vessel := vessels[key]).parent is not None:
-        if vessel.centreline.project(curve[at[key]]).arc_length > vessel.ostium:
+        place = vessel.centreline.project(curve[at[key]])
+        trunk = vessels[vessel.parent].centreline.project(curve[at[key]])
+        # A branch that turns back towards the place is no nearer than its parent.
+        if place.arc_length > vessel.ostium and place.distance < trunk.distance:
             break
         key = vessel.parent
     return key, at[key]
