@@ -182,3 +182,42 @@ def test_places_of_mending_are_those_of_the_file(tmp_path):
     notes = read_lumen(path, frame="RAS", axes="ILA").notes
     (filled,) = (note for note in notes if "holes filled" in note)
     assert filled.endswith(" cm")
+
+
+def with_sheet(profile, height, radius, missing=0):
+    """A profile that turns about z, and a sheet of triangles across it; mm."""
+    vertices, faces = revolved(*profile)
+    x, y, z = vertices.T
+    rim = np.flatnonzero((abs(z - height) < 1e-6) & (np.hypot(x, y) > 0.9 * radius))
+    rim = rim[np.argsort(np.arctan2(y[rim], x[rim]))]
+    middle = np.full(len(rim), len(vertices))
+    fan = np.stack([rim, np.roll(rim, -1), middle], axis=1)
+    fan[::2] = fan[::2, ::-1]  # the order of corners does not matter
+    vertices = np.concatenate([vertices, [(0.0, 0.0, height)]])
+    return vertices, np.concatenate([faces, fan[missing:]])
+
+
+@pytest.mark.parametrize("height", [60.0, 117.5])
+def test_a_cap_that_a_join_left_across_the_lumen_is_taken_out(height):
+    """Also near an end, where the body behind it is short."""
+    whole, _ = mended(*revolved(*CLOSED))
+    volume, notes = mended(*with_sheet(CLOSED, height, RADIUS))
+    assert volume == pytest.approx(whole, rel=1e-6)
+    assert "1 sheets across the lumen taken out" in notes
+
+
+def test_a_thin_branch_that_mending_cuts_through_is_not_dropped(monkeypatch):
+    """A sheet with a gap is cut out with its rim; beyond it are 2 % of the area."""
+    monkeypatch.setattr(repair, "NON_MANIFOLD", 0.05)
+    profile = (0, 0), (40, 0), (40, 100), (3, 100), (3, 160), (0, 160)
+    with pytest.raises(ValueError, match="2 separate parts"):
+        mended(*with_sheet(profile, 130.0, 3.0, missing=1))
+
+
+def test_a_body_in_the_lumen_is_no_inner_surface_of_a_wall():
+    """Such as a graft: the lumen around it is not taken for the outer surface."""
+    vessel = trimesh.creation.capsule(height=120.0, radius=8.0)
+    graft = trimesh.creation.capsule(height=30.0, radius=5.0)
+    whole = trimesh.util.concatenate([vessel, graft])
+    with pytest.raises(ValueError, match="2 separate parts.*Keep the largest island"):
+        mended(whole.vertices, whole.faces)

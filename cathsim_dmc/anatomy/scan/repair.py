@@ -6,6 +6,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import bodies, topology
+from cathsim_dmc.anatomy.scan.membranes import membranes
 from cathsim_dmc.anatomy.scan.places import cut_open
 from cathsim_dmc.anatomy.scan.units import enlargement, mm, shown
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
@@ -51,6 +52,7 @@ def mend(name: str, vertices: np.ndarray, faces: np.ndarray) -> Mended:
     work = _Work(name, vertices, faces)
     work.merge()
     work.keep_one_part()
+    work.open_membranes()
     work.cut_non_manifold()  # while triangles are small, so that holes are
     work.decimate()  # makes no edge with more than two triangles
     work.orient()
@@ -118,6 +120,17 @@ class _Work:
         )
         self.vertices, self.faces = points, faces
 
+    def open_membranes(self) -> None:
+        """Takes out sheets across the lumen, such as caps that a join has left."""
+        found = membranes(self.vertices, self.faces)
+        if found:
+            where = shown(self.vertices[self.faces[found[-1]]].mean(axis=(0, 1)))
+            self.notes.append(
+                f"{len(found)} sheets across the lumen taken out, the largest at "
+                f"{where}: if a vessel is closed there, close it at its end"
+            )
+            self._keep(~np.any(found, axis=0))
+
     def cut_non_manifold(self) -> None:
         """Cuts out the triangles at edges that more than two triangles share."""
         first = None
@@ -139,7 +152,9 @@ class _Work:
             self._cut_out(bad)
         if first:
             self.notes.append(f"{first}: the triangles around them cut out")
-            self._drop_small_parts()
+            # A vessel that is cut through here is no small part.
+            found = bodies.found(self.vertices, self.faces)
+            self._keep(np.isin(found.label, found.large))
 
     def _drop_small_parts(self) -> None:
         label = topology.parts(self.faces)

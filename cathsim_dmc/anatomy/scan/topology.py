@@ -17,6 +17,7 @@ TOUCH = 1e-6  # of an edge or a triangle: a hit this near to its border does not
 # Detection of the thick wall of a vessel.
 RAYS = 64
 ENCLOSED = 0.75  # share of rays that hit, above which a point is inside a vessel
+SPAN = 0.7  # least width of its inner surface, relative to that of its outer one
 WALL = 0.25  # enclosed share of its area, above which a surface is a wall
 EDGE = 0.6  # cosine between the normals of triangles at the rim of an open end
 SOME = 500  # triangles of the first, fast test
@@ -264,9 +265,13 @@ def inner_shell(
 ) -> int | None:
     """The part, of two `shells` (2,), that is inside the other; None if neither is.
 
-    Faces (F, 3) are labelled (F,) by their parts.
+    A body in the lumen, such as a graft, is shorter than the inner surface of a wall:
+    None, too. Faces (F, 3) are labelled (F,) by their parts.
     """
     one, other = shells.tolist()
+    wide = widths(vertices, faces, label)[shells]
+    if wide.min() < SPAN * wide.max():
+        return None
     first = inside(vertices, faces, label, other)[one]
     second = inside(vertices, faces, label, one)[other]
     if max(first, second) < 0.9 or min(first, second) > 0.5:
