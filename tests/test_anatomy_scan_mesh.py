@@ -507,6 +507,12 @@ def test_a_label_map_without_size_is_refused(tmp_path):
     nrrd.write(str(tmp_path / "bare.nrrd"), np.ones((4, 4, 4), np.uint8))
     with pytest.raises(ValueError, match="its header lacks 'space directions'"):
         read_lumen(tmp_path / "bare.nrrd")
+    steps = {"spacings": [0.5, 0.5, 3.0], "space": "left-posterior-superior"}
+    nrrd.write(str(tmp_path / "bare.nrrd"), np.ones((4, 4, 4), np.uint8), steps)
+    with pytest.raises(
+        ValueError, match=r"directions: \(0.5,0,0\) \(0,0.5,0\) \(0,0,3"
+    ):
+        read_lumen(tmp_path / "bare.nrrd")
 
 
 def test_what_is_no_label_map_is_refused(y_mesh, tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 from synthetic_scans import marched, write_markup, write_obj, y_tree
 from test_anatomy_scan_files import ball, poly_data, written
 
@@ -86,6 +87,22 @@ def test_a_label_map_without_orientation_asks(tmp_path):
     bare = {"space": None, "space dimension": 3}
     notes = label_surface(nrrd_map(tmp_path / "bare.nrrd", 1.0, **bare)).notes
     assert notes[1].startswith("question: its header names no space")
+
+
+@pytest.mark.parametrize(("turned", "asks"), [(0.0, False), (0.3, True)])
+def test_a_label_map_with_two_orientations_asks(tmp_path, turned, asks):
+    nibabel = pytest.importorskip("nibabel")
+    image = nibabel.Nifti1Image(ball(), np.diag((0.8, 0.9, 1.0, 1.0)))
+    other = image.affine.copy()
+    other[:3, :3] = Rotation.from_rotvec((0, 0, turned)).as_matrix() @ other[:3, :3]
+    image.set_qform(other, 1)
+    nibabel.save(image, tmp_path / "two.nii")
+    notes = label_surface(tmp_path / "two.nii").notes
+    found = [note for note in notes if "two orientations, sform and qform" in note]
+    assert len(found) == asks
+    if asks:  # the farthest corner turns by 0.3 rad
+        across = np.hypot(*np.array(image.shape[:2]) * (0.8, 0.9))
+        assert f"{2 * across * np.sin(0.15):.3g} mm apart; sform is taken" in found[0]
 
 
 def test_a_label_map_of_one_point_in_time_has_three_dimensions(tmp_path):

@@ -13,7 +13,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from cathsim_dmc import bounds
-from cathsim_dmc.anatomy.scan import voxel_files
+from cathsim_dmc.anatomy.scan import frames, voxel_files
 from cathsim_dmc.anatomy.scan.mesh import parsed
 from cathsim_dmc.anatomy.scan.units import UNITS, to_lps
 
@@ -246,13 +246,7 @@ def _nifti(path: Path) -> _Voxels:
     image: Any = nibabel.load(path)
     unit = _unit([image.header.get_xyzt_units()[0].replace("unknown", "")])
     affine = UNITS[unit or "mm"] * to_lps("m", "RAS") @ image.affine[:3]
-    frame = ""
-    if not (image.header["sform_code"] or image.header["qform_code"]):
-        frame = (
-            "question: its header gives no orientation (sform and qform are 0), so its "
-            "axes are taken as left, front and head, as old files have them. If they "
-            "are others, the patient is turned or mirrored: set them and import again"
-        )
+    frame = frames.of_nifti(image, 1e3 * UNITS[unit or "mm"])
     count = _require_few(image.shape)
     if path.suffix.lower() == ".gz":
         with path.open("rb") as stream:
@@ -281,15 +275,8 @@ def _nrrd(path: Path) -> _Voxels:
             pass
         _require_end(stream, count, str(header.get("encoding")))
     voxels, header = nrrd.read(str(path))
-    space, frame = header.get("space"), ""
-    if space is None:
-        space = "LPS"
-        frame = (
-            "question: its header names no space, so its axes are taken as left, back "
-            "and head (LPS). If they are others, the patient is turned or mirrored: "
-            "set it and import again"
-        )
-    letters = str(space).upper()
+    space, frame = frames.of_nrrd(header)
+    letters = space.upper()
     letters = "".join(re.findall(r"\b\w", letters)) if "-" in letters else letters
     if letters not in _SPACES:
         raise ValueError(
@@ -298,11 +285,7 @@ def _nrrd(path: Path) -> _Voxels:
         )
     unit = _unit(np.atleast_1d(header.get("space units", [])).tolist())
     to = np.diag(_SPACES[letters]) * UNITS[unit or "mm"]
-    if "space directions" not in header:
-        raise ValueError(
-            "its header lacks 'space directions', the size and place of its voxels"
-        )
-    rows = np.asarray(header["space directions"], dtype=float)
+    rows = frames.directions(header)
     origin = np.asarray(header.get("space origin", np.zeros(3)), dtype=float)
     names = {
         int(value): str(header.get(key.replace("_LabelValue", "_Name"), ""))
