@@ -36,7 +36,9 @@ WALL, BORE, MOTION = 104, 112, 120
 FAULT = 128
 # Offset of the parameters of a compliant wall in `userdata`, -1 for none.
 SHARING = 136
-WORDS, CAPACITY, SPAN = 18, 1 << 12, 1 << 52
+# Degree of freedom whose velocity is that of a moving wall, -1 for none.
+CLOCK = 144
+WORDS, CAPACITY, SPAN = 19, 1 << 12, 1 << 52
 SYMBOL = "cathsim_layouts"
 # Allocated before code that refers to the symbol is loaded.
 TABLE = symbol(SYMBOL, WORDS * CAPACITY).reshape(CAPACITY, WORDS)

@@ -23,6 +23,7 @@ from cathsim_dmc.collision.native import (
     word,
 )
 from cathsim_dmc.collision.own import (
+    CLOCK,
     FAULT,
     JOINTS,
     LINK,
@@ -157,12 +158,13 @@ def compliance(model, data, layout, start):
 def motion(model, data, layout, start):
     """Writes the wall's velocity into the Jacobian of its contacts.
 
-    MuJoCo computes the velocity of a contact as J qvel. The last degree of freedom of
-    the model has a velocity of 1 m/s in every physics step; its column of J gets the
-    velocity of the wall in the frame of each contact.
+    MuJoCo computes the velocity of a contact as J qvel. One degree of freedom, that of
+    `motion.add_clock`, has a velocity of 1 m/s in every physics step; its column of J
+    gets the velocity of the wall in the frame of each contact.
     """
     nv, wall = model_field(model, "nv"), word(layout + WALL)
-    data_field(data, "qvel")[nv - 1] = 1.0
+    clock = word(layout + CLOCK)
+    data_field(data, "qvel")[clock] = 1.0
     count, jacobian = data_field(data, "ncon"), data_field(data, "efc_J")
     if count == 0:
         return
@@ -184,7 +186,7 @@ def motion(model, data, layout, start):
         u, v, w = wall_velocity(there, (-frame[0], -frame[1], -frame[2]))
         for row in range(min(contact_field(contact, "dim")[0], 3)):
             speed = frame[3 * row] * u + frame[3 * row + 1] * v + frame[3 * row + 2] * w
-            jacobian[(first + row) * nv + nv - 1] = speed
+            jacobian[(first + row) * nv + clock] = speed
 
 
 @compiled

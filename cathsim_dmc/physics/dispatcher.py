@@ -55,12 +55,13 @@ def _passive(model, data):
 
 @_callback
 def _control(model, data):
-    """Zeroes `xfrc_applied`, then runs the laws that add to it."""
+    """Zeroes `xfrc_applied` of the links, then runs the laws that add to it."""
     call_before(address_of("cathsim_before_control"), model, data)
     layout = layout_of(model, data)
     if layout != 0 and word(word(layout + CONTROL)) > 0:
-        nbody = native.model_field(model, "nbody")
-        data_field(data, "xfrc_applied")[:nbody] = 0.0
+        first = word(layout + own.LINK)
+        last = first + word(layout + own.LINKS)
+        data_field(data, "xfrc_applied")[first:last] = 0.0
         _run(word(layout + CONTROL), model, data, layout)
 
 
@@ -108,6 +109,8 @@ class Places(NamedTuple):
             positions and their degrees of freedom.
         wall: Geom of the wall, -1 for none.
         bore: Geom of the bore of the sheath, -1 for none.
+        clock: Degree of freedom that moves the wall, see `adapters.motion`, -1 for
+            none.
     """
 
     first_link: int
@@ -115,6 +118,7 @@ class Places(NamedTuple):
     hinges: np.ndarray = np.zeros((3, 0))
     wall: int = -1
     bore: int = -1
+    clock: int = -1
 
     @classmethod
     def of(cls, model: mujoco.MjModel, index: ModelIndex) -> "Places":
@@ -125,7 +129,9 @@ class Places(NamedTuple):
         kind = mujoco.mjtObj.mjOBJ_GEOM
         wall = mujoco.mj_name2id(model, kind, "wall")
         bore = mujoco.mj_name2id(model, kind, "sheath/bore")
-        return cls(index.links.start, index.geoms, hinges, wall, bore)
+        ticks = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, "vessel_clock")
+        clock = -1 if ticks < 0 else int(model.jnt_dofadr[ticks])
+        return cls(index.links.start, index.geoms, hinges, wall, bore, clock)
 
 
 class Layout:
@@ -145,7 +151,7 @@ class Layout:
         start = {law.adapter: law.start for law in laws}
         where = np.concatenate([places.geoms, *places.hinges]).astype(np.int64)
         named = [(law.name, law.acts_in, law.start) for law in laws]
-        kind = repr((sizes, places.first_link, places[3:], where.tolist(), named))
+        kind = repr((sizes, places.first_link, places[3:5], where.tolist(), named))
         # Equal in every process, because the label is part of the saved state.
         number = int.from_bytes(hashlib.sha256(kind.encode()).digest()[:6], "big") + 1
         taken = own.TABLE[:, 0].view(np.float64)
@@ -168,6 +174,7 @@ class Layout:
             *(places.first_link, len(places.geoms), places.hinges.shape[1] // 2),
             *(where.ctypes.data, places.wall, places.bore),
             *(start.get(adapters.motion, -1), 0, start.get(adapters.compliance, -1)),
+            places.clock,
         )
         # The label is written last: other threads search the table concurrently.
         taken[slot] = self.label

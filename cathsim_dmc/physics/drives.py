@@ -43,11 +43,16 @@ class Drives:
             m and rad; a base in motion lags it.
     """
 
-    def __init__(self, model: mujoco.MjModel, arrays: Any):
-        """Finds the servos; `arrays` are lasting views (N, ...) of MuJoCo's arrays."""
-        found = np.flatnonzero(
-            model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR.value
-        )
+    def __init__(self, model: mujoco.MjModel, arrays: Any, driven: slice = slice(None)):
+        """Finds the servos.
+
+        Args:
+            arrays: Lasting views (N, ...) of MuJoCo's arrays.
+            driven: Actuators of the device; all by default.
+        """
+        integrator = mujoco.mjtDyn.mjDYN_INTEGRATOR.value
+        found = np.arange(model.nu)[driven]
+        found = found[model.actuator_dyntype[driven] == integrator]
         joints = model.actuator_trnid[found, 0]
         self._arrays, dofs = arrays, model.jnt_dofadr[joints]
         gain, spring = model.actuator_gainprm[found, 0], model.actuator_biasprm[found]
@@ -107,11 +112,13 @@ class Drives:
         return slip
 
 
-def hold(model: mujoco.MjModel, data: mujoco.MjData) -> Drives:
+def hold(
+    model: mujoco.MjModel, data: mujoco.MjData, driven: slice = slice(None)
+) -> Drives:
     """Returns the drives of one simulation, commanded to hold their bases in place."""
     names = ("qpos", "qvel", "act", "sensordata")
     arrays = {name: getattr(data, name)[None] for name in names}
-    drives = Drives(model, types.SimpleNamespace(**arrays))
+    drives = Drives(model, types.SimpleNamespace(**arrays), driven)
     drives.hold(0)
     return drives
 

@@ -71,8 +71,9 @@ class World:
         arrays: The state, arrays (N, ...) with MuJoCo's names: those of
             `ModelIndex.FIELDS` and of `Effect.data_fields`.
         field: Returns a field of one simulation's own model, to be written, by the
-            index of the simulation and MuJoCo's name of the field. ValueError for a
-            field that no effect has in its `model_fields`.
+            index of the simulation and MuJoCo's name of the field. It keeps its value
+            from episode to episode: `restart` scales that of `model`, not the last one.
+            ValueError for a field that no effect has in its `model_fields`.
         parameters: Parameters of the effect's law, `Effect.parameters` of views
             (N, ...). They are part of MuJoCo's state, and 0 when an episode begins.
     """

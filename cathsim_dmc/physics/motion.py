@@ -214,11 +214,7 @@ class Moving(Effect):
 
 
 def add_clock(root) -> None:
-    """Adds the body of the last degree of freedom, see `adapters.motion`.
-
-    Args:
-        root: MJCF of the complete scene; nothing may be attached to it afterwards.
-    """
+    """Adds the body whose velocity is that of the wall, see `adapters.motion`."""
     clock = root.worldbody.add("body", name="vessel_clock", gravcomp=1)
     inertia = [_CLOCK_MASS * 1e-4] * 3
     clock.add("inertial", pos=[0, 0, 0], mass=_CLOCK_MASS, diaginertia=inertia)

@@ -103,6 +103,7 @@ class ModelIndex:
         self.qpos = _as_slice(np.sort(model.jnt_qposadr[joints]))
         self.dofs = _as_slice(np.sort(model.jnt_dofadr[joints]))
         self._order = joints - joints.min()
+        self.driven = _as_slice(ids(model, chain.actuators))
         # (n - 1, 2), hinges about x and y.
         self.bends_qpos = model.jnt_qposadr[ids(model, chain.bends)].reshape(-1, 2)
         base = [each for each in (chain.insertion, chain.rotation) if each is not None]

@@ -60,7 +60,7 @@ class SingleDevice(Effect):
     def bind(self, world: World) -> None:
         """Finds the drives and the hinges in the model."""
         super().bind(world)
-        self._drives = Drives(world.model, world.arrays)
+        self._drives = Drives(world.model, world.arrays, world.index.driven)
         self.slipped, self.told = self._drives.slipped, self._drives.told
         model, places = world.model, world.index.bends_qpos
         joints, self._steering = len(places), None

@@ -36,6 +36,7 @@ class Stepper(abc.ABC):
         repeated: (N,) int, number of control steps repeated in shorter physics steps.
         deepest: Contact depth, m, above which a control step is repeated; None for
             `forces.DEEPEST`.
+        driven: Columns of `ctrl` that are the device's; others are the scene's own.
         num_simulations: N.
         substeps: S, physics steps in a control step.
         has_snapshots: Whether `kept` and `put_back` are supported.
@@ -43,6 +44,7 @@ class Stepper(abc.ABC):
 
     arrays: Any
     warnings: np.ndarray
+    driven = slice(None)
     has_snapshots = False
 
     def __init__(self, model: mujoco.MjModel, num_simulations: int, substeps: int):
@@ -108,7 +110,7 @@ class Stepper(abc.ABC):
 
     def begin(self, control: np.ndarray) -> None:
         """Begins a control step with the control (N, U) of all its physics steps."""
-        self.arrays.ctrl[:] = control
+        self.arrays.ctrl[:, self.driven] = control
         self.before = self.states()
         self._warnings_before = self.warnings.copy()
 
@@ -361,12 +363,15 @@ class SingleStepper(Stepper):
 
     def run(self) -> None:
         """Does all physics steps of a control step."""
+        self.before = self.states()  # with what hooks after `begin` have written
         for row in self._rows:
             self._advance(row)
         self.substep = self.substeps
 
     def advance(self) -> None:
         """Does a physics step; none after a warning, as in a batch."""
+        if not self.substep:
+            self.before = self.states()  # as in `run`
         self._advance(self._rows[self.substep])
 
     def _advance(self, row: np.ndarray) -> None:

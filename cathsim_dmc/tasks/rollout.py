@@ -94,7 +94,7 @@ class Rollout(Restorable):
         self.index = ModelIndex(model, scene.catheter, scene.robot)
         self._read = self.index.reader(state)
         self.effects = config.effects_on(scene.catheter)
-        stepper.deepest = config.vessel.deepest
+        stepper.deepest, stepper.driven = config.vessel.deepest, self.index.driven
         self.moving = of_kind(self.effects, Moving)
         self._devices = cast(SingleDevice, of_kind(self.effects, SingleDevice))
         self._world = world = World(

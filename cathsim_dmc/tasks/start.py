@@ -317,7 +317,7 @@ def _settle(
     data.qpos[index.bends_qpos] = joints_along(
         scene.catheter.link_lengths, scene.placement.line, at
     )
-    hold(model, data)
+    hold(model, data, index.driven)
     depth = scene.placement.start_depth
     with contextlib.ExitStack() as stack:
         if not scene.sheath.touches:

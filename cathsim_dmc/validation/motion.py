@@ -54,7 +54,7 @@ def begin(model: mujoco.MjModel, course: np.ndarray, bore: int = -1) -> mujoco.M
     """Data of a model whose wall moves with the parameters `course`."""
     data = mujoco.MjData(model)
     law = dispatcher.Law("motion", "contact", adapters.motion, 1)
-    places = dispatcher.Places(1, np.zeros(0), wall=0, bore=bore)
+    places = dispatcher.Places(1, np.zeros(0), wall=0, bore=bore, clock=model.nv - 1)
     data.userdata[1:9] = course[1:9]
     data.userdata[-1] = dispatcher.layout(model, places, [law]).label
     return data

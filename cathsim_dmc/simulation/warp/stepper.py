@@ -156,7 +156,7 @@ class WarpStepper(Stepper):
 
     def begin(self, control: np.ndarray) -> None:
         """Begins a control step with the control (N, U) of all its physics steps."""
-        self.arrays.ctrl[:] = control
+        self.arrays.ctrl[:, self.driven] = control
         self._begun = {
             n: rows.copied(getattr(self.arrays, n)) for n in (*_STATE, "time")
         }
