@@ -13,6 +13,7 @@ from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End
 from cathsim_dmc.collision import fields
+from cathsim_dmc.compiled import interpreted
 from cathsim_dmc.entities.contact import CONTACT_SOLIMP
 from cathsim_dmc.laws import contact, motion, moving_contact, places, planes, wall
 
@@ -322,7 +323,10 @@ def test_strain_along_a_tube_changes_nothing_where_a_link_touches_it(tube):
     found = np.zeros((2, planes.MOST, contact.CONTACT))
     samples, rows = np.empty(65), np.empty((planes.PLANES, 4))
     scratch = contact.Scratch(samples, rows)
-    count = contact.contacts(walls, capsule, law, sweep, scratch, found[0])
+    # Compilation for one capsule would take 5 s.
+    contacts = interpreted(contact.contacts)
+    moving_contacts = interpreted(moving_contact.moving_contacts)
+    count = contacts(walls, capsule, law, sweep, scratch, found[0])
     values = np.zeros((2, 2, 2, motion.VALUES))
     values[..., 2] = 0.05 * np.array([-0.1, 0.1])  # of the way along z
     lattice = np.concatenate([[-0.1] * 3, [0.2], [2.0] * 3, values.ravel()])
@@ -330,7 +334,7 @@ def test_strain_along_a_tube_changes_nothing_where_a_link_touches_it(tube):
     moved = moving_contact.MovingScratch(
         samples, rows, np.empty((motion.VALUES, 4)), np.empty(motion.WARP)
     )
-    assert count == moving_contact.moving_contacts(
+    assert count == moving_contacts(
         walls, capsule, law, sweep, (lattice, course), moved, found[1]
     )
     assert count > 0 and found[0, 0, 4] == pytest.approx(HALF)
