@@ -33,7 +33,6 @@ from cathsim_dmc.tasks.anatomies import lumens
 from cathsim_dmc.tasks.config import EVALUATION_SEED
 from cathsim_dmc.tasks.snapshot import Snapshot
 
-EnvFactory = Callable[..., EnvBase]
 # Called after every step with the environment and which episodes (n,) bool still run.
 Observer = Callable[[EnvBase, np.ndarray], None]
 
@@ -54,7 +53,7 @@ def evaluate(
     error_dir: str | Path | None = None,
     observer: Observer | None = None,
     start: Snapshot | None = None,
-    make_env: EnvFactory = environments.make_env,
+    make_env: environments.EnvFactory = environments.make_env,
     on_cluster: bool = False,
 ) -> EvaluationResult:
     """Play episodes with a policy in parallel, each with a seed of its own.
@@ -186,7 +185,7 @@ class _Plan:
         self,
         num_threads: int | None,
         error_dir: str | Path | None,
-        make_env: EnvFactory,
+        make_env: environments.EnvFactory,
         start: Snapshot | None,
     ) -> list["_Group"]:
         """Returns a group for the episodes of each part."""
@@ -248,7 +247,7 @@ class _Group:
     rows: range
     player: Policy
     varied: bool
-    make_env: EnvFactory
+    make_env: environments.EnvFactory
     errors: Path | None
     num_threads: int | None
     torch_threads: int

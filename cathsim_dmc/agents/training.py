@@ -27,7 +27,6 @@ from cathsim_dmc.agents.checkpoint import (
 from cathsim_dmc.agents.collection import make_collector
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig, require
 from cathsim_dmc.agents.episodes import EpisodeTracker
-from cathsim_dmc.agents.evaluation import EnvFactory
 from cathsim_dmc.agents.interruption import noted_interruption
 from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.learners import LEARNERS, check_usable
@@ -35,6 +34,7 @@ from cathsim_dmc.agents.networks import NetworkShapes, bounded
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 from cathsim_dmc.agents.training_log import TrainingLog, crossed, read_metrics
 from cathsim_dmc.simulation import environments
+from cathsim_dmc.simulation.environments import EnvFactory
 from cathsim_dmc.tasks import observations
 
 CONFIG_FILE = "config.json"
@@ -144,13 +144,12 @@ def train(
 def _environment(config: TrainingConfig, make_env: EnvFactory, frames: int) -> EnvBase:
     """Make the environment of a run that has already collected `frames` frames."""
     # The seed depends on the frames, so that a resumed run gets new episodes.
-    stretch = [config.seed, frames]
-    seed = int(np.random.SeedSequence(stretch).generate_state(1)[0]) % 2**31
+    state = np.random.SeedSequence([config.seed, frames]).generate_state(1)
     try:
         return make_env(
             config.task, observation=config.collected_observation,
-            num_envs=config.num_envs, num_threads=config.num_threads, seed=seed,
-            task_kwargs=config.training_kwargs,
+            num_envs=config.num_envs, num_threads=config.num_threads,
+            task_kwargs=config.training_kwargs, seed=int(state[0]) % 2**31,
             **bounds.option_simulation_device(config.simulation_device),
         )  # fmt: skip
     except ValueError as error:

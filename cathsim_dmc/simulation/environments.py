@@ -1,6 +1,6 @@
 """TorchRL environments of the tasks, with observations for networks."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,8 @@ from cathsim_dmc import bounds
 VECTOR = "observation_vector"
 # Images, channels first, uint8.
 PIXELS = "pixels"
+# Function with the arguments of `make_env`.
+EnvFactory = Callable[..., envs.EnvBase]
 
 
 def make_env(

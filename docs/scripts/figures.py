@@ -35,7 +35,6 @@ _WITH_FORCE = {
     "gentle": "ppo-internal-tuned-gentle",
     "control": "ppo-internal-tuned-control",
 }
-_FORCE_TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
 _VARIED = re.compile(r"\b(?:\w+_\w+|type\d|patient)\b(?: in \w+_\w+)?|\d+(?:\.\d+)?")
 
 
@@ -151,8 +150,6 @@ def _forces_by_reward() -> dict[str, dict]:
         for path in sorted((ROOT / "results").glob(f"*-{training}-seed*.json")):
             result = json.loads(path.read_text())
             cell, machine = result["cell"], result["machine"]
-            if cell["task"] not in _FORCE_TASKS:
-                continue
             model, finished = machine["processor"] or "?", result["finished"]
             commit, mark = result["commit"][:7], result["commit"][40:]
             source = {

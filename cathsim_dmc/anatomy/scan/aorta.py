@@ -76,19 +76,19 @@ def find_aorta(
     if pair is None:
         return None, "the lumen has no two wide ends"
     ends_of_it = " and ".join(shown(ends[k].position) for k in pair)
-    wide, bent = np.median(ways.depth[way]), Bend.of(ways.points[way]).turn
+    wide, bend = np.median(ways.depth[way]), Bend.of(ways.points[way])
     if mm(wide) < 1e3 * RADIUS:
         return None, (
             f"the widest way, from {ends_of_it}, is {mm(2.0 * wide):.1f} mm wide; an "
             f"aorta has {2e3 * RADIUS:g} mm or more"
         )
-    if bent <= turn:
+    if bend.turn <= turn:
         return None, (
-            f"the widest way, from {ends_of_it}, bends by {np.degrees(bent):.0f} "
+            f"the widest way, from {ends_of_it}, bends by {np.degrees(bend.turn):.0f} "
             f"degrees; an arch bends by {np.degrees(turn):.0f} or more: one of its "
             "limbs may be cut off"
         )
-    if thin := _artery(ways, way):
+    if thin := _artery(ways, way, bend):
         return None, (
             f"the widest way, from {ends_of_it}, narrows to {mm(2.0 * thin):.1f} mm "
             "near its bend, as an artery of the arch does: the aorta may be cut off "
@@ -97,10 +97,10 @@ def find_aorta(
     return pair, ""
 
 
-def _artery(ways: Ways, way: np.ndarray) -> float:
+def _artery(ways: Ways, way: np.ndarray, bend: "Bend") -> float:
     """Radius, m, of a limb of the path (n,) of nodes that is no aorta; 0 for none."""
     points, depth = ways.points[way], ways.depth[way]
-    s, bend = arc_lengths(points), Bend.of(points)
+    s = arc_lengths(points)
     apex = s[np.linalg.norm(points - bend.line[bend.apex], axis=1).argmin()]
     wide = float(np.percentile(depth, 75.0))
     broad = np.flatnonzero(depth > ARTERY * wide)

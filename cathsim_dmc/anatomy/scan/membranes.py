@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cathsim_dmc.anatomy.scan.topology import adjacent, areas, groups, oriented
+from cathsim_dmc.anatomy.scan.topology import adjacent, areas, groups, oriented, sides
 
 FLAT = 0.7  # least area of a sheet across its mean normal, relative to its area
 
@@ -13,8 +13,9 @@ def membranes(vertices: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
     A sheet is flat and has its whole rim in the wall. Of two sheets, or of a sheet and
     the short end of a vessel behind it, the smaller one is taken.
     """
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    _, which, left = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    _, which, left = np.unique(
+        sides(faces), axis=0, return_inverse=True, return_counts=True
+    )
     which = which.reshape(-1, 3)
     times = left[which]
     if not (times > 2).any():

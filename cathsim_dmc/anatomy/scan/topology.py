@@ -97,8 +97,12 @@ def widths(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray) -> np.nda
 
 def edge_counts(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Edges (E, 2), lower vertex first, and the number (E,) of triangles at each."""
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    return np.unique(edges, axis=0, return_counts=True)
+    return np.unique(sides(faces), axis=0, return_counts=True)
+
+
+def sides(faces: np.ndarray) -> np.ndarray:
+    """Edges (3 F, 2), lower vertex first, three for each triangle."""
+    return np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
 
 
 def handles(faces: np.ndarray) -> int:
