@@ -4,6 +4,7 @@ Importing numba takes longer than loading a task. A function is therefore compil
 numba imported, at the first call.
 """
 
+import dis
 import functools
 import types
 from collections.abc import Callable
@@ -67,7 +68,7 @@ class _Compiled:
     def _calling(self, form: str) -> types.FunctionType:
         """The function, which calls the forms of compiled functions with that name."""
         function, own = self._function, dict(self._function.__globals__)
-        for name in _names(function.__code__):
+        for name in _global_names(function.__code__):
             if isinstance(own.get(name), _Compiled):
                 own[name] = getattr(own[name], form)
         held = (
@@ -170,7 +171,9 @@ def compile_first(function: Any) -> None:
     _Compiled.__call__ = call
 
 
-def _names(code: types.CodeType) -> set[str]:
-    """Returns the names that a code object and its nested functions refer to."""
+def _global_names(code: types.CodeType) -> set[str]:
+    """Returns the global names that a code object and its nested functions load."""
     inner = (each for each in code.co_consts if isinstance(each, types.CodeType))
-    return set(code.co_names) | {name for each in inner for name in _names(each)}
+    used = dis.get_instructions(code)
+    own = {each.argval for each in used if each.opname == "LOAD_GLOBAL"}
+    return own | {name for each in inner for name in _global_names(each)}
