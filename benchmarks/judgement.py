@@ -1,8 +1,10 @@
 """The published evaluation of a trained policy, as JSON."""
 
 import dataclasses
+import subprocess
 import time
 from importlib.metadata import version
+from pathlib import Path
 
 # torchrl must be imported before dm_control.
 from cathsim_dmc.agents.evaluation import EVALUATION_SEED, ContactLog, evaluate  # isort: skip
@@ -173,3 +175,11 @@ def numbers(values):
 def versions():
     """Versions of this package and of packages that results depend on."""
     return {name: version(name) for name in ("cathsim-dmc", *_PACKAGES)}
+
+
+def commit():
+    """Commit of the source tree, with "+" if files differ; None outside of git."""
+    head = ["describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"]
+    git = ["git", "-C", str(Path(__file__).parent), *head]
+    done = subprocess.run(git, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or None

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
+import judgement
 import numpy as np
 import torch
 import tyro
@@ -204,6 +205,7 @@ def play(policy: str, cell: Cell, player=None, threads: int | None = None) -> di
         ],
         "seconds": round(time.monotonic() - began, 1),
         "date": time.strftime("%Y-%m-%d"),
+        "commit": judgement.commit(),
     }
 
 

@@ -14,7 +14,6 @@ import fnmatch
 import json
 import os
 import platform
-import subprocess
 import sys
 import tempfile
 import time
@@ -226,7 +225,7 @@ def work(cell, runs, results, num_threads=None):
         },
         "evaluation": evaluation,
         "versions": judgement.versions(),
-        "commit": commit(),
+        "commit": judgement.commit(),
         "machine": {"processor": platform.processor(), "cores": os.cpu_count()},
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
@@ -277,14 +276,6 @@ def write_result(path, values):
         for name, value in values.items()
     ]
     return files.write_text(path, "{\n" + ",\n".join(lines) + "\n}\n")
-
-
-def commit():
-    """Commit of the source tree, with "+" if files differ; None outside of git."""
-    head = ["describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"]
-    git = ["git", "-C", str(HERE), *head]
-    done = subprocess.run(git, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or None
 
 
 def learning_curve(rows):
