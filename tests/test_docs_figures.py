@@ -88,6 +88,7 @@ def history(script, monkeypatch, tmp_path):
         commits.append(script.git("rev-parse", "--short", "HEAD").stdout.strip())
     freshness._has_moved.cache_clear()
     table = {"parts": {"laws": ["law"], "notes": ["note"]}, "equal": []}
+    table |= {"files": {"*.json*": ["laws"]}, "rows": {}}
     monkeypatch.setattr(freshness, "TABLE", table)
     yield freshness, commits
     freshness._has_moved.cache_clear()
@@ -119,6 +120,24 @@ def test_equal_results_keep_a_figure_in_date(history, script):
     assert freshness.moved(["laws"], second) == ["laws"]
 
 
+def test_a_file_is_as_old_as_its_oldest_row(history, script):
+    freshness, (first, noted, second, third) = history
+    lines = [{"of": "a", "commit": third}, {"of": "b", "commit": f"{third}+"}]
+    rows = script.ROOT / "rows.jsonl"
+    rows.write_text("\n".join(map(json.dumps, lines)))
+    assert freshness.files() == {"rows.jsonl": []}
+    freshness.TABLE["rows"]["rows.jsonl"] = [[{"of": "b"}, ["notes"]]]
+    (script.ROOT / "note").write_text("2")
+    freshness._has_moved.cache_clear()
+    assert freshness.files() == {"rows.jsonl": ["notes"]}
+    rows.write_text(json.dumps({"of": "a", "commit": second}))
+    assert freshness.files() == {"rows.jsonl": ["laws"]}
+    rows.unlink()
+    parts = [{"commit": third}, {"commit": second}]
+    (script.ROOT / "whole.json").write_text(json.dumps({"parts": parts}))
+    assert freshness.files() == {"whole.json": ["laws"]}
+
+
 def test_every_quoted_figure_depends_on_known_parts(script):
     table = json.loads((ROOT / "docs" / "data" / "depends.json").read_text())
     known = set(table["parts"])
@@ -126,6 +145,8 @@ def test_every_quoted_figure_depends_on_known_parts(script):
         assert set(parts) <= known
     for pattern, parts in table["files"].items():
         assert set(parts) <= known and list(ROOT.glob(pattern)), pattern
+    for rows in table["rows"].values():
+        assert all(set(parts) <= known for _, parts in rows)
     for paths in table["parts"].values():
         assert all((ROOT / path.removeprefix(":!")).exists() for path in paths)
 

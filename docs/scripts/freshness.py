@@ -11,10 +11,14 @@ import argparse
 import fnmatch
 import functools
 import json
+import re
 import sys
+from collections.abc import Iterable
+from pathlib import Path
 
 import figures
 
+_COMMIT = re.compile(r'"commit": "([^"]+)"')
 TABLE = json.loads((figures.DATA / "depends.json").read_text())
 
 
@@ -24,7 +28,7 @@ def parts_of(name: str) -> list[str]:
     return next(parts for one, parts in patterns if fnmatch.fnmatchcase(name, one))
 
 
-def moved(parts: list[str], commit: str) -> list[str]:
+def moved(parts: Iterable[str], commit: str) -> list[str]:
     """Parts whose results may differ from those at a commit.
 
     Args:
@@ -66,15 +70,26 @@ def files() -> dict[str, list[str]]:
     for pattern, parts in TABLE["files"].items():
         for path in sorted(figures.ROOT.glob(pattern)):
             name = str(path.relative_to(figures.ROOT))
-            found[name] = moved(parts, _commit(path))
+            old = {one for args in _measured(path, parts) for one in moved(*args)}
+            found[name] = sorted(old)
     return found
 
 
-def _commit(path) -> str:
-    """Commit that a file names, else the last one that changed it."""
-    if path.suffix == ".json" and "commit" in (own := json.loads(path.read_text())):
-        return own["commit"]
-    return figures.git("log", "-1", "--format=%h", "--", str(path)).stdout.strip()
+def _measured(path: Path, parts: list[str]) -> set[tuple[tuple[str, ...], str]]:
+    """Parts and commits of what a file holds, of all of it or of each row.
+
+    A commit is one that the file or the row names, else the last one that changed the
+    file. A row with the values of an entry of "rows" depends on the parts there, too.
+    """
+    last = figures.git("log", "-1", "--format=%h", "--", str(path)).stdout.strip()
+    text, own = path.read_text(), TABLE["rows"].get(path.name, [])
+    found = set()
+    for row in text.splitlines() if path.suffix == ".jsonl" else [text]:
+        values = json.loads(row)
+        more = [extra for some, extra in own if some.items() <= values.items()]
+        commits = _COMMIT.findall(row) or [last]
+        found |= {((*parts, *sum(more, [])), commit) for commit in commits}
+    return found
 
 
 def summary(names: list[str], known: dict[str, dict]) -> list[str]:
