@@ -134,6 +134,26 @@ def test_a_critic_that_reads_more_than_the_policy(tmp_path, make):
     assert state["normalisers"]["0.module.count"] == kept + 128
 
 
+def test_a_critic_of_its_own_has_statistics_where_the_policy_is_taken_over(
+    tmp_path, monkeypatch
+):
+    config = small_ppo(
+        **SMALL_IMAGES, steps_per_update=128, normalisation_frames=64, total_frames=128
+    )
+    run(config, tmp_path / "first")
+    counts, update = [], PPO.update
+
+    def watched(learner, *arguments):
+        (critic,) = learner.critic_normalisers
+        counts.append(float(critic.module.count))
+        return update(learner, *arguments)
+
+    monkeypatch.setattr(PPO, "update", watched)
+    taken = str(tmp_path / "first")
+    run(config.replace(initial_policy=taken), tmp_path / "second")
+    assert counts == [64.0]
+
+
 @pytest.mark.parametrize(
     ("observation", "critic"),
     [

@@ -147,7 +147,8 @@ class TrainingConfig:
         normalisation_frames: Number of random control steps before the first update,
             from which the first observation statistics come; they are not counted as
             frames. An algorithm that begins with random actions anyway (SAC) needs
-            none, nor does one that starts from another policy.
+            none, nor does one that starts from another policy, unless its critic reads
+            other observations.
         initial_policy: Directory of the run or checkpoint, or "pretrained:NAME", whose
             policy the networks start from, with its observation statistics; None for
             random weights.

@@ -77,6 +77,12 @@ class Learner(abc.ABC):
         for module in chosen:
             module.module.update(batch[module.in_keys[0]].to(self.device))
 
+    @property
+    def lacks_statistics(self) -> bool:
+        """Whether a new run has no observation statistics before its first update."""
+        taken = self.config.initial_policy is not None and not self.critic_normalisers
+        return not taken and not self.random_frames
+
     def normalise(self, batch: TensorDictBase, critic_only: bool = False) -> None:
         """Add the normalised observations of policy and critic, or of the critic."""
         chosen: list[Any] = list(self.critic_normalisers)

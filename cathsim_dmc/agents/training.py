@@ -234,8 +234,8 @@ def _start(
         config = learner.config
         if config.initial_policy is not None:
             take_over(learner.network, config, learner.shapes)
-        elif config.normalisation_frames and not learner.random_frames:
-            # The first update sees normalised observations.
+        # The first update sees normalised observations.
+        if config.normalisation_frames and learner.lacks_statistics:
             steps = math.ceil(config.normalisation_frames / config.num_envs)
             learner.observe(env.rollout(steps, break_when_any_done=False))
         return {"frames": 0, "seconds": 0.0, "episodes": 0, "window": []}
