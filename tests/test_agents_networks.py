@@ -9,7 +9,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc.agents import ConfigError, PPOConfig, SACConfig, make_config
 from cathsim_dmc.agents.exploration import CorrelatedExploration, CorrelatedNoise
-from cathsim_dmc.agents.networks import NetworkShapes, make_policy
+from cathsim_dmc.agents.networks import NetworkShapes, make_policy, network_of
 from cathsim_dmc.agents.normalisation import (
     SHADOW,
     ImageNormaliser,
@@ -128,6 +128,20 @@ def test_standard_observations_satisfy_torchrl(observation):
         names = sorted(synthetic_env.SIZES)
         joined = torch.cat([parts[name] for name in names], -1).float()
         assert torch.equal(seeded[1].reset()["observation_vector"], joined)
+
+
+def test_an_update_begins_at_the_policy_that_acted_also_at_the_bounds(tmp_path):
+    torch.manual_seed(0)
+    learner = PPO(PPOConfig(), NetworkShapes(3, None, 2), tmp_path)
+    env = synthetic_env.make_env("reach")
+    learner.attach(env.base_env)  # an environment without transforms
+    network_of(learner.network).mean.bias.data.fill_(8.0)
+    batch = TensorDict({VECTOR: torch.randn(64, 3)}, [64])
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        learner.policy(batch)
+    batch["advantage"], batch["value_target"] = torch.randn(2, 64, 1)
+    losses = learner.loss(batch)
+    assert losses["kl_approx"].abs() < 1e-5 and losses["clip_fraction"] == 0
 
 
 def test_truncation_bootstraps_and_termination_does_not(tmp_path):

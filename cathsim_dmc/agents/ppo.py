@@ -167,10 +167,10 @@ class PPO(Learner):
 
     @override
     def attach(self, env: EnvBase) -> None:
+        # White noise too: the log-probability by the policy alone is that of an action
+        # before it is rounded at a bound; the loss takes that of the rounded one.
         config = self.config
-        if not config.noise_correlation and not config.noise_shared:
-            return
-        groups = getattr(env.base_env, "action_groups", None)
+        groups = getattr(getattr(env, "base_env", env), "action_groups", None)
         if groups is None:
             if config.noise_shared:
                 raise ConfigError(
