@@ -5,12 +5,15 @@ import json
 import mujoco
 import numpy as np
 import pytest
+import trimesh
+from dm_control import mjcf
 
 from cathsim_dmc import suite
 from cathsim_dmc.entities.sheath import CLEARANCE
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.simulation.mjcf import write_mjcf
+from cathsim_dmc.tasks.navigation import Navigation
 
 TASK, SEED, STEPS = "type1_lcca", 3, 30
 
@@ -127,6 +130,45 @@ def test_a_pair_is_written_as_its_chain_stands(tmp_path, cathsim):
     described = json.loads((out / "task.json").read_text())
     assert described["devices"] == ["wire_035_glide", "berenstein_5f"]
     np.testing.assert_array_equal(model.key("start").qpos, env.physics.data.qpos)
+
+
+CUBE = 0.01 * np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+
+
+class Beside(Navigation):
+    """A mesh on a hinge, and a body that the episode puts somewhere."""
+
+    def __init__(self, scene, *arguments, **options):
+        root = scene.arena.mjcf_model
+        file = trimesh.convex.convex_hull(CUBE).export(file_type="stl")
+        root.asset.add("mesh", name="cube", file=mjcf.Asset(file, ".stl"))
+        swing = root.worldbody.add("body", name="swing", pos=(1, 0, 0))
+        swing.add("joint", name="swing", axis=(0, 1, 0))
+        swing.add("geom", type="mesh", mesh="cube", contype=0, conaffinity=0)
+        hand = root.worldbody.add("body", name="hand", mocap=True)
+        hand.add("site", name="hand")
+        super().__init__(scene, *arguments, **options)
+
+    def initialize_episode(self, physics, random_state):
+        super().initialize_episode(physics, random_state)
+        physics.named.data.qvel["swing"] = 0.5
+        physics.named.data.mocap_pos["hand"] = (1, 2, 3)
+
+
+def test_bodies_beside_the_device_are_written_as_they_are(tmp_path):
+    definition = suite.TaskDefinition("Beside.", "type1", "bca", task=Beside)
+    if "cube_bca" not in suite.TASKS:
+        suite.register("cube_bca", definition)
+    out = write_mjcf("cube_bca", tmp_path / "cube", wall="prisms")
+    model = mujoco.MjModel.from_xml_path(str(out / "scene.xml"))
+    corners = model.mesh_vert[model.mesh_vertadr[model.mesh("cube").id] :][:8]
+    sides = np.ptp(corners, axis=0)
+    assert model.mesh("cube").vertnum == 8
+    np.testing.assert_allclose(sides, 0.01, rtol=1e-6)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("start").id)
+    assert data.joint("swing").qvel == 0.5
+    np.testing.assert_array_equal(data.mocap_pos, [[1, 2, 3]])
 
 
 @pytest.mark.slow

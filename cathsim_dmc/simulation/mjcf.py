@@ -40,11 +40,12 @@ def write_mjcf(
 ) -> Path:
     """Write the scene of a task and the start of one of its episodes.
 
-    `scene.xml` is a file of plain MuJoCo: convex pieces replace the wall, and boxes the
-    bore of the sheath, whose fields only this package can read. With the same actions
-    it moves nearly as a task with the same `sheath_clearance` does, by default that of
-    `entities.sheath.CLEARANCE`. The keyframe "start" is the start of the episode.
-    `task.json` has the rest, see `describe`.
+    `scene.xml` is a file of plain MuJoCo, beside files with meshes of your own bodies:
+    convex pieces replace the wall, and boxes the bore of the sheath, whose fields only
+    this package can read. With the same actions it moves nearly as a task with the same
+    `sheath_clearance` does, by default that of `entities.sheath.CLEARANCE`. The
+    keyframe "start" is the start of the episode. `task.json` has the rest, see
+    `describe`.
 
     Coaxial devices are one chain whose model fields change in every control step; the
     file has the fields at the start. A compliant or moving wall is rigid and at rest in
@@ -178,14 +179,16 @@ def _at_its_start(path: Path, physics: Any, chain: str) -> None:
             numbers["diaginertia"] = body.inertia
             values = {name: _text(value, 17) for name, value in numbers.items()}
             one.insert(0, etree.Element("inertial", values))
-    state = {"qpos": _text(data.qpos, 17), "act": _text(data.act, 17)}
+    fields = {"qpos": data.qpos, "qvel": data.qvel, "act": data.act, "ctrl": data.ctrl}
+    fields |= {"mpos": data.mocap_pos, "mquat": data.mocap_quat}
+    state = {name: _text(value, 17) for name, value in fields.items() if value.size}
     keyframe = etree.SubElement(tree.getroot(), "keyframe")
     etree.SubElement(keyframe, "key", {"name": "start", **state})
     tree.write(str(path))
 
 
 def _in_one_file(path: Path, scene: Scene, wall: str) -> None:
-    """Writes meshes and convex walls into the scene; drops classes of textures.
+    """Writes surface and convex wall into the scene; drops classes of textures.
 
     MuJoCo up to 3.14 refuses a defaults class of textures. PyMJCF names a class in
     every element but defines none for textures, so nothing is lost.
@@ -193,13 +196,13 @@ def _in_one_file(path: Path, scene: Scene, wall: str) -> None:
     tree = etree.parse(str(path))
     for texture in tree.iter("texture"):
         texture.attrib.pop("class", None)
-    files = set()
     surface = scene.anatomy.surface
-    for mesh in tree.iterfind("asset/mesh[@file]"):
-        file = path.parent / mesh.attrib.pop("file")
-        files.add(file)
-        mesh.set("vertex", _text(surface.vertices.astype(np.float32)))
-        mesh.set("face", " ".join(map(str, surface.faces.ravel().tolist())))
+    # Meshes of bodies that a user has added keep their files.
+    lumen = scene.phantom.mjcf_model.find("mesh", "lumen")
+    mesh = tree.find(f"asset/mesh[@name='{lumen.full_identifier}']")
+    (path.parent / mesh.attrib.pop("file")).unlink()
+    mesh.set("vertex", _text(surface.vertices.astype(np.float32)))
+    mesh.set("face", " ".join(map(str, surface.faces.ravel().tolist())))
     carrier = tree.find(".//geom[@name='wall']")
     for number, piece in enumerate(wall_pieces(scene.anatomy, wall)):
         name = f"wall_{number:03d}"
@@ -218,8 +221,6 @@ def _in_one_file(path: Path, scene: Scene, wall: str) -> None:
         geom.attrib.update({"name": name, "group": "3", **side})
         del geom.attrib["user"]
     carrier.getparent().remove(carrier)
-    for file in files:
-        file.unlink()
     tree.write(str(path))
 
 
