@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from dm_control import mjcf
 
 from cathsim_dmc import suite
 from cathsim_dmc.physics.effects import Effect
@@ -93,3 +94,51 @@ def test_a_moving_vessel_moves_no_joint_beside_the_device(task_name):
     assert env.physics.bind(env.task.slide).qpos[0] == 0.0
     found, expected = env.task.readings.centreline, alone.task.readings.centreline
     np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * 0.02
+
+
+class Stone(Navigation):
+    """A body with a mesh, a cube in the first scene and a slab in the others."""
+
+    stretch = 3.0  # of the slab along x
+
+    def __init__(self, scene, *arguments, others=None, **options):
+        rest = list(others or ())
+        self._add(scene, "cube", 3.0)
+        for other, _ in rest:
+            self._add(other, "slab", self.stretch)
+        super().__init__(scene, *arguments, others=rest or None, **options)
+
+    @staticmethod
+    def _add(scene, shown, stretch):
+        own = mjcf.RootElement(model="own")
+        for name, along in (("cube", 1.0), ("slab", stretch)):
+            vertices = CORNERS * (along, 1.0, 1.0)
+            own.asset.add("mesh", name=name, vertex=vertices.ravel())
+        own.worldbody.add("geom", name="stone", type="mesh", mesh=shown, conaffinity=0)
+        # Attached after the vessel, whose mesh only the first scene has.
+        scene.arena.mjcf_model.attach(own)
+
+
+def _in_two_anatomies(monkeypatch):
+    definition = suite.TaskDefinition("Stones.", ["type1", "type2"], "bca", task=Stone)
+    monkeypatch.setitem(suite.TASKS, "stones", definition)
+    return suite.make_task("stones", random=0)
+
+
+def test_each_anatomy_shows_the_meshes_of_its_own_scene(monkeypatch):
+    env = suite.environment(_in_two_anatomies(monkeypatch))
+    model, seen = env.physics.model.ptr, {}
+    while len(seen) < 2:
+        env.reset()
+        mesh = model.mesh(model.geom("own/stone").dataid[0])
+        seen[env.task.conditions.anatomy] = mesh.name
+    assert seen == {"type1": "own/cube", "type2": "own/slab"}
+
+
+def test_anatomies_share_no_model_with_other_meshes_of_one_name(monkeypatch):
+    monkeypatch.setattr(Stone, "stretch", 2.0)
+    with pytest.raises(ValueError, match="same meshes of your own"):
+        _in_two_anatomies(monkeypatch)

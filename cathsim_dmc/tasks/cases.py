@@ -28,10 +28,12 @@ from cathsim_dmc.tasks.start import StartPosture
 
 # Fields of mjStatistic; the mean inertia scales the tolerance of the solver.
 _STATISTICS = ("meaninertia", "meanmass", "meansize", "extent", "center")
-# Prefixes of fields that are not compared: texts, and the mesh of the surface, which
-# only the first anatomy has; and of bounding volume trees, in which the tree of that
-# mesh comes last.
+# Prefixes of fields that are not compared: texts, and meshes, since only the first
+# anatomy has that of the surface; and of bounding volume trees, in which those of
+# meshes come last.
 _APART, _TREES = ("_", "name", "path", "text", "mesh_"), "bvh_"
+# Kinds of geoms whose data are a mesh.
+_WITH_MESH = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF
 
 Fields = dict[str, np.ndarray]
 
@@ -202,18 +204,23 @@ def _differences(
     """Returns copies of the model's fields that differ from those of the host."""
     names = f"{scene.anatomy.name!r} cannot share a model with {first.anatomy.name!r}"
     fields: Fields = {}
+    numbers, trees = _mesh_numbers(host, model, names), model.body_bvhnum.sum()
     for name in dir(host):
         room, value = getattr(host, name), getattr(model, name)
         if name.startswith(_APART) or not isinstance(room, np.ndarray):
             continue
-        size = len(value) if name.startswith(_TREES) else len(room)
-        if value.shape != (size, *room.shape[1:]) or size > len(room):
+        if name.startswith(_TREES):
+            room, value = room[:trees], value[:trees]
+        elif name == "geom_dataid":
+            value = numbers
+        if value.shape != room.shape:
             raise ValueError(
                 f"{names}: {name} has the shape {value.shape}, and {room.shape} "
                 "there; give anatomies with as many goals, one device of one length, "
-                "and scenes after the first that are not drawn"
+                "scenes after the first that are not drawn, and all scenes the same "
+                "bodies of your own"
             )
-        if not np.array_equal(room[:size], value):
+        if not np.array_equal(room, value):
             fields[name] = value.copy()
     ours, theirs = (
         [one.site(index).name for index in range(one.nsite)] for one in (host, model)
@@ -221,3 +228,41 @@ def _differences(
     if ours != theirs:
         raise ValueError(f"{names}: {theirs} are not {ours}; give the same goals")
     return fields
+
+
+def _mesh_numbers(
+    host: mujoco.MjModel, model: mujoco.MjModel, names: str
+) -> np.ndarray:
+    """Returns the numbers (G,) in the host of the meshes of a model's geoms.
+
+    ValueError for a mesh that the host lacks or has with another shape.
+    """
+    there = {host.mesh(number).name: number for number in range(host.nmesh)}
+    found = model.geom_dataid.copy()
+    for number in range(model.nmesh):
+        name = model.mesh(number).name
+        if name not in there or any(
+            not np.array_equal(own, other)
+            for own, other in zip(
+                _mesh(model, number), _mesh(host, there[name]), strict=True
+            )
+        ):
+            raise ValueError(
+                f"{names}: there is no such mesh {name!r} there; give all scenes the "
+                "same meshes of your own, of which a geom may show another in each"
+            )
+        shown = np.isin(model.geom_type, _WITH_MESH) & (model.geom_dataid == number)
+        found[shown] = there[name]
+    return found
+
+
+def _mesh(model: mujoco.MjModel, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the vertices (V, 3), m, and triangles (F, 3) of a mesh."""
+    vertices, faces = (
+        np.arange(count[number]) + start[number]
+        for start, count in (
+            (model.mesh_vertadr, model.mesh_vertnum),
+            (model.mesh_faceadr, model.mesh_facenum),
+        )
+    )
+    return model.mesh_vert[vertices], model.mesh_face[faces]
