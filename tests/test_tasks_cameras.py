@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import types
 
 import mujoco
 import numpy as np
@@ -12,6 +13,7 @@ from conftest import twin
 from cathsim_dmc import suite
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.cameras import FARTHEST, CameraOptions
+from cathsim_dmc.tasks.navigation import Navigation
 
 BACK_ENDS = ("egl", "osmesa")  # that need no display
 PROBE = "import mujoco as m; m.Renderer(m.MjModel.from_xml_string('<mujoco/>'), 8, 8)"
@@ -304,6 +306,67 @@ def test_without_opengl_the_message_says_what_to_do(shared_environment, monkeypa
     task = twin(shared_environment("simple1_bca").task, observation="rgb")
     with pytest.raises(ValueError, match="MUJOCO_GL.*no display"):
         BatchSimulation(task, 2)  # before any work
+
+
+class Lister:
+    """Lists the geoms that MuJoCo would draw, without OpenGL."""
+
+    _gl_context = types.SimpleNamespace(make_current=lambda: None)
+
+    def __init__(self, model, rows, columns):
+        self._model, self._image = model, np.zeros((rows, columns, 3), np.uint8)
+        self.scene = mujoco.MjvScene(model, 1000)
+
+    def update_scene(self, data, camera, options):
+        chosen = mujoco.MjvCamera()
+        chosen.type, chosen.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
+        kinds = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(
+            self._model, data, options, None, chosen, kinds, self.scene
+        )
+        for geom in self.scene.geoms[: self.scene.ngeom]:
+            name = self._model.geom(geom.objid).name
+            Lister.drawn[name] = [*geom.pos.round(6), *geom.size.round(6)]
+
+    def render(self):
+        return self._image
+
+    def disable_depth_rendering(self):
+        pass
+
+    close = disable_depth_rendering
+
+
+class Beside(Navigation):
+    """Balls that the start of an episode moves and enlarges."""
+
+    def __init__(self, scene, *arguments, others=None, **options):
+        rest = list(others or ())
+        for each in (scene, *(other for other, _ in rest)):
+            world = each.arena.mjcf_model.worldbody
+            for name, mocap in (("hand", True), ("stone", False)):
+                body = world.add("body", name=name, mocap=mocap)
+                untouched = {"contype": 0, "conaffinity": 0}
+                body.add("geom", name=name, type="sphere", size=[0.01], **untouched)
+        super().__init__(scene, *arguments, others=rest or None, **options)
+
+    def initialize_episode(self, physics, random_state):
+        super().initialize_episode(physics, random_state)
+        physics.named.data.mocap_pos["hand"] = (1, 2, 3)
+        physics.named.model.body_pos["stone"] = (4, 5, 6)
+        physics.named.model.geom_size["stone"] = 0.02
+
+
+@pytest.mark.parametrize("anatomy", ["simple1", ["simple1", "simple2"]])
+def test_cameras_show_bodies_where_hooks_have_put_them(anatomy, monkeypatch):
+    monkeypatch.setattr(mujoco, "Renderer", Lister)
+    monkeypatch.setattr(Lister, "drawn", {}, raising=False)
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    definition = suite.TaskDefinition("Beside.", anatomy, "bca", task=Beside)
+    monkeypatch.setitem(suite.TASKS, "balls", definition)
+    suite.environment(suite.make_task("balls", observation="rgb", random=0)).reset()
+    assert Lister.drawn["hand"] == [1, 2, 3, 0.01, 0.01, 0.01]
+    assert Lister.drawn["stone"] == [4, 5, 6, 0.02, 0.02, 0.02]
 
 
 @pytest.mark.parametrize("names", ["back", [], ["top", "top"], [1], 3, None])

@@ -16,7 +16,7 @@ from cathsim_dmc.imaging.options import VIEW_ANGLE
 from cathsim_dmc.physics.effects import World
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import Readings
-from cathsim_dmc.physics.stepper import Stepper
+from cathsim_dmc.physics.stepper import SingleStepper, Stepper
 from cathsim_dmc.tasks.render_thread import render_thread
 
 # Two cameras of `scene.Scene`, and one in the head of the device, see `Cameras`.
@@ -28,11 +28,14 @@ NEAREST, FARTHEST = 0.3e-3, 10.0
 _EXTENT = 1.0  # m, of the drawn model: the unit of `znear` and `zfar`
 # Values of MUJOCO_GL with which MuJoCo loads no OpenGL.
 _DISABLED = ("disable", "disabled", "off", "false", "0")
-# Fields of the model that, with `qpos`, decide how a device is drawn.
+# Fields of the model that, with `qpos`, decide how bodies are drawn; and those that
+# decide from where, which several anatomies set themselves.
 _DRAWN = frozenset(
-    {"body_pos", "body_quat", "jnt_pos", "jnt_axis"}
+    {"body_pos", "body_quat", "jnt_pos", "jnt_axis", "mat_rgba"}
     | {"geom_pos", "geom_quat", "geom_size", "geom_rgba"}
+    | {"light_pos", "light_dir", "light_diffuse"}
 )
+_AIMED = frozenset({"cam_pos", "cam_quat", "cam_fovy"})
 _OUT_OF_SIGHT = 1e3  # m; a transparent geom would still be in the depth image
 
 
@@ -73,8 +76,9 @@ class Meshes(Protocol):
 class Cameras:
     """MuJoCo's cameras of one compiled model, with their own OpenGL context.
 
-    They render the pose of `qpos`, so composer and batches give the same images. The
-    endoscope "tip" looks ahead from the head of the device and does not show it.
+    They render the pose of `qpos` and of mocap bodies, so composer and batches give the
+    same images. The endoscope "tip" looks ahead from the head of the device and does
+    not show it.
     """
 
     _renderer: Any = None
@@ -199,14 +203,22 @@ class Cameras:
             meshes.enter(self._model, number)
             self._model.stat.extent = _EXTENT
             self._number = number
-        for name in self._written:
+        written = self._written
+        if isinstance(stepper, SingleStepper):  # hooks may write all fields
+            written = _DRAWN if meshes is not None else _DRAWN | _AIMED
+        for name in written:
             getattr(self._model, name)[:] = stepper.field(index, name)
-        if meshes is not None and (anew or self._written):
+        if meshes is not None and (anew or written):
             meshes.draw(self._model, number)
         if meshes is not None and moving is not None:
             mesh = meshes.reshape(self._model, number, moving.surface(index))
             render_thread().upload(self._renderer, self._model, mesh)
         self._data.qpos[:] = stepper.arrays.qpos[index]
+        if self._model.nmocap:
+            state = stepper.states(np.array([index]))[0]
+            mujoco.mj_setState(
+                self._model, self._data, state, mujoco.mjtState.mjSTATE_INTEGRATION
+            )
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         seen: dict[str, list[np.ndarray]] = {kind: [] for kind in self._kinds}
