@@ -241,10 +241,19 @@ def test_entries_that_networks_cannot_read_are_refused():
     ):
         with pytest.raises(ValueError, match=f"entry '{entry.key}'.*must be"):
             entry.spec(Sizes())
+    for dtype in (bool, float, np.int64):  # networks and specs know none of them
+        with pytest.raises(ValueError, match="dtype of the entry 'dim'.*uint8"):
+            Entry("dim", (2, 2, 1), "", "", dtype=dtype)
     spec = {"near": Entry("near", 1, "m", "").spec(Sizes())}
     table.check({"near": np.zeros((2, 1))}, spec, np.arange(2))
     with pytest.raises(ValueError, match="'near' .* is of bool, .* declares float64"):
         table.check({"near": np.zeros((2, 1), bool)}, spec, np.arange(2))
+
+
+def test_an_image_with_one_bound_has_the_other_of_its_type():
+    spec = Entry("dim", (2, 2, 1), "", "", low=1, dtype=np.uint8).spec(Sizes())
+    assert (spec.minimum, spec.maximum) == (1, 255)
+    assert Entry("near", 1, "m", "", low=0).spec(Sizes()).maximum == np.inf
 
 
 def test_the_base_bears_what_pushes_and_turns_the_device():

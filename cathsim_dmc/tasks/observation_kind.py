@@ -18,6 +18,7 @@ from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.route import Ahead
 
+_IMAGES = np.uint8, np.float32  # types of images
 Observation = dict[str, np.ndarray]
 Shape = int | tuple[int, ...]
 
@@ -89,7 +90,10 @@ class Entry:
         meaning: layout and frame.
         low: least value, -inf if there is no bound.
         high: greatest value.
-        dtype: float64 for numbers, another type for images.
+        dtype: numpy.float64 for numbers, uint8 or float32 for images.
+
+    Raises:
+        ValueError: if the type is another one.
     """
 
     key: str
@@ -100,10 +104,15 @@ class Entry:
     high: float = math.inf
     dtype: type = np.float64
 
+    def __post_init__(self):
+        if self.dtype not in (np.float64, *_IMAGES):
+            allowed = "numpy.float64 for numbers, numpy.uint8 or float32 for images"
+            bounds.refuse(f"dtype of the entry {self.key!r}", self.dtype, allowed)
+
     @property
     def is_image(self) -> bool:
         """Whether it is an image."""
-        return self.dtype is not np.float64
+        return self.dtype != np.float64
 
     def spec(self, sizes: Sizes) -> specs.Array:
         """Its spec for one simulation."""
@@ -116,7 +125,10 @@ class Entry:
             bounds.refuse(f"the shape of the entry {self.key!r}", shape, allowed)
         if math.isinf(self.low) and math.isinf(self.high):
             return specs.Array(shape, self.dtype, self.key)
-        low, high = (np.asarray(end, self.dtype) for end in (self.low, self.high))
+        most = (0, 255) if self.dtype == np.uint8 else (-math.inf, math.inf)
+        low, high = (
+            np.asarray(end, self.dtype) for end in np.clip((self.low, self.high), *most)
+        )
         return specs.BoundedArray(shape, self.dtype, low, high, self.key)
 
 
