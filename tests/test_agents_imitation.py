@@ -1,6 +1,7 @@
 """Cloning, DAgger, demonstrations in SAC's replay, and runs that start from another."""
 
 import copy
+import json
 import shutil
 import types
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from cathsim_dmc import suite
 from cathsim_dmc.agents import (
     Checkpoint,
     ConfigError,
@@ -27,6 +29,7 @@ from cathsim_dmc.agents.sac import SAC
 from cathsim_dmc.agents.training import take_over
 from cathsim_dmc.agents.training_log import read_metrics
 from cathsim_dmc.recording.dataset import DatasetError
+from cathsim_dmc.tasks.objectives import Cannulation
 
 SHARED = {
     "task": "simple1_bca",
@@ -316,6 +319,34 @@ def test_demonstrations_of_another_task_are_refused(dataset, shapes, tmp_path):
     closer = {"task_kwargs": {"goal_radius": 4e-3}, **shown}
     with pytest.raises(DatasetError, match="its goal_radius is 0.045, not 0.004"):
         BC(small("bc", **closer), shapes, tmp_path)
+
+
+def _own(anatomy, goal, *, depth=0.01, weight=1.0, farthest_shift=0.0):
+    reward = {"success": weight, "distance": -depth}
+    return Cannulation.to(anatomy, goal, reward=reward, farthest_shift=farthest_shift)
+
+
+def test_demonstrations_share_the_options_of_an_own_objective(
+    dataset, shapes, tmp_path, monkeypatch
+):
+    given = {"options": {"weight": 2.0}, "objective": _own}
+    own = suite.TaskDefinition("Own.", "simple1", "bca", **given)
+    monkeypatch.setitem(suite.TASKS, "own_bca", own)
+    copied = shutil.copytree(dataset, tmp_path / "copied")
+    (file,) = copied.rglob("metadata.json")
+    about = json.loads(file.read_text())
+    spec = json.loads(about["env_spec"])
+    spec["kwargs"] = {"task": "own_bca", "observation": "tracking"}
+    file.write_text(json.dumps({**about, "env_spec": json.dumps(spec)}))
+
+    def read(**options):
+        settings = {"demonstrations": str(copied), "task_kwargs": options}
+        return BC(small("bc", task="own_bca", **settings), shapes, tmp_path)
+
+    read(depth=0.01, weight=2.0)  # the defaults
+    for name, value in (("depth", 0.02), ("weight", 1.0)):
+        with pytest.raises(DatasetError, match=f"its {name} is the default, not"):
+            read(**{name: value})
 
 
 def test_half_of_sacs_minibatch_is_shown(dataset, shapes, tmp_path):

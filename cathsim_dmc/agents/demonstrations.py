@@ -33,8 +33,10 @@ from cathsim_dmc.tasks.observation_kind import Sizes
 DEMONSTRATION_SEED = 2_000_000  # apart from the seeds of evaluation
 # Key of the infos with the expert's action before noise is added.
 EXPERT_ACTION = "expert_action"
-# Options that must agree between demonstrations and training.
-_ALIKE = ("device", "devices", "goal", "access", "goal_radius")
+# Options that must agree between demonstrations and training, beside those of the
+# objective; its rewards serve only learners that read them.
+_ALIKE = ("device", "devices", "goal", "access")
+_REWARD = "reward"
 _SIMULATIONS = 16
 
 
@@ -202,10 +204,13 @@ def _buffer(seed: int, row: int, columns: Mapping[str, Any]) -> Any:
     return EpisodeBuffer(seed=seed, observations=shown, infos=infos, **own)
 
 
-def alike(task_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options that demonstrations must share, None for a default."""
-    given = {name: dataset.chosen(task_kwargs, name) for name in _ALIKE}
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in given.items()}
+def alike(task: str, task_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return task and options that demonstrations must share, None for a default."""
+    own = {*suite.TASKS[suite.known(task)].objective_options} - {_REWARD}
+    given = {"task": task, **task_kwargs}
+    shared = {name: dataset.chosen(given, name) for name in (*_ALIKE, *sorted(own))}
+    listed = {k: list(v) if isinstance(v, tuple) else v for k, v in shared.items()}
+    return {"task": task, **listed}
 
 
 def require_dataset(path: str | Path | None) -> str | Path:

@@ -158,8 +158,7 @@ class BC(CloningLearner):
             require_dataset(config.demonstrations),
             config.observation,
             shapes,
-            task=config.task,
-            **alike(config.task_kwargs),
+            **alike(config.task, config.task_kwargs),
         ).exclude("next")
         super().__init__(config, shapes, directory)
         self.observe(self.states)

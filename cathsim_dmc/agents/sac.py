@@ -139,9 +139,8 @@ class SAC(Learner):
                 config.demonstrations,
                 config.collected_observation,
                 shapes,
-                task=config.task,
+                **alike(config.task, config.task_kwargs),
                 reward=config.training_kwargs.get("reward"),
-                **alike(config.task_kwargs),
             )
             self.demonstrations = shown.select(*self.replay_keys)
             self.observe(shown)

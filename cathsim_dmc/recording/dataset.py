@@ -101,9 +101,16 @@ class DatasetError(ValueError):
 
 
 def chosen(options: Mapping[str, Any], name: str) -> Any:
-    """Returns an option of a task; None if it is missing or has its default."""
-    value = options.get(name)
-    return None if value == getattr(NavigationConfig, name, None) else value
+    """Returns an option of a task; None if it is missing or has its default.
+
+    Args:
+        options: Options, with the name of the task as "task".
+    """
+    value, default = options.get(name), getattr(NavigationConfig, name, None)
+    if (definition := suite.TASKS.get(options.get("task", ""))) is not None:
+        own = {**definition.objective_defaults, **definition.options}
+        default = own.get(name, default)
+    return None if value == default else value
 
 
 def _require_options(own: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:

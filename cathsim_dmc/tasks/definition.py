@@ -79,5 +79,14 @@ class TaskDefinition:
     @property
     def objective_options(self) -> tuple[str, ...]:
         """Names of the options that the objective takes."""
+        return tuple(self.objective_defaults)
+
+    @property
+    def objective_defaults(self) -> dict[str, Any]:
+        """Options that the objective takes, with their defaults; None without one."""
         parameters = inspect.signature(self.objective).parameters.values()
-        return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
+        return {
+            p.name: None if p.default is p.empty else p.default
+            for p in parameters
+            if p.kind is p.KEYWORD_ONLY
+        }
