@@ -171,6 +171,23 @@ def test_bodies_beside_the_device_are_written_as_they_are(tmp_path):
     np.testing.assert_array_equal(data.mocap_pos, [[1, 2, 3]])
 
 
+def test_a_device_of_drawn_stiffness_bends_as_far_as_in_the_task(tmp_path):
+    options = {"randomisation": {"stiffness": [1.25, 1.25]}}
+    out = write_mjcf(
+        "type1_bca", tmp_path / "stiff", wall="prisms", task_kwargs=options
+    )
+    model = mujoco.MjModel.from_xml_path(str(out / "scene.xml"))
+    bore = {"random": 0, "sheath_clearance": CLEARANCE}
+    env = suite.load("cathsim", "type1_bca", {**bore, **options})
+    env.reset()
+    own = env.physics.model.ptr
+    for motor in env.task.scene.catheter.tip_motors:
+        found, expected = (m.actuator(motor.full_identifier) for m in (model, own))
+        joint = model.joint(found.trnid[0])
+        assert joint.stiffness == own.joint(joint.name).stiffness
+        np.testing.assert_array_equal(found.gainprm, expected.gainprm)
+
+
 @pytest.mark.slow
 def test_what_cannot_be_written_is_refused_before(tmp_path):
     with pytest.raises(ValueError, match="type9.*type1_bca"):

@@ -169,6 +169,10 @@ def _at_its_start(path: Path, physics: Any, chain: str) -> None:
         own = one.get("size", "").split()
         one.set("size", " ".join([_text(geom.size[:1], 17), *own[1:]]))
         one.set("friction", _text(geom.friction, 17))
+    for one in tree.find("actuator"):
+        if one.get("name").startswith(chain):  # their torques scale with the stiffness
+            gain = model.actuator(one.get("name")).gainprm
+            one.set("gainprm", _text(gain, 17))
     for one in named["body"]:
         body = model.body(one.get("name"))
         one.set("gravcomp", _text(model.body_gravcomp[body.id], 17))
