@@ -171,8 +171,9 @@ def test_bodies_beside_the_device_are_written_as_they_are(tmp_path):
     np.testing.assert_array_equal(data.mocap_pos, [[1, 2, 3]])
 
 
-def test_a_device_of_drawn_stiffness_bends_as_far_as_in_the_task(tmp_path):
-    options = {"randomisation": {"stiffness": [1.25, 1.25]}}
+def test_a_scene_has_the_drawn_stiffness_of_motors_and_friction_of_the_wall(tmp_path):
+    drawn = {"stiffness": [1.25, 1.25], "friction": [0.02, 0.02]}  # 0.037 otherwise
+    options = {"randomisation": drawn}
     out = write_mjcf(
         "type1_bca", tmp_path / "stiff", wall="prisms", task_kwargs=options
     )
@@ -186,6 +187,8 @@ def test_a_device_of_drawn_stiffness_bends_as_far_as_in_the_task(tmp_path):
         joint = model.joint(found.trnid[0])
         assert joint.stiffness == own.joint(joint.name).stiffness
         np.testing.assert_array_equal(found.gainprm, expected.gainprm)
+    # MuJoCo takes the larger coefficient of two geoms.
+    assert model.geom("wall_000").friction[0] == own.geom("wall").friction[0] == 0.02
 
 
 @pytest.mark.slow

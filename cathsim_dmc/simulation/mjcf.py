@@ -87,7 +87,8 @@ def write_mjcf(
     directory.parent.mkdir(parents=True, exist_ok=True)
     with atomic_directory(directory) as folder:
         mjcf.export_with_assets(env.task.root_entity.mjcf_model, folder, SCENE)
-        _in_one_file(folder / SCENE, env.task.scene, wall)
+        drawn = env.physics.model.ptr.geom("wall").friction
+        _in_one_file(folder / SCENE, env.task.scene, wall, drawn)
         chain = env.task.scene.catheter.mjcf_model.model
         _at_its_start(folder / SCENE, env.physics, f"{chain}/")
         (folder / TASK).write_text(json.dumps(values, indent=1) + "\n")
@@ -191,11 +192,15 @@ def _at_its_start(path: Path, physics: Any, chain: str) -> None:
     tree.write(str(path))
 
 
-def _in_one_file(path: Path, scene: Scene, wall: str) -> None:
+def _in_one_file(path: Path, scene: Scene, wall: str, friction: np.ndarray) -> None:
     """Writes surface and convex wall into the scene; drops classes of textures.
 
     MuJoCo up to 3.14 refuses a defaults class of textures. PyMJCF names a class in
     every element but defines none for textures, so nothing is lost.
+
+    Args:
+        wall: How the wall is divided.
+        friction: (3,) coefficients of the wall in the present episode.
     """
     tree = etree.parse(str(path))
     for texture in tree.iter("texture"):
@@ -215,6 +220,7 @@ def _in_one_file(path: Path, scene: Scene, wall: str) -> None:
         )
         geom = etree.SubElement(carrier.getparent(), "geom", dict(carrier.attrib))
         geom.attrib.update({"name": name, "type": "mesh", "mesh": name, "group": "3"})
+        geom.set("friction", _text(friction, 17))
         for attribute in ("pos", "size", "user"):
             del geom.attrib[attribute]
     carrier.getparent().remove(carrier)
