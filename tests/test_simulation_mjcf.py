@@ -12,8 +12,9 @@ from cathsim_dmc import suite
 from cathsim_dmc.entities.sheath import CLEARANCE
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import hold
-from cathsim_dmc.simulation.mjcf import write_mjcf
+from cathsim_dmc.simulation.mjcf import describe, write_mjcf
 from cathsim_dmc.tasks.navigation import Navigation
+from cathsim_dmc.tasks.objectives import Cannulation
 
 TASK, SEED, STEPS = "type1_lcca", 3, 30
 
@@ -189,6 +190,28 @@ def test_a_scene_has_the_drawn_stiffness_of_motors_and_friction_of_the_wall(tmp_
         np.testing.assert_array_equal(found.gainprm, expected.gainprm)
     # MuJoCo takes the larger coefficient of two geoms.
     assert model.geom("wall_000").friction[0] == own.geom("wall").friction[0] == 0.02
+
+
+class Inserted(Cannulation):
+    """Success after 3 cm."""
+
+    def success(self, measurement):
+        return measurement.readings.insertion > 0.03
+
+
+class Heavy(Cannulation):
+    """A cannulation with another reward."""
+
+    TERMS = {**Cannulation.TERMS, "weight": lambda self, m: m.readings.insertion}
+
+
+@pytest.mark.parametrize(("kind", "known"), [(Inserted, False), (Heavy, True)])
+def test_the_branch_stands_for_the_success_of_a_cannulation(kind, known, monkeypatch):
+    definition = suite.TaskDefinition("Own.", "type1", "bca", objective=kind.to)
+    monkeypatch.setitem(suite.TASKS, "own_bca", definition)
+    env = suite.environment(suite.make_task("own_bca", random=0))
+    env.reset()
+    assert (describe(env)["branch"] is not None) == known
 
 
 @pytest.mark.slow

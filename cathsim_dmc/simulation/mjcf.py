@@ -27,6 +27,8 @@ from cathsim_dmc.tasks.scene import Scene, chosen_devices
 
 FORMAT = 2
 SCENE, TASK = "scene.xml", "task.json"
+# Methods of a cannulation that decide what success is.
+_RULE = "outcome", "success", "failure", "distance", "in_branch"
 _SIDE = 8e-3  # m, thickness of the boxes around the bore of the sheath
 
 
@@ -109,7 +111,8 @@ def describe(env: Any) -> dict[str, Any]:
         "sensors" (name by quantity, and "contact_size", the numbers a contact takes in
         the sensor of the wall: found, force, dist, pos, normal, tangent), "goal" and
         "branch" (success: the head is within the goal's radius, nearer to the branch's
-        centreline than its radius there, and past its ostium), "max_steps",
+        centreline than its radius there, and past its ostium; "branch" is None for an
+        objective of your own with another success or a failure), "max_steps",
         "device_radius", "devices" (from the innermost outwards; of several the
         actuators move their combined chain) and "versions".
     """
@@ -263,8 +266,9 @@ def _sides(sheath: Sheath) -> Iterator[dict[str, str]]:
 
 
 def _branch(objective: Any) -> dict[str, Any] | None:
-    """Centreline of the target branch; None for an objective that has no branch."""
-    if not isinstance(objective, Cannulation):
+    """Centreline of the target branch; None for objectives with another success."""
+    same = (getattr(type(objective), n, None) is getattr(Cannulation, n) for n in _RULE)
+    if not all(same):
         return None
     line = objective.branch
     return {
