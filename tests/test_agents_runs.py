@@ -31,6 +31,8 @@ from cathsim_dmc.agents.training import take_over
 from cathsim_dmc.agents.training_log import read_metrics
 from cathsim_dmc.cli import agents, task_options
 from cathsim_dmc.simulation import environments
+from cathsim_dmc.tasks.observation_kind import Entry, ObservationKind
+from cathsim_dmc.tasks.observations import OBSERVATIONS
 
 
 def test_a_second_training_in_a_folder_is_refused(tmp_path):
@@ -184,6 +186,28 @@ def test_a_policy_that_observes_less_starts_a_training():
     for other in (("force", "route"), ("tracking", "route_retry")):
         with pytest.raises(ConfigError, match="does not fit .*observation: it has"):
             take_over(policy, config.replace(observation=other), shapes)
+
+
+def test_entries_of_other_names_start_no_training(tmp_path, monkeypatch):
+    """Only those of the route and of its reconstruction stand for each other."""
+    for name in ("tip_speed", "base_speed"):
+        row = ObservationKind(lambda frame: {}, (Entry(name, 3, "m/s", ""),))
+        monkeypatch.setitem(OBSERVATIONS, name, row)
+    config, shapes = make_config("ppo", hidden=(8,)), NetworkShapes(3, None, 2)
+    policy = make_policy(shapes, config)
+
+    def start(observation, other):
+        own = config.replace(observation=observation).to_dict()
+        card = {"task": config.task, "config": own, "shapes": shapes.to_dict()}
+        card |= {"task_kwargs": {}, "training": {}, "evaluation": {}}
+        weights = pretrained.write(tmp_path, "source", policy.state_dict(), card)
+        changes = {"observation": other, "initial_policy": str(weights)}
+        take_over(policy, config.replace(**changes), shapes)
+
+    start("tip_speed", "tip_speed")
+    start("route", "biplane")
+    with pytest.raises(ConfigError, match="observation: it has 'tip_speed', given is"):
+        start("tip_speed", "base_speed")
 
 
 def test_what_a_policy_of_images_observes_besides_may_grow(tmp_path):

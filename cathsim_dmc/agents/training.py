@@ -331,13 +331,13 @@ def _widened(
 
 
 def _entries(names: str | tuple[str, ...]) -> list[str]:
-    """Return the entries in the order of the networks, without their first word.
+    """Return the entries in the order of the networks.
 
-    The first word differs between "route" and "biplane".
+    Those of "route" and of "biplane", its reconstruction, have the same names.
     """
     rows = observations.entries(observations.resolve(names))
     keys = sorted(entry.key for entry in rows)
-    return [key.partition("_")[2] or key for key in keys]
+    return [key.removeprefix("route_").removeprefix("biplane_") for key in keys]
 
 
 def _loop(
