@@ -24,6 +24,13 @@ _FIGURES = "safe, 0.5 N", "steps", "mean force, mN", "largest sum, N"
 _KEYS = ("policy", "part", "goal", "access", "anatomy", "change", "arch", "devices")
 _KEYS += ("radius",)
 _HELD_OUT = {"arches": "held-out arches", "neck": "held-out arches with a neck"}
+_PARTS = {
+    **_HELD_OUT,
+    "variants": "kinds of arches",
+    "anatomies": "phantoms and scans",
+    "changes": "one change at a time",
+    "narrow": "branches that are too narrow",
+}
 
 
 def key(row):
@@ -177,6 +184,20 @@ def narrow(rows):
     return lines
 
 
+def measured(rows):
+    """Table of when, and at which commit, the cells of a policy were played."""
+    count = {}
+    for row in rows:
+        commit = row["commit"][:7] + row["commit"][40:]
+        place = row["policy"], _PARTS[row["part"]], row["date"], commit
+        count[place] = count.get(place, 0) + 1
+    lines = [
+        (f"`{policy}`", part, number, date, commit)
+        for (policy, part, date, commit), number in sorted(count.items())
+    ]
+    return grid(("policy", "table", "cells", "date", "commit"), lines)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="*", type=Path)
@@ -202,6 +223,8 @@ def main():
     found["kinds"] = kinds([r for r in varied if r["part"] != "anatomies"])
     tabled = "anatomies", *_HELD_OUT
     found["pair"] = pairs([row for row in coaxial if row["part"] in tabled])
+    found["measured"] = measured(rows.values())
+    found["pair measured"] = measured(coaxial)
     for page in PAGES:
         text = page.read_text()
         own = {name: x for name, x in found.items() if f"<!-- {name} -->" in text}
