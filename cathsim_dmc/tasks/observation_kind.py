@@ -125,10 +125,9 @@ class Entry:
             bounds.refuse(f"the shape of the entry {self.key!r}", shape, allowed)
         if math.isinf(self.low) and math.isinf(self.high):
             return specs.Array(shape, self.dtype, self.key)
-        most = (0, 255) if self.dtype == np.uint8 else (-math.inf, math.inf)
-        low, high = (
-            np.asarray(end, self.dtype) for end in np.clip((self.low, self.high), *most)
-        )
+        least, most = (0, 255) if self.dtype == np.uint8 else (-math.inf, math.inf)
+        low = np.asarray(max(self.low, least), self.dtype)
+        high = np.asarray(min(self.high, most), self.dtype)
         return specs.BoundedArray(shape, self.dtype, low, high, self.key)
 
 
