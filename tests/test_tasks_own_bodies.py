@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from dm_control import mjcf
+from test_recording_rerun_log import Recording
 
 from cathsim_dmc import suite
 from cathsim_dmc.physics.effects import Effect
+from cathsim_dmc.pictures import record
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.navigation import Navigation
 
@@ -142,3 +144,18 @@ def test_anatomies_share_no_model_with_other_meshes_of_one_name(monkeypatch):
     monkeypatch.setattr(Stone, "stretch", 2.0)
     with pytest.raises(ValueError, match="same meshes of your own"):
         _in_two_anatomies(monkeypatch)
+
+
+def test_a_recording_shows_a_body_beside_the_device(task_name, tmp_path):
+    env = suite.load("cathsim", task_name)
+    env.add_extra_hook("before_step", _push)
+    idle = np.zeros(env.action_spec().shape)
+    path = tmp_path / "e.rrd"
+    episode = record(env, lambda seen: idle, path, seed=2, max_steps=3)
+    file = Recording(path)
+    places = file.temporal["/world/bodies/own"]["Transform3D:translation"]
+    body = env.physics.model.name2id("own", "body")
+    assert np.allclose([one.as_py()[0] for one in places], episode.body_pos[:, body])
+    assert np.ptp(episode.body_pos[:, body, 0]) > 1e-3
+    shape = file.static["/world/bodies/own/sphere"]["Ellipsoids3D:half_sizes"]
+    assert np.allclose(shape[-1].as_py(), [[0.01, 0.01, 0.01]])

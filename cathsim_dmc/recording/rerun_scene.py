@@ -33,8 +33,11 @@ LABEL_COLOUR = (186, 58, 0)
 # Geoms that bodies collide with are not drawn, as in MuJoCo's own viewers.
 _VISIBLE_GROUPS = 3
 # MuJoCo geom types that a recording can draw, and how many sizes each one uses:
-# capsule and cylinder (radius, half length), box (half extents).
-SIZES = {"capsule": 2, "cylinder": 2, "box": 3}
+# capsule and cylinder (radius, half length), box (half extents), sphere (radius) and
+# ellipsoid (radii).
+SIZES = {"capsule": 2, "cylinder": 2, "box": 3, "sphere": 1, "ellipsoid": 3}
+# Entities whose bodies are drawn otherwise: as links of an episode, and as a surface.
+_APART = "catheter", "phantom"
 
 
 class Log:
@@ -210,14 +213,17 @@ class BodyGeom(NamedTuple):
     body: int  # row in `Episode.body_pos`: the MuJoCo id
     body_name: str  # in full, such as "robot/carriage"
     kind: str  # one of `SIZES`
-    size: np.ndarray  # MuJoCo's: (radius, half length) or half extents
+    size: np.ndarray  # MuJoCo's, see `SIZES`
     position: np.ndarray  # (3,) of the centre
     quaternion: np.ndarray  # (4,) wxyz
     rgba: np.ndarray  # (4,) in [0, 1]
 
 
 def body_geoms(physics: Any) -> Iterator[BodyGeom]:
-    """Yield the visible primitives of robot and sheath of a dm_control ``Physics``."""
+    """Yield the visible primitives of a dm_control ``Physics``.
+
+    Those of robot and sheath, and of bodies that a task has beside the device.
+    """
     import mujoco
 
     model = physics.model
@@ -227,7 +233,7 @@ def body_geoms(physics: Any) -> Iterator[BodyGeom]:
         name, material = model.id2name(body, "body"), int(model.geom_matid[geom])
         rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
         visible = rgba[3] > 0 and model.geom_group[geom] < _VISIBLE_GROUPS
-        if visible and kind and name.split("/", 1)[0] in ("robot", "sheath"):
+        if visible and kind and name.partition("/")[0] not in _APART:
             size = model.geom_size[geom][: SIZES[kind]]
             place, turn = model.geom_pos[geom], model.geom_quat[geom]
             yield BodyGeom(body, name, kind, size, place, turn, rgba)
@@ -240,7 +246,7 @@ def log_bodies(log: Log, geoms: Iterable[BodyGeom]) -> None:
     """
     by_body = sorted(geoms, key=lambda geom: (geom.body, geom.kind))
     for body, parts in itertools.groupby(by_body, lambda geom: geom.body):
-        entity = f"world/{next(parts).body_name.strip('/')}"
+        entity = _entity(next(parts))
         place = log.episode.body_pos[:, body]
         turn = np.roll(log.episode.body_quat[:, body], -1, axis=-1)  # xyzw
         if np.ptp(place, axis=0).any() or np.ptp(turn, axis=0).any():
@@ -252,8 +258,16 @@ def log_bodies(log: Log, geoms: Iterable[BodyGeom]) -> None:
     log.flush()
     for _, parts in itertools.groupby(by_body, lambda geom: (geom.body, geom.kind)):
         same = list(parts)
-        name, kind = same[0].body_name.strip("/"), same[0].kind
-        log.static(f"world/{name}/{kind}", _shape(kind, same))
+        kind = same[0].kind
+        log.static(f"{_entity(same[0])}/{kind}", _shape(kind, same))
+
+
+def _entity(geom: BodyGeom) -> str:
+    """Path of a body; bodies beside the device are apart from all other entities."""
+    parts = geom.body_name.strip("/").split("/")
+    if parts[0] not in ("robot", "sheath"):
+        parts = ["bodies", "/".join(parts) or str(geom.body)]
+    return "/".join(["world", *map(rr.escape_entity_path_part, parts)])
 
 
 def _shape(kind: str, parts: list[BodyGeom]) -> Any:
@@ -265,6 +279,9 @@ def _shape(kind: str, parts: list[BodyGeom]) -> Any:
     look |= {"colors": colours, "fill_mode": "solid"}
     if kind == "box":
         return rr.Boxes3D(half_sizes=size, centers=centre, **look)
+    if kind in ("sphere", "ellipsoid"):
+        sizes = np.broadcast_to(size, (len(size), 3))  # of a sphere one radius
+        return rr.Ellipsoids3D(half_sizes=sizes, centers=centre, **look)
     look |= {"radii": size[:, 0], "lengths": 2 * size[:, 1]}
     if kind == "cylinder":
         return rr.Cylinders3D(centers=centre, **look)
