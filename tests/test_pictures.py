@@ -237,8 +237,8 @@ def test_a_film_as_mp4_plays_the_episode(pushed, tmp_path):
     assert rows % 2 == columns % 2 == 0 and abs(columns - 321) < 4
     # Four pictures, and the last one for a while.
     seconds = episode.time[-1] - episode.time[0]
-    assert len(frames) == 4 + int(1500 // (1000 * seconds / 4))
-    assert about["duration"] == pytest.approx(seconds / 4 * len(frames), abs=0.1)
+    assert len(frames) == 4 + int(1500 // (1000 * seconds / 3))
+    assert about["duration"] == pytest.approx(seconds / 3 * len(frames), abs=0.1)
     moved = np.abs(frames[0] - frames[3]).mean()
     still = np.abs(frames[3] - frames[-1]).mean()
     assert moved > 1 > 3 * still
@@ -499,17 +499,27 @@ def test_the_frames_of_a_film_differ_where_the_device_moves(pushed, tmp_path):
     assert np.abs(frames[0] - frames[-1]).max() > 100
 
 
-def test_a_short_film_takes_two_seconds_and_a_rest(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "steps, count, tick, seconds",
+    [(4, 5, 500, 2.0), (103, 90, 46, 4.12)],  # a GIF has steps of 10 ms
+)
+def test_a_film_takes_the_time_of_the_episode_and_a_rest(
+    steps, count, tick, seconds, tmp_path, monkeypatch
+):
+    grey = np.tile(np.arange(64, dtype=np.uint8)[:, None], (64, 1, 3))
+
     def frames(episode, surface, width, steps):
-        return (np.full((64, 64, 3), 50 * number, np.uint8) for number in steps)
+        return (np.roll(grey, number, axis=1) for number in range(len(steps)))
 
     monkeypatch.setattr(animation, "_frames", frames)
-    film = Image.open(animate(make_episode(4), make_tube(), tmp_path / "a.gif"))
+    film = Image.open(animate(make_episode(steps), make_tube(), tmp_path / "a.gif"))
     times = []
     for number in range(film.n_frames):
         film.seek(number)
         times.append(film.info["duration"])
-    assert sum(times[:-1]) == 4 * 400 and times[-1] == 1500  # equal ones are one
+    assert film.n_frames == count and times[-1] == 1500
+    assert sum(times[:-1]) == pytest.approx(1000 * seconds, abs=40)
+    assert abs(np.array(times[:-1]) - tick).max() <= 10
 
 
 def test_the_contacts_of_a_state_are_those_of_the_step_that_leads_to_it():

@@ -77,7 +77,7 @@ def animate(
     count = min(frames, episode.steps + 1)
     chosen = np.unique(np.linspace(0, episode.steps, count).round().astype(int))
     made = list(_frames(episode, surface, width, chosen))
-    tick = max(round(1000 * seconds / len(made)), _TICK_MS)
+    tick = max(round(1000 * seconds / max(len(made) - 1, 1)), _TICK_MS)
     if path.suffix == MP4:
         return write_mp4(path, made, tick, _HOLD_MS)
     pictures = [Image.fromarray(picture) for picture in made]
@@ -85,11 +85,18 @@ def animate(
     options: dict[str, Any] = {"quality": quality, "method": 4}
     if path.suffix == ".gif":
         pictures, options = _one_palette(pictures), {"optimize": False}
+        times[:-1] = _whole_ticks(tick, len(times) - 1)
     options |= {"append_images": pictures[1:], "duration": times, "loop": 0}
     with atomic_path(path, path.suffix) as temporary:
         kind = path.suffix[1:].upper()
         pictures[0].save(temporary, format=kind, save_all=True, **options)
     return path
+
+
+def _whole_ticks(tick: int, count: int) -> list[int]:
+    """Returns times, ms, in steps of a GIF's 10 ms, whose sum is that of `tick`."""
+    ends = tick * np.arange(count + 1) / 10
+    return (10 * np.diff(ends.round().astype(int))).tolist()
 
 
 def _one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
