@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from test_play_hands import by_hand  # noqa: F401
 
-from cathsim_dmc import agents
+from cathsim_dmc import __version__, agents
 from cathsim_dmc.agents import hub, sharing
 from cathsim_dmc.analysis.force_statistics import millinewtons
 
@@ -81,7 +81,8 @@ def test_a_run_is_uploaded_with_what_it_reached(local, trained, tmp_path, by):
     run = tmp_path / "run"
     shutil.copytree(trained / "ppo", run)
     frames = agents.Checkpoint.open(run).frames - (by == "an earlier checkpoint")
-    reached = {"settings": {"frames": frames}, "policy": "ppo"}
+    settings = {"frames": frames, "protocol": "varied", "task_kwargs": {"lead": 0.1}}
+    reached = {"settings": settings, "policy": "ppo", "task": "type2_lcca"}
     reached["summary"] = {"episodes": 4, "success": 0.5}
     written = reached if by == "evaluate" else {"policy": reached}
     (run / "evaluation.json").write_text(json.dumps(written))
@@ -89,9 +90,26 @@ def test_a_run_is_uploaded_with_what_it_reached(local, trained, tmp_path, by):
     assert reference == f"hf:me/all@{COMMIT}#ppo_small" and not local.made[0][2]
     policy, same = agents.load_policy(reference), agents.load_policy(run)
     assert policy.card["training"]["frames"] == same.checkpoint.frames
-    assert policy.card["evaluation"] == ({} if by.startswith("an") else reached)
+    early = by.startswith("an")
+    assert policy.card["evaluation"] == ({} if early else reached)
+    (page,) = local.cache.rglob("README.md")
+    where = 'of `type2_lcca`, protocol varied, options `{"lead": 0.1}`'
+    shown = "Not evaluated." if early else f"Success 50 % of 4 episodes {where}."
+    assert shown in page.read_text()
     for name, tensor in same.network.state_dict().items():
         assert (policy.network.state_dict()[name] == tensor).all()
+
+
+def test_a_shared_card_has_the_versions_of_the_training(local, trained, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(trained / "ppo", run)
+    path = agents.Checkpoint.open(run).path / "checkpoint.json"
+    values = json.loads(path.read_text())
+    assert values["versions"]["cathsim-dmc"] == __version__
+    values["versions"]["mujoco"] = "3.0.0"
+    path.write_text(json.dumps(values))
+    card = agents.load_policy(sharing.upload(run, "hf:me/old")).card
+    assert card["versions"] == values["versions"]
 
 
 def test_damaged_weights_and_those_that_are_not_there_are_refused(local):

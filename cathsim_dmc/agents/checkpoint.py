@@ -51,6 +51,7 @@ class Checkpoint:
         frames: Number of frames that the run had seen.
         seconds: Wall time that the run had taken, over all its processes.
         sha256: Checksums of the files with the weights, by file name.
+        versions: Versions of the packages that trained it, by name.
     """
 
     path: Path
@@ -59,6 +60,7 @@ class Checkpoint:
     frames: int
     seconds: float
     sha256: Mapping[str, str]
+    versions: Mapping[str, str]
 
     @classmethod
     def open(cls, path: str | Path) -> "Checkpoint":
@@ -85,6 +87,7 @@ class Checkpoint:
                 frames=bounds.whole("frames", values["frames"], 0),
                 seconds=bounds.number("seconds", values["seconds"], 0.0),
                 sha256={name: values["sha256"][name] for name in (_POLICY, _LEARNING)},
+                versions=dict(values.get("versions", {})),
             )
 
     def policy_state(self) -> dict[str, Any]:
@@ -226,7 +229,7 @@ def save_checkpoint(
     if target.exists():
         # No frame was added since, as when a run is interrupted right after saving.
         return target
-    packages = ("torch", "torchrl", "mujoco", "dm-control")
+    packages = ("cathsim-dmc", "torch", "torchrl", "mujoco", "dm-control")
     sums: dict[str, str] = {}
     description = {
         "format": FORMAT, "frames": frames, "seconds": seconds,

@@ -4,7 +4,6 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.analysis.force_statistics import millinewtons
 from cathsim_dmc.recording.dataset import DatasetError, recordings_in
 
-_PACKAGES = ("cathsim-dmc", "torch", "torchrl", "mujoco", "dm-control")
 _PAGE = """\
 ---
 library_name: cathsim_dmc
@@ -110,32 +108,39 @@ def _write_policy(source: str | Path, folder: Path, name: str) -> dict[str, Any]
                 "seed": one.config.seed,
             },
             "evaluation": evaluation,
-            "versions": {name: metadata.version(name) for name in _PACKAGES},
+            "versions": dict(one.versions),
         }
     pretrained.write(folder, name, state, card)
     return card
 
 
 def _summary(card: Mapping[str, Any]) -> str:
-    """Return two sentences: what the policy is, and its success and force."""
+    """Return two sentences: what the policy is, and its success, where, and force."""
     config, training = card["config"], card["training"]
     text = (
         f"Policy of the task `{card['task']}` of cathsim_dmc, observation "
         f"`{config['observation']}`, {config['algorithm']}, {training['frames']:,} "
         "frames."
     )
-    summary = card["evaluation"].get("summary", {})
+    judged = card["evaluation"]
+    summary, settings = judged.get("summary", {}), judged.get("settings", {})
     if "success" not in summary:
         return f"{text} Not evaluated."
     forces = summary.get("forces", {})
     # As `EpisodeForces.max_force`.
     force = summary.get("max_force") or forces.get("mean_max") or forces.get("max")
     rate = f"{100 * summary['success']:.0f} % of {summary['episodes']} episodes"
+    # A card without these is of a policy that ships, evaluated on its task.
+    where = f" of `{judged['task']}`" if "task" in judged else ""
+    if "protocol" in settings:
+        where += f", protocol {settings['protocol']}"
+    if options := settings.get("task_kwargs"):
+        where += f", options `{json.dumps(options)}`"
     with_force = ""
     if isinstance(force, Mapping) and "maximum" in force:
         largest = force["maximum"]
         with_force = f", max force {millinewtons(largest['mean'])} mN"
-    return f"{text} Success {rate}{with_force}."
+    return f"{text} Success {rate}{where}{with_force}."
 
 
 def _write_page(folder: Path, name: str, what: str, command: str) -> None:
