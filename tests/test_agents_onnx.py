@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from cathsim_dmc import agents
+from cathsim_dmc import agents, suite
 from cathsim_dmc.agents import onnx_export, onnx_selftest, pretrained
 from cathsim_dmc.agents.networks import network_of
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
@@ -51,7 +51,19 @@ def test_the_model_acts_as_the_policy_and_says_what_it_reads(exported):
     assert (last["name"], last["scale"]) == ("insertion", MAX_PUSH_SPEED)
     assert len(card["output"]["entries"]) == 21
     assert card["evaluation"]["success"] == 1.0
+    about = {"task": "femoral_type1_lcca", "options": {"max_steps": 2000}}
+    assert about.items() <= card["evaluation"].items()  # not of the short episode
+    assert card["evaluation"]["protocol"] == "published"
     assert card["versions"]["exported"]["onnxruntime"]
+
+
+def test_the_card_of_a_run_has_the_versions_of_its_training(trained):
+    player = agents.load_policy(trained / "ppo")
+    task = suite.make_task("type1_bca")  # which the versions do not depend on
+    card = onnx_export.card_of(player, task)
+    kept = json.loads((player.checkpoint.path / "checkpoint.json").read_text())
+    assert card["versions"]["trained"] == kept["versions"]
+    assert card["evaluation"] is None
 
 
 def test_the_self_test_runs_without_the_package_and_can_fail(exported, tmp_path):

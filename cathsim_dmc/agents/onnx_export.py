@@ -147,13 +147,15 @@ def card_of(player: TrainedPolicy, task: Any) -> dict[str, Any]:
         "inputs": each with "name", "dtype", "shape" (N is the number of observations),
         "entries" (key, place, unit and meaning, in their order) and "normaliser",
         which is part of the model; "output", with the meaning of each action;
-        "control_timestep" in s; "training", "evaluation", "versions".
+        "control_timestep" in s; "training"; "evaluation", with its "task", "options"
+        and "protocol", or None; "versions".
     """
     shapes, table = player.shapes, observation_table(task)
     inputs = zip(shapes.raw_keys, _normalisers(player.network), strict=True)
     card, kept = player.card or {}, player.checkpoint
     if kept is not None:
         card = {"sha256": dict(kept.sha256), "training": {"frames": kept.frames}}
+        card["versions"] = dict(kept.versions)
     training = {"seed": player.config.seed, **card["training"]}
     return {
         "format": FORMAT,
@@ -169,12 +171,27 @@ def card_of(player: TrainedPolicy, task: Any) -> dict[str, Any]:
         "control_timestep": CONTROL_TIMESTEP,
         "sha256": card["sha256"],
         "training": {**training, "task": player.config.task},
-        "evaluation": card.get("evaluation", {}).get("summary"),
+        "evaluation": _evaluation(card),
         "versions": {
             "trained": card.get("versions"),
             "exported": {one: metadata.version(one) for one in _PACKAGES},
         },
     }  # fmt: skip
+
+
+def _evaluation(card: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the figures of a card with the task that they are of; None without."""
+    found = card.get("evaluation", {})
+    if "summary" not in found:
+        return None
+    # A card of a policy that ships has its task alone, which it was evaluated on.
+    settings = found.get("settings", {})
+    about = {
+        "task": found.get("task", card["task"]),
+        "options": settings.get("task_kwargs", card["task_kwargs"]),
+        "protocol": settings.get("protocol", "published"),
+    }
+    return {**about, **found["summary"]}
 
 
 def _input(
