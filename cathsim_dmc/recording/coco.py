@@ -61,6 +61,8 @@ def described(columns: np.ndarray, bit: int = 1) -> dict[str, Any]:
 def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[Any]]:
     """Returns the images and annotations of one file of sequences.
 
+    What an image does not show, an empty mask, has no annotation.
+
     Args:
         path: Path of the HDF5 file, see `recording.sequences`.
         number: Number of the file in its split; it makes the ids unique.
@@ -98,11 +100,13 @@ def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[An
             known = (own[..., 2] > 0).sum(axis=1).tolist()
             flat = own.reshape(rows, -1).tolist()
             for row, mask in enumerate(masks):
-                image = first + row
+                image, shape = first + row, described(mask, bit)
+                if not shape["area"]:  # training code refuses empty boxes
+                    continue
                 annotations.append({  # COCOeval takes an id of 0 for no match
                     "id": 2 * image + kind + 1,
                     "image_id": image, "category_id": kind + 1,
-                    **described(mask, bit), "keypoints": flat[row],
+                    **shape, "keypoints": flat[row],
                     "num_keypoints": known[row],
                 })  # fmt: skip
         if pictures and not (folder := path.with_suffix("")).exists():
