@@ -151,7 +151,7 @@ def play(
         if action is None:
             slides = _Slides(step.readings.insertion, limit.growth)
             continue
-        tracker.add(step.wall_force)
+        tracker.add(step.wall_force, step.physics_error)
         slides.add(step.readings.insertion)
         for index, end in _ends(step, number, slides.steps, limit).items():
             if running[index]:

@@ -88,7 +88,7 @@ def test_episodes_that_end_at_different_steps_keep_apart(seed, steps, count):
     tracker = ForceTracker(count)
     begun = np.zeros(count, int)
     for step in range(steps):
-        tracker.add(values[:, step])
+        tracker.add(values[:, step], np.zeros(count, bool))
         for simulation in np.flatnonzero(ends[step]):
             found = dataclasses.astuple(tracker.finish(simulation))
             part = values[:, begun[simulation] : step + 1, simulation]
@@ -100,6 +100,17 @@ def test_episodes_that_end_at_different_steps_keep_apart(seed, steps, count):
                 else:
                     assert touching is None
             begun[simulation] = step + 1
+
+
+def test_the_step_of_a_physics_error_has_no_part_in_the_forces():
+    tracker = ForceTracker(2)
+    for force, failed in ([2.0, 1.0], [False, False]), ([1e6, 3.0], [True, False]):
+        tracker.add([np.array(force)] * len(QUANTITIES), np.array(failed))
+    first, second = tracker.finish(0), tracker.finish(1)
+    assert (first.max_force, first.mean_force) == (2.0, 2.0)
+    assert (second.max_force, second.mean_force) == (3.0, 2.0)
+    tracker.add([np.array([1e6, 0.0])] * len(QUANTITIES), np.array([True, False]))
+    assert tracker.finish(0) == EpisodeForces()
 
 
 def test_forces_are_told_in_three_digits():

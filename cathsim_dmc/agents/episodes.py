@@ -20,7 +20,8 @@ class EpisodeOutcome:
         length: Number of control steps.
         terminated: Whether the task ended it, not the limit of steps.
         success: Whether the goal was reached.
-        forces: Forces on the wall, N, such as `forces.mean_force`.
+        forces: Forces on the wall, N, such as `forces.mean_force`, without the control
+            step of a physics error.
         physics_error: Whether the simulation diverged, which ended it.
         path_ratio: Length of the head's path divided by the shortest way to the goal;
             below 1 where the head cuts the corner of the route at an ostium.
@@ -80,7 +81,7 @@ class EpisodeTracker:
                 self.reward[env] = self.length[env] = 0
             self.reward += reward[:, step]
             self.length += 1
-            self.forces.add([one[:, step] for one in forces])
+            self.forces.add([one[:, step] for one in forces], error[:, step])
             for env in map(int, np.flatnonzero(done[:, step])):
                 finished.append(
                     EpisodeOutcome(

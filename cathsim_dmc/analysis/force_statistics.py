@@ -102,14 +102,20 @@ class ForceTracker:
         """Starts N episodes."""
         self._steps: list[list[np.ndarray]] = [[] for _ in range(num_simulations)]
 
-    def add(self, forces: Sequence[np.ndarray]) -> None:
-        """Add a control step: one array (N,), N, for each of `QUANTITIES`, in order."""
+    def add(self, forces: Sequence[np.ndarray], failed: np.ndarray) -> None:
+        """Add a control step.
+
+        Args:
+            forces: One array (N,), N, for each of `QUANTITIES`, in order.
+            failed: (N,) bool, where the physics failed, whose forces do not count.
+        """
         rows = np.array(forces, dtype=np.float64).T
-        for steps, row in zip(self._steps, rows, strict=True):
-            steps.append(row)
+        for steps, row, lost in zip(self._steps, rows, failed, strict=True):
+            if not lost:
+                steps.append(row)
 
     def finish(self, simulation: int) -> EpisodeForces:
-        """Ends the episode of a simulation and returns its statistics."""
+        """Ends the episode of a simulation; its statistics are None without a step."""
         steps, self._steps[simulation] = self._steps[simulation], []
         columns = zip(QUANTITIES, np.transpose(steps), strict=False)
         return EpisodeForces(**{name: _statistics(column) for name, column in columns})
