@@ -101,6 +101,27 @@ def test_only_the_first_episode_of_each_seed_counts():
         assert episode.length < 20  # so that another one ends
 
 
+def test_an_observer_leaves_out_the_step_of_a_physics_error(monkeypatch):
+    """The first of two stands still, and its physics fails in the third step."""
+    step, run = synthetic_env.ReachEnv._step, []
+
+    def failing(self, tensordict):
+        after = step(self, tensordict)
+        lost = torch.tensor([[self.count[0] == 3], [False]])
+        after["info", "physics_error"] = lost.float()
+        after["terminated"] |= lost
+        after["done"] |= lost
+        return after
+
+    monkeypatch.setattr(synthetic_env.ReachEnv, "_step", failing)
+    found = play(
+        policy=lambda observation: 0 * push(observation), episodes=2, seed=50,
+        observer=lambda env, running: run.append(running.copy()),
+    ).episodes  # fmt: skip
+    assert [one.length for one in found] == [3, 40] and found[0].physics_error
+    assert sum(run).tolist() == [2, 40]
+
+
 def test_options_of_an_evaluation_replace_those_of_the_training():
     class Trained(Policy):
         task_kwargs, observation = {"max_steps": 5}, "internal"

@@ -30,7 +30,6 @@ class ContactLog:
         """Adds the contacts at the end of a control step."""
         found = env.base_env.simulation.contacts()
         present = found.present & running[:, None]
-        present &= np.isfinite(found.magnitude)  # not so after a physics error
         self._steps.append((found.position[present], found.magnitude[present]))
 
     def join(self, logs: Sequence["ContactLog"]) -> None:

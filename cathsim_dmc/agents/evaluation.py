@@ -33,7 +33,8 @@ from cathsim_dmc.tasks.anatomies import lumens
 from cathsim_dmc.tasks.config import EVALUATION_SEED
 from cathsim_dmc.tasks.snapshot import Snapshot
 
-# Called after every step with the environment and which episodes (n,) bool still run.
+# Called after every step with the environment and which episodes (n,) bool have been in
+# it, without those whose physics failed.
 Observer = Callable[[EnvBase, np.ndarray], None]
 
 
@@ -80,7 +81,8 @@ def evaluate(
         out_dir: Directory for evaluation.json, written at the end; None writes none.
         error_dir: Directory for files of the last physics errors; None takes errors/ in
             `out_dir`, if that is given.
-        observer: Function that is called after every step, before any reset.
+        observer: Function that is called after every step, before any reset, see
+            `Observer`.
         start: Snapshot of running episodes, as many as are played, which continue and
             are counted from there; None for the starts of the task.
         make_env: Function with the arguments of `environments.make_env`; "info" of its
@@ -349,7 +351,8 @@ def _first_episodes(
         state["action"] = _checked(policy, policy.act(state), env)
         stepped = env.step(state)
         if observer is not None:
-            observer(env, running)
+            failed = stepped["next", "info", "physics_error"].reshape(-1).numpy() > 0
+            observer(env, running & ~failed)
         for outcome in tracker.add(stepped.unsqueeze(1)):
             outcomes.setdefault(outcome.env, outcome)
         begun = stepped["next", "done"].reshape(-1).numpy()
