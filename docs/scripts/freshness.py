@@ -81,15 +81,20 @@ def _measured(path: Path, parts: list[str]) -> set[tuple[tuple[str, ...], str]]:
     A commit is one that the file or the row names, else the last one that changed the
     file. A row with the values of an entry of "rows" depends on the parts there, too.
     """
-    last = figures.git("log", "-1", "--format=%h", "--", str(path)).stdout.strip()
     text, own = path.read_text(), TABLE["rows"].get(path.name, [])
     found = set()
     for row in text.splitlines() if path.suffix == ".jsonl" else [text]:
         values = json.loads(row)
         more = [extra for some, extra in own if some.items() <= values.items()]
-        commits = _COMMIT.findall(row) or [last]
+        commits = _COMMIT.findall(row) or [_last_change(path)]
         found |= {((*parts, *sum(more, [])), commit) for commit in commits}
     return found
+
+
+@functools.cache
+def _last_change(path: Path) -> str:
+    """The last commit that changed a file."""
+    return figures.git("log", "-1", "--format=%h", "--", str(path)).stdout.strip()
 
 
 def summary(names: list[str], known: dict[str, dict]) -> list[str]:
