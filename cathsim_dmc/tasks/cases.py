@@ -241,11 +241,8 @@ def _mesh_numbers(
     found = model.geom_dataid.copy()
     for number in range(model.nmesh):
         name = model.mesh(number).name
-        if name not in there or any(
-            not np.array_equal(own, other)
-            for own, other in zip(
-                _mesh(model, number), _mesh(host, there[name]), strict=True
-            )
+        if name not in there or not all(
+            map(np.array_equal, _mesh(model, number), _mesh(host, there[name]))
         ):
             raise ValueError(
                 f"{names}: there is no such mesh {name!r} there; give all scenes the "
@@ -258,11 +255,6 @@ def _mesh_numbers(
 
 def _mesh(model: mujoco.MjModel, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns the vertices (V, 3), m, and triangles (F, 3) of a mesh."""
-    vertices, faces = (
-        np.arange(count[number]) + start[number]
-        for start, count in (
-            (model.mesh_vertadr, model.mesh_vertnum),
-            (model.mesh_faceadr, model.mesh_facenum),
-        )
-    )
-    return model.mesh_vert[vertices], model.mesh_face[faces]
+    first, count = model.mesh_vertadr[number], model.mesh_vertnum[number]
+    start, size = model.mesh_faceadr[number], model.mesh_facenum[number]
+    return model.mesh_vert[first:][:count], model.mesh_face[start:][:size]
