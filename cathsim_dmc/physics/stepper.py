@@ -40,12 +40,14 @@ class Stepper(abc.ABC):
         num_simulations: N.
         substeps: S, physics steps in a control step.
         has_snapshots: Whether `kept` and `put_back` are supported.
+        has_hooks: Whether hooks of composer may write all fields of the model.
     """
 
     arrays: Any
     warnings: np.ndarray
     driven = slice(None)
     has_snapshots = False
+    has_hooks = False
 
     def __init__(self, model: mujoco.MjModel, num_simulations: int, substeps: int):
         """Finds the wall, its sensor and the links that may touch it in the scene."""
@@ -104,8 +106,7 @@ class Stepper(abc.ABC):
         self, indices: np.ndarray, option: str, change: Callable[[Any], Any]
     ) -> None:
         """Changes an option of the models of some simulations."""
-        models = map(self._model_of, indices)
-        for options in {id(model): model.opt for model in models}.values():
+        for options in {id(m): m.opt for m in map(self._model_of, indices)}.values():
             setattr(options, option, change(getattr(options, option)))
 
     def begin(self, control: np.ndarray) -> None:
@@ -297,6 +298,7 @@ class SingleStepper(Stepper):
     """
 
     has_snapshots = True
+    has_hooks = True
 
     def __init__(
         self,

@@ -16,7 +16,7 @@ from cathsim_dmc.imaging.options import VIEW_ANGLE
 from cathsim_dmc.physics.effects import World
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import Readings
-from cathsim_dmc.physics.stepper import SingleStepper, Stepper
+from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks.render_thread import render_thread
 
 # Two cameras of `scene.Scene`, and one in the head of the device, see `Cameras`.
@@ -204,7 +204,7 @@ class Cameras:
             self._model.stat.extent = _EXTENT
             self._number = number
         written = self._written
-        if isinstance(stepper, SingleStepper):  # hooks may write all fields
+        if stepper.has_hooks:
             written = _DRAWN if meshes is not None else _DRAWN | _AIMED
         for name in written:
             getattr(self._model, name)[:] = stepper.field(index, name)
