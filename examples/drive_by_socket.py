@@ -45,7 +45,8 @@ def main() -> None:
         send(sock, "hello", protocol=1, name="drive_by_socket")
         welcome = receive(stream)
         names = [one["name"] for one in welcome["action"]]
-        print(f"{welcome['name']}: {len(names)} actions, last {names[-1]}")
+        pushes = [float(name.endswith("insertion")) for name in names]
+        print(f"{welcome['name']}: {len(names)} actions, {sum(pushes):g} of them push")
         send(sock, "start", seed=options.seed)
         back, step = 0, 0
         while (state := receive(stream))["kind"] == "state":
@@ -54,7 +55,7 @@ def main() -> None:
                 break
             if state["force"].get("largest", 0.0) > LIMIT:  # if it is measured
                 back = WITHDRAWAL
-            action = [0.0] * (len(names) - 1) + [-1.0 if back else 1.0]
+            action = [-push if back else push for push in pushes]
             back = max(0, back - 1)
             send(sock, "action", step=step, action=action)
         print(state.get("end") or state["reason"], "after", step, "steps")

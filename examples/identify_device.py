@@ -41,7 +41,9 @@ class Bench:
         self._given = {"stiffness": Given(), "friction": Given()}
         ranges = {**self._given, "start_radius": 0.0}
         observed = {"observation": ["tracking", "force"], "randomisation": ranges}
-        self._simulation = BatchSimulation(suite.make_task(task, **observed), count)
+        made = suite.make_task(task, **observed)
+        self._pushes = list(made.scene.catheter.translations)
+        self._simulation = BatchSimulation(made, count)
 
     def push(self, devices: np.ndarray, steps: int) -> np.ndarray:
         """Measurements (N, steps, n) of devices (N, 2), in standard deviations."""
@@ -49,7 +51,7 @@ class Bench:
             given.give(column)
         self._simulation.reset()
         action = np.zeros((len(devices), self._simulation.num_actions))
-        action[:, -1] = 1.0
+        action[:, self._pushes] = 1.0
         rows = []
         for _ in range(steps):
             seen = self._simulation.step(action).observation

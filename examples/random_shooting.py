@@ -29,7 +29,8 @@ def best_actions(
     planner.restore(snapshot.repeat(count))
     # Actions that are held for some steps reach farther than white noise.
     held = random.uniform(-1.0, 1.0, (horizon // 5 + 1, count, planner.num_actions))
-    held[..., -1] = np.abs(held[..., -1])  # forward
+    pushes = list(planner.task.scene.catheter.translations)
+    held[..., pushes] = np.abs(held[..., pushes])  # forward
     sequences = np.repeat(held, 5, axis=0)[:horizon]
     total, running = np.zeros(count), np.ones(count, bool)
     for actions in sequences:

@@ -1017,7 +1017,9 @@ def test_a_port_that_is_taken_is_refused_before_anything_compiles(cathsim, monke
     assert code == 2 and f"cannot listen on 127.0.0.1:{port}" in told
 
 
-def test_the_example_says_after_how_many_steps_a_device_stops(monkeypatch, capsys):
+def test_the_example_pushes_and_says_after_how_many_steps_a_device_stops(
+    monkeypatch, capsys
+):
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "examples")
     import drive_by_socket as example
 
@@ -1027,13 +1029,16 @@ def test_the_example_says_after_how_many_steps_a_device_stops(monkeypatch, capsy
         sock, _ = server.accept()
         with sock, sock.makefile("rb") as stream:
             example.receive(stream)
-            example.send(sock, "welcome", name="d", action=[{"name": "insertion"}])
+            names = "wire/insertion", "wire/rotation"
+            action = [{"name": name} for name in names]
+            example.send(sock, "welcome", name="d", action=action)
             for step in range(3):
-                example.receive(stream)
+                sent.append(example.receive(stream).get("action"))
                 example.send(sock, "state", step=step, **state)
             example.send(sock, "stop", reason="watchdog")
             example.receive(stream)
 
+    sent: list = []
     with socket.create_server(("127.0.0.1", 0)) as server:
         thread = threading.Thread(target=device, args=(server,))
         thread.start()
@@ -1042,3 +1047,4 @@ def test_the_example_says_after_how_many_steps_a_device_stops(monkeypatch, capsy
         example.main()
         thread.join(10.0)
     assert "watchdog after 2 steps" in capsys.readouterr().out
+    assert sent == [None, [1.0, 0.0], [1.0, 0.0]]  # the start, then the push

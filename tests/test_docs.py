@@ -8,8 +8,10 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -196,3 +198,24 @@ def test_the_example_of_ppo_learns_what_it_prints(tmp_path):
 def test_examples_print_what_they_find(tmp_path, name, options, printed):
     script = str(ROOT / "examples" / f"{name}.py")
     assert re.search(printed, run([script, *options.split()], tmp_path))
+
+
+def test_examples_push_coaxial_devices_forward(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    import identify_device
+    import random_shooting
+
+    rows = identify_device.Bench("simple1_bca_wire", 1).push(np.array([[1.0, 0.05]]), 5)
+    points = rows[0, :, :-1].reshape(5, -1, 3) * identify_device.POINT
+    assert np.linalg.norm(points[-1, -1] - points[0, -1]) > 5e-3
+
+    zeros = SimpleNamespace(outcome=SimpleNamespace(reward=np.zeros(9)))
+    zeros.terminated = zeros.truncated = np.zeros(9, bool)
+    pair = SimpleNamespace(catheter=SimpleNamespace(translations=(0, 2)))
+    planner = SimpleNamespace(num_simulations=9, num_actions=4, played=[])
+    planner.task, planner.restore = SimpleNamespace(scene=pair), lambda snapshot: None
+    planner.step = lambda actions: planner.played.append(actions) or zeros
+    snapshot = SimpleNamespace(repeat=lambda count: None)
+    random_shooting.best_actions(planner, snapshot, 10, np.random.default_rng(0))
+    played = np.array(planner.played)
+    assert (played[..., [0, 2]] >= 0).all() and (played[..., [1, 3]] < 0).any()
