@@ -149,10 +149,9 @@ class StartPosture:
                 break
             displacement = start_displacement(random_state, self._radius)
         else:
-            asked = np.zeros(3)
-            joints = posture.joints(asked, episode.roll)
+            joints = posture.joints(np.zeros(3), episode.roll)
         posture.write(qpos, joints)
-        return Started(posture.advance, asked)
+        return Started(posture.advance, posture.displaced(joints, episode.roll))
 
 
 class _Posture:
@@ -248,6 +247,10 @@ class _Posture:
         ):
             return False
         return bool((self._shape.depths(points) <= self._deepest).all())
+
+    def displaced(self, joints: _Joints, roll: float | None) -> np.ndarray:
+        """Displacement (3,) of the head by joints, m, frame of the inlet."""
+        return (self._shape.points(joints, roll or 0.0)[-1] - self._head) @ self._frame
 
     def write(self, qpos: np.ndarray, joints: _Joints) -> None:
         """Writes joints into the configuration (nq,)."""
