@@ -84,7 +84,9 @@ class Randomisation:
             hydrophilic device is this times its `friction_ratio`.
         stiffness: factor of EI and GJ; damping and steering torques are scaled alike,
             so relaxation time and steering angles do not change.
-        loss: factor of the loss factor of the material.
+        loss: factor of the loss factor of the material. That of the simulated device is
+            0.025 at least, which a physics step of 4 ms gives it; a metal has less, so
+            half or twice as much changes nothing.
         viscosity: factor of the viscosity of blood.
         start_radius: radius of the ball in which the tip starts, m.
         view: deviation of the C-arm's angles, degrees, rounded to whole degrees.
@@ -97,7 +99,9 @@ class Randomisation:
         start_insertion: additional insertion at the start, m, in steps of 5 mm; scaled
             down where its largest value is more than half of the way to the goal.
         tracking_noise: standard deviation of each coordinate of the tracked points,
-            m, drawn anew in every control step.
+            m, drawn anew in every control step. The errors are drawn at the joints of
+            the chain; a point of `tracking` between two of them, as those of wires and
+            pairs, has their weighted mean, which is up to 30 % smaller.
     """
 
     friction: Range | None = None

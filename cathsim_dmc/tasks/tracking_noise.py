@@ -8,9 +8,11 @@ from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 
 
 class TrackingNoise:
-    """Independent normal errors of every tracked point, drawn in each control step.
+    """Independent normal errors of the joints, drawn in each control step.
 
-    Rewards, success and images use the true points.
+    So have the head and the points of coaxial devices. A tracked point between two
+    joints has the weighted mean of their errors. Rewards, success and images use the
+    true points.
 
     Attributes:
         deviation: Standard deviation of each coordinate, m; 0 for no errors.
