@@ -1,5 +1,6 @@
 """The compiled chain is the device it stands for: masses, stiffness, shape, motors."""
 
+import dataclasses
 import math
 
 import mujoco
@@ -21,6 +22,7 @@ from cathsim_dmc.entities.chain import (
     TORSION_ARMATURE,
 )
 from cathsim_dmc.entities.coaxial import carried_mass
+from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.laws import coaxial
 
 STEERABLE = ("steerable_5f", "steerable_4f")
@@ -248,6 +250,27 @@ def test_rest_shape_turns_by_the_arcs(name):
     outer = catheter.link_lengths[-1] / 2  # the last half link has no joint
     lost = catheter.device.rest_angle(outer, 0.0)
     assert rest[1::2].sum() == pytest.approx(turning - lost, rel=1e-9)
+
+
+def test_a_shape_has_links_that_follow_it():
+    """Straight links of a few of a pigtail would bend it by millimetres elsewhere."""
+    wire = devices.get("wire_035_glide")
+    arc = devices.Arc(6e-3, math.radians(300))
+    pigtail = dataclasses.replace(
+        wire, name="pigtail", tip_length=0.04, tip_links=6, tip_shape=(arc,)
+    )
+    catheter = Catheter(pigtail)
+    rest = np.cumsum([0.0, *(hinge.springref for hinge in catheter.bends[1::2])])
+    ways = catheter.link_lengths[:, None] * np.stack([np.sin(rest), np.cos(rest)], -1)
+    end = ways.sum(0) - (0.0, catheter.link_lengths.sum() - arc.length)
+    exact = arc.radius * np.array([1 - math.cos(arc.angle), math.sin(arc.angle)])
+    np.testing.assert_allclose(end, exact, atol=0.5e-3)
+    for links, angle in ((1, 109), (3, 130), (5, 68)):
+        coarse = dataclasses.replace(pigtail, tip_links=links)
+        wrong = f"'pigtail' bends by {angle}°.*up to 60°; give more tip_links than "
+        for chain in (Catheter, lambda one: DeviceStack((one,))):
+            with pytest.raises(ValueError, match=f"{wrong}{links},"):
+                chain(coarse)
 
 
 @pytest.mark.parametrize(
