@@ -94,14 +94,16 @@ class Randomisation:
         kerma: factor of the kerma, which sets the quantum noise (with `noise`).
         goal_shift: shift of the goal along its branch, m, positive away from the
             ostium.
-        roll: rotation of the device about its own axis at the start, rad.
+        roll: rotation of the device about its own axis at the start, rad. A shaped
+            device starts in the posture without roll and turns into its shape in the
+            first control steps, by millimetres.
         delay: shortest and longest delay of the action, whole control steps.
         start_insertion: additional insertion at the start, m, in steps of 5 mm; scaled
             down where its largest value is more than half of the way to the goal.
         tracking_noise: standard deviation of each coordinate of the tracked points,
             m, drawn anew in every control step. The errors are drawn at the joints of
             the chain; a point of `tracking` between two of them, as those of wires and
-            pairs, has their weighted mean, which is up to 30 % smaller.
+            pairs, has their weighted mean, which is smaller by √2 at most.
     """
 
     friction: Range | None = None

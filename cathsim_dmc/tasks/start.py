@@ -74,7 +74,8 @@ class StartPosture:
 
     The device is laid along the centreline of the vessel and settles once, with motors
     and base at rest, on the compiled model without randomisation. An episode starts in
-    the settled posture, at rest, with the head displaced as drawn.
+    the settled posture, at rest, with the head displaced as drawn. A drawn roll leaves
+    the posture as it is, so a shaped device then turns into its rolled shape.
     """
 
     def __init__(
