@@ -103,7 +103,7 @@ class Randomisation:
         tracking_noise: standard deviation of each coordinate of the tracked points,
             m, drawn anew in every control step. The errors are drawn at the joints of
             the chain; a point of `tracking` between two of them, as those of wires and
-            pairs, has their weighted mean, which is smaller by √2 at most.
+            pairs, has their weighted mean, which is smaller by a factor of √2 at most.
     """
 
     friction: Range | None = None
