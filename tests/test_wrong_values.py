@@ -239,11 +239,18 @@ def test_a_task_is_not_stepped_by_an_environment_that_has_lost_it(call):
     last.step(np.zeros(task.num_actions))
 
 
+@pytest.mark.parametrize("drawn", [False, True])
 @pytest.mark.parametrize("friction", [1.0, 2.0])
-def test_the_friction_of_a_device_is_refused_with_its_ratio(friction):
+def test_the_friction_of_a_device_is_refused_with_its_ratio(friction, drawn):
     rough = dataclasses.replace(devices.get("steerable_5f"), name="r", friction_ratio=3)
-    with pytest.raises(ValueError, match=rf"friction is {friction:g}.*'r'.* 3.*most 2"):
-        suite.make_task("simple1_bca", device=rough, friction=friction)
+    passive = dataclasses.replace(rough, steering_angle=0.0)
+    given = {"friction": friction}
+    if drawn:
+        given = {"randomisation": {"friction": (0.0, friction)}}
+    for chosen in ({"device": rough}, {"devices": [passive]}):
+        wrong = rf"friction is {friction:g}.*'r'.* 3.*most 2"
+        with pytest.raises(ValueError, match=wrong):
+            suite.make_task("simple1_bca", **chosen, **given)
 
 
 def test_options_do_not_change_with_what_they_were_given_as():

@@ -99,13 +99,14 @@ class Scene:
         goal = placement.resolve_goal(anatomy, goal)
         config.vessel.check(anatomy)
         chosen, shift = chosen_devices(config), config.randomisation.farthest_shift
+        _check_friction(chosen, config)
         length, play = config.working_length, config.sheath_clearance or 0.0
         place = placement.place_device(
             anatomy, goal, longest_tip(chosen), length, shift, play
         )
         friction = config.friction
         if config.devices is None:  # in a stack, it differs from link to link
-            friction *= _friction_ratio(chosen[0], friction)
+            friction *= chosen[0].friction_ratio
         catheter = _chain(chosen, place, config, friction)
         if config.vessel.wall is not None:
             soften(catheter)
@@ -209,16 +210,19 @@ def longest_tip(chosen: Sequence[devices.Device]) -> devices.Device:
     return max(chosen, key=lambda device: device.tip_length)
 
 
-def _friction_ratio(device: devices.Device, friction: float) -> float:
-    """The friction ratio of a device; ValueError if its friction is out of range."""
-    ratio = device.friction_ratio
-    if ratio * friction > MOST_FRICTION:
-        raise ValueError(
-            f"friction is {friction:g} for an uncoated device, and device "
-            f"{device.name!r} has a friction_ratio of {ratio:g}; their product must be "
-            f"at most {MOST_FRICTION:g}"
-        )
-    return ratio
+def _check_friction(chosen: Sequence[devices.Device], config: NavigationConfig) -> None:
+    """Raise ValueError if the friction of a device on the wall can be out of range."""
+    drawn = config.randomisation.friction
+    ends = drawn if isinstance(drawn, Sequence) else (0.0,)
+    friction = max(config.friction, *ends)
+    for device in chosen:
+        ratio = device.friction_ratio
+        if ratio * friction > MOST_FRICTION:
+            raise ValueError(
+                f"friction is {friction:g} for an uncoated device, and device "
+                f"{device.name!r} has a friction_ratio of {ratio:g}; their product "
+                f"must be at most {MOST_FRICTION:g}"
+            )
 
 
 def _chain(
