@@ -23,9 +23,9 @@ class Conditions(NamedTuple):
         anatomy: Name of the anatomy.
         goal: Name of the goal in it.
         insertion: Insertion at the start beyond the task's own start, m.
-        displacement: (3,) of the head at the start, frame of the inlet, m. It is
-            reduced where the vessel is too narrow for the drawn one, and joints that
-            are linear in the drawn one miss a large one.
+        displacement: (3,) of the head at the start, frame of the inlet, m. It differs
+            from the drawn one where the vessel is too narrow for that, and by the error
+            of a linearised posture.
         friction: Coulomb coefficient of an uncoated device on the wall.
         stiffness: Factor of EI and GJ.
         loss: Factor of the loss factor of the material.
