@@ -8,13 +8,14 @@ from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.scan.aorta import Bend
 from cathsim_dmc.anatomy.scan.arches import Arch
+from cathsim_dmc.anatomy.scan.forks import leads
 from cathsim_dmc.anatomy.scan.naming import (
     _unlisted,
     hypotheses,
     name_branches,
     neutral_names,
 )
-from cathsim_dmc.anatomy.scan.offshoots import Offshoot, leads, offshoots, third_limb
+from cathsim_dmc.anatomy.scan.offshoots import Offshoot, offshoots, third_limb
 
 FIRST, SPACE = 95e-3, 20e-3  # m of aorta up to the first ostium and between ostia
 

@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cathsim_dmc.anatomy.scan import offshoots
+from cathsim_dmc.anatomy.scan import forks
 from cathsim_dmc.anatomy.scan.aorta import Bend, chord
-from cathsim_dmc.anatomy.scan.offshoots import EXTRA, SPREAD, SURE, Offshoot, normal
+from cathsim_dmc.anatomy.scan.forks import EXTRA, SPREAD, SURE, normal
+from cathsim_dmc.anatomy.scan.offshoots import Offshoot
 from cathsim_dmc.anatomy.scan.units import shown
 from cathsim_dmc.anatomy.scan.ways import Ways, common
 
@@ -105,7 +106,7 @@ def name_branches(
     asks = False
     labels: list[tuple[str, float]] = []
     for place in range(len(seen)):
-        odds = offshoots.summed(share, lambda key, place=place: key.labels[place])
+        odds = forks.summed(share, lambda key, place=place: key.labels[place])
         labels.append(max(odds.items(), key=lambda item: item[1]))
     others = {label for label, sure in labels if sure >= SURE}
     for one, (label, sure) in zip(seen, labels, strict=True):
@@ -118,11 +119,11 @@ def name_branches(
             right += one.curves
             said.append(f"bca {sure:.2f}")
         called = label, sure
-        parts = offshoots.leads(ways, bend, one, called, scale, heart_last, others)
+        parts = forks.leads(ways, bend, one, called, scale, heart_last, others)
         for number, (name, surety) in parts.items():
             names[number] = name
             said.append(f"{name} {surety:.2f}")
-        if len(parts) < len(offshoots.without_twins(one.rows)):
+        if len(parts) < len(forks.without_twins(one.rows)):
             forked.append((label, one))
     rest = [i for i in range(len(curves)) if i not in names]
     rest.sort(key=lambda i: _leaves(curves[i], bend))
@@ -133,7 +134,7 @@ def name_branches(
     for label, one in forked:
         own = " and ".join(sorted(names[i] for i in one.curves))
         called = TRUNKS.get(label, label)
-        if mixed := offshoots.mixed(label, others):
+        if mixed := forks.mixed(label, others):
             called = f"{label}, or trunk of {label} and {mixed}, or one with a bypass,"
         notes.append(
             f"question: the {called} that leaves the arch at {shown(one.place)} leads "
@@ -188,7 +189,7 @@ def hypotheses(
             seen, right = seen[::-1], [-values for values in sides[::-1]]
         for pattern, labels, weight in _labellings(seen, right, scale, bend.head):
             weights[Hypothesis(last, pattern, labels)] = weight + more
-    return offshoots.normalised(weights)
+    return forks.normalised(weights)
 
 
 def _labellings(
@@ -309,7 +310,7 @@ def question(
         without = f" without its {' and '.join(missing)}" if missing else ""
         return PATTERNS[key.pattern][1] + without
 
-    best = sorted(offshoots.summed(share, text).items(), key=lambda item: -item[1])
+    best = sorted(forks.summed(share, text).items(), key=lambda item: -item[1])
     texts = [f"{text} ({value:.2f})" for text, value in best[:3] if value > 0.02]
     return f"{left_by(seen, names)}: {', or '.join(texts)}? Name them (--rename)"
 
