@@ -121,13 +121,20 @@ def test_a_trunk_whose_fork_is_beside_the_inlet_leads_on():
 def test_the_inlet_lies_behind_the_start_of_a_drawn_curve(start, ends, widths, chosen):
     """Nodes are a millimetre apart on one line; the curve leads to the last end."""
     s = 1e-3 * np.arange(201)
-    line = SimpleNamespace(node=int, lengths_from=lambda node: np.abs(s - s[node]))
-    free, curve = np.array([True, True, False]), np.array([start, 200])
-    given = line, ends, np.array(ends), np.array(widths)
-    assert extract._chosen_by_curves(*given, free, [curve]) == chosen
-    end = SimpleNamespace(position=np.array([0.001, 0.002, 0.003]), radius=2e-3)
+
+    def at(node, radius=2e-3):
+        return SimpleNamespace(position=np.array([node, 0.002, 0.003]), radius=radius)
+
+    line = SimpleNamespace(
+        node=lambda place: int(place[0]), lengths_from=lambda node: np.abs(s - s[node])
+    )
+    curve = np.array([at(start).position, at(200).position])
+    free, widths = np.array([True, True, False]), np.array(widths)
+    given = [curve]
+    found = extract._chosen_by_curves(line, list(map(at, ends)), widths, free, given)
+    assert found == chosen
     with pytest.raises(ValueError, match=r"inlet=.*: \(1, 2, 3\) mm, 4.0 mm wide"):
-        extract._chosen_by_curves(line, [end], *given[2:], 0 * free > 0, [curve])
+        extract._chosen_by_curves(line, [at(0.001)], widths[:1], ~free[:1], given)
 
 
 def test_a_branch_counts_as_far_as_the_device_passes():

@@ -87,7 +87,14 @@ class Arch:
         return replace(arch, entry=entry, found=extract.centrelines(ways, ends, entry))
 
     @classmethod
-    def _seen(cls, ways, ends, first, last, heart: float | None = None) -> Self:
+    def _seen(
+        cls,
+        ways: Ways,
+        ends: Sequence[FreeEnd],
+        first: FreeEnd,
+        last: FreeEnd,
+        heart: float | None = None,
+    ) -> Self:
         entry = LumenEntry(first.position, True, last.position)
         found = extract.centrelines(ways, ends, entry)
         bend, width, branches = _branches(ways, first.position, last.position, found)

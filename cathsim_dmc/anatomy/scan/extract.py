@@ -68,7 +68,7 @@ def plan_inlet(
         # Near a free end the inlet is that end: only its tip would be cut off.
         cut = bool(gap[chosen] > 2.5 * ends[chosen].radius)
     elif curves:
-        chosen = _chosen_by_curves(ways, ends, nodes, width, free, curves)
+        chosen = _chosen_by_curves(ways, ends, width, free, curves)
     else:
         order = [int(k) for k in np.argsort(-width, kind="stable")]
         chosen = next((k for k in order if not is_sac(ways, nodes, k)), order[0])
@@ -93,8 +93,21 @@ def plan_inlet(
     return LumenEntry(position, not cut, None, tuple(sacs))
 
 
-def _chosen_by_curves(ways, ends, nodes, width, free, curves) -> int:
-    """Index of the end at which the curves start, else of a wide one far from there."""
+def _chosen_by_curves(
+    ways: Ways,
+    ends: Sequence[FreeEnd],
+    width: np.ndarray,
+    free: np.ndarray,
+    curves: Sequence[np.ndarray],
+) -> int:
+    """Index of the end at which the curves start, else of a wide one far from there.
+
+    Args:
+        width: (n,), least radius of the way to each end, m.
+        free: (n,) bool, ends at which no curve ends.
+        curves: (m_i, 3) m.
+    """
+    nodes = [ways.node(end.position) for end in ends]
     reach = np.stack([ways.lengths_from(ways.node(c[0]))[nodes] for c in curves])
     # A curve leads away from the end at which it starts.
     last = np.stack([ways.lengths_from(ways.node(c[-1]))[nodes] for c in curves])

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from itertools import combinations, product
+from itertools import combinations, pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -277,13 +277,26 @@ def _fit(
     return weight + np.log((1.0 - none) * density)
 
 
-def _spacings(seen, pattern, shown, at, scale: float) -> float:
-    """Log probability of the distances between neighbours of a pattern."""
+def _spacings(
+    seen: Sequence[Offshoot],
+    pattern: Sequence[str],
+    places: Sequence[int],
+    at: Sequence[int],
+    scale: float,
+) -> float:
+    """Log probability of the distances between neighbours of a pattern.
+
+    Args:
+        places: Places in the pattern that offshoots have.
+        at: The indices of these offshoots.
+        scale: Width of the aorta relative to a usual one.
+    """
     weight = 0.0
-    for k in range(len(at) - 1):
-        shares = [BRANCHES[name][1] for name in pattern[shown[k] : shown[k + 1] + 1]]
+    named = zip(pairwise(places), pairwise(at), strict=True)
+    for (first, last), (one, other) in named:
+        shares = [BRANCHES[name][1] for name in pattern[first : last + 1]]
         wanted = sum(shares[:-1]) + sum(shares[1:])
-        there = max(abs(seen[at[k + 1]].s - seen[at[k]].s), 2e-3)
+        there = max(abs(seen[other].s - seen[one].s), 2e-3)
         weight += normal(np.log(there / (scale * wanted)), APART)
     return weight
 

@@ -1,7 +1,7 @@
 """Growth of a vessel tree from curves in a scan and an inlet."""
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -111,8 +111,13 @@ def _separation(
     return min(first, len(curve) - 3)
 
 
-def _parent(curve, lines, vessels, field) -> tuple[str, int]:
-    """Vessel that ``curve`` leaves last, and the index at which it does."""
+def _parent(
+    curve: np.ndarray,
+    lines: Mapping[str, np.ndarray],
+    vessels: Mapping[str, Vessel],
+    field: SurfaceDepth,
+) -> tuple[str, int]:
+    """Vessel that a curve (n, 3) leaves last, and the index at which it does."""
     depth = field(curve)
     at = {key: _separation(curve, depth, line, field) for key, line in lines.items()}
     key = max(at, key=lambda name: at[name])
