@@ -347,6 +347,13 @@ def recorded(tmp_path_factory):
     )
 
 
+def test_episodes_are_recorded_as_they_are_evaluated(recorded):
+    _, expected = recorded
+    options = {"observation": "tracking", "task_kwargs": {"max_steps": 12}}
+    found = evaluation.evaluate("random", "type1_lcca", 4, protocol="varied", **options)
+    assert found.episodes == expected.episodes
+
+
 def test_recorded_actions_give_the_same_episodes(recorded, tmp_path):
     path, expected = recorded
     (tmp_path / "one.npz").write_bytes(b"of an earlier submission")
