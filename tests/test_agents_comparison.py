@@ -2,12 +2,14 @@ import dataclasses
 import json
 import math
 
+import numpy as np
 import pytest
 
 from cathsim_dmc import suite
 from cathsim_dmc.agents import EvaluationResult, comparison, evaluate, protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, Statistics
+from cathsim_dmc.simulation.batch import BatchSimulation
 
 
 def result(task="type1_bca", policy="mine", episodes=4, first=10, **options):
@@ -181,11 +183,17 @@ def test_the_notes_tell_rules_apart_that_differ_late_in_a_long_value(tmp_path):
     assert ["EI=2" in one for one in notes] == [False, False, True]
 
 
-def test_an_episode_that_began_at_a_snapshot_has_other_rules():
-    one = result()
-    again = dataclasses.replace(one, settings={**one.settings, "started": True})
-    rules = [comparison.rules_of(each) for each in (one, again)]
-    assert [each["start"] for each in rules] == ["task", "snapshot"]
+def test_episodes_that_began_at_other_states_have_other_rules():
+    simulation = BatchSimulation(suite.make_task("simple1_bca", max_steps=4), 2)
+    simulation.reset()
+    starts = [None, simulation.snapshot(), simulation.snapshot()]
+    simulation.step(np.ones((2, simulation.num_actions)))
+    starts.append(simulation.snapshot())
+    options = {"episodes": 2, "task_kwargs": {"max_steps": 4}}
+    played = [evaluate("push", "simple1_bca", start=one, **options) for one in starts]
+    found = [comparison.rules_of(one)["start"] for one in played]
+    assert found[0] == "task" and found[1] == found[2]
+    assert len(set(found)) == 3
 
 
 def test_forces_read_at_another_time_have_other_rules():

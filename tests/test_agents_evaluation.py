@@ -541,6 +541,32 @@ def test_episodes_are_distinct_where_all_draws_can_differ(
     assert protocols.distinct(task, options, episodes) == expected
 
 
+def test_episodes_from_a_snapshot_are_distinct_where_its_states_are():
+    drawn = {"friction": [0.05, 0.2], "gain": [0.9, 1.1], "start_radius": 0.0}
+    snapshots = []
+    for ranges in drawn, {**drawn, "friction": [0.1, 0.1]}:
+        task = suite.make_task("simple1_bca", randomisation=ranges, max_steps=40)
+        simulation = BatchSimulation(task, 3, num_threads=1, seeds=[1, 2, 3])
+        simulation.reset()
+        snapshots.append(simulation.snapshot())
+    other, alike = snapshots
+    assert protocols.distinct_states(other) and not protocols.distinct_states(alike)
+    assert not protocols.distinct_states(other[[0, 1, 1]])
+    push = np.zeros((3, simulation.num_actions))
+    push[:, -1] = [0.0, 0.5, 1.0]
+    for _ in range(10):
+        simulation.step(push)
+    apart = simulation.snapshot()  # by the way of their heads
+    assert protocols.distinct_states(apart)
+    assert not protocols.distinct_states(apart[:1])
+    options = {"randomisation": ranges, "max_steps": 40}
+    options = {"task_kwargs": options, "num_threads": 1}
+    same = evaluate("push", "simple1_bca", start=apart[:1].repeat(4), **options)
+    assert same.num_conditions == 1 and same.summary()["success_ci95"] is None
+    found = evaluate("push", "simple1_bca", start=apart, **options)
+    assert found.num_conditions == 3 and found.summary()["success_ci95"] is not None
+
+
 def test_safe_success_counts_the_mean_force_of_every_control_step():
     def episode(success, force):
         told = {"mean_sum": Statistics(0.0, None, force)} if force else {}
@@ -660,7 +686,7 @@ def test_an_evaluation_goes_on_from_a_snapshot(tmp_path, cathsim):
     assert code == 0, err
     played = json.loads(out)["policy"]
     episodes = played["episodes"]
-    assert played["settings"]["started"] is played["distinct"] is True
+    assert played["settings"]["started"] == snapshot.digest
     assert [one["length"] for one in episodes] == [8, 8]
     # The seeds have not drawn what the snapshot holds.
     assert not any("conditions" in one for one in episodes)

@@ -160,7 +160,7 @@ def rules_of(result: EvaluationResult) -> dict[str, Any]:
     rules = {
         "task": result.task,
         "protocol": settings.get("protocol"),
-        "start": "snapshot" if settings.get("started") else "task",
+        "start": settings.get("started", "task"),
         "episodes": len(result.episodes),
         "seeds": list(result.seeds),
         "force": "mean over a control step" if judged else "end of a control step",

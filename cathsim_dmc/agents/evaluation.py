@@ -124,7 +124,7 @@ def evaluate(
         outcomes = _play_on_cluster(groups, observer)
     else:
         outcomes = [one for group in groups for one in _play(group, observer)]
-    result = plan.result(name, outcomes, start is not None)
+    result = plan.result(name, outcomes, start)
     if out_dir is not None:
         files.require_folder(out_dir, make=True)
         files.write_json(Path(out_dir) / "evaluation.json", result.to_dict())
@@ -204,12 +204,19 @@ class _Plan:
         ]  # fmt: skip
 
     def result(
-        self, name: str | None, outcomes: Sequence[EpisodeOutcome], started: bool
+        self,
+        name: str | None,
+        outcomes: Sequence[EpisodeOutcome],
+        start: Snapshot | None,
     ) -> EvaluationResult:
-        """Returns the result; `started` means that episodes began at a snapshot."""
+        """Returns the result of episodes that began at `start`, or from their seeds."""
         trained = getattr(self.player, "checkpoint", None)
         first, count = self.parts[0].task_kwargs, sum(len(p.seeds) for p in self.parts)
-        drawn = () if started else [one for p in self.parts for one in p.conditions]
+        if start is None:
+            distinct = protocols.distinct(self.task, first, count)
+            drawn = [one for part in self.parts for one in part.conditions]
+        else:
+            distinct, drawn = protocols.distinct_states(start), []
         return EvaluationResult(
             task=self.task,
             policy=name or self.player.name,
@@ -220,10 +227,10 @@ class _Plan:
                 "observation": self.observation,
                 "task_kwargs": self.options,
                 "frames": trained and trained.frames,
-                **({"started": True} if started else {}),
+                **({"started": start.digest} if start is not None else {}),
                 **({"lumens": self.lumens} if self.lumens else {}),
             },
-            distinct=started or protocols.distinct(self.task, first, count),
+            distinct=distinct,
             conditions=tuple(drawn),
             versions=versions(),
         )

@@ -8,10 +8,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.physics.randomisation import Draw, Randomisation
 from cathsim_dmc.tasks.anatomies import anatomy_name, arch_numbers, is_pool
+from cathsim_dmc.tasks.conditions import drawn_in
+from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.tasks.start import START_SPACING, STARTS_ALONG_ROUTE
 
 # Number of strata of each quantity, and of candidate seeds for each episode.
@@ -227,6 +230,20 @@ def distinct(task: str, task_kwargs: Mapping[str, Any], episodes: int) -> bool:
     if along := task_kwargs.get("start_along_route"):
         values *= STARTS_ALONG_ROUTE if along[1] > along[0] else 1
     return values >= max(episodes, 2) or (not along and ranges.start_radius > _NEAR)
+
+
+def distinct_states(start: Snapshot) -> bool:
+    """Whether all states of a snapshot differ by more than the jitter of the start.
+
+    Two states differ if their heads are more than 2 mm apart, or if they are of another
+    anatomy or have drawn other quantities, apart from noise and C-arm.
+    """
+    names = {*_STEPS} - {"start_insertion"}
+    drawn = np.nan_to_num(drawn_in(start, names))
+    drawn = np.column_stack([drawn, start.arrays["rollout._case_of"]])
+    heads = KDTree(start.arrays["rollout.readings.head"])
+    one, other = heads.query_pairs(_NEAR, output_type="ndarray").T
+    return len(start) > 1 and bool((drawn[one] != drawn[other]).any(axis=1).all())
 
 
 def count_distinct(conditions: Iterable[Mapping[str, Any]]) -> int:

@@ -36,8 +36,9 @@ class EvaluationResult:
         seeds: Seed of each episode.
         episodes: Episodes in the order of their seeds.
         settings: Protocol, observation, further task_kwargs, frames of a checkpoint,
-            "started" where the episodes began at a snapshot, and "lumens", name and
-            digest of each anatomy that the option `anatomy` names.
+            "started", the digest of the snapshot at which the episodes began, if they
+            did, and "lumens", name and digest of each anatomy that the option `anatomy`
+            names.
         distinct: Whether all episodes can differ by more than the jitter of the start.
             If not, no interval over them is given.
         conditions: What was drawn for each episode; empty without randomisation.

@@ -1,7 +1,7 @@
 """Drawn values of an episode, for logs, recordings and conditioned policies."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,6 +78,22 @@ _SIZES = {
 }  # fmt: skip
 _WHOLE = "delay", "view"
 _ARRAY = "conditions._values"  # its name in a snapshot
+
+
+def drawn_in(snapshot: Snapshot, names: Collection[str]) -> np.ndarray:
+    """Returns what the K episodes of a snapshot have drawn.
+
+    Args:
+        names: Names of quantities of `Conditions` that are numbers.
+
+    Returns:
+        (K, n) in the units of `Conditions`, a column for each number of the quantities;
+        NaN where nothing is drawn.
+    """
+    columns = np.repeat(list(_SIZES), list(_SIZES.values()))
+    unknown = np.full((len(snapshot), len(columns)), np.nan)
+    values = snapshot.arrays.get(_ARRAY, unknown)
+    return values[:, np.isin(columns, list(names))]
 
 
 class DrawnConditions:

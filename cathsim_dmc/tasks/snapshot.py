@@ -67,6 +67,12 @@ class Snapshot:
         plural = "s" if len(self) > 1 else ""
         return f"<Snapshot of {len(self)} simulation{plural} {done}, {text}>"
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its task and its arrays, in hexadecimal digits."""
+        task = np.array(json.dumps(self.task, sort_keys=True))
+        return _digest({_META: task, **self.arrays})
+
     def __len__(self) -> int:
         """Number K of simulations."""
         return len(next(iter(self.arrays.values())))
