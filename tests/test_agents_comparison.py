@@ -9,6 +9,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.agents import EvaluationResult, comparison, evaluate, protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, Statistics
+from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.simulation.batch import BatchSimulation
 
 
@@ -194,6 +195,12 @@ def test_episodes_that_began_at_other_states_have_other_rules():
     found = [comparison.rules_of(one)["start"] for one in played]
     assert found[0] == "task" and found[1] == found[2]
     assert len(set(found)) == 3
+
+
+def test_episodes_with_other_effects_have_other_rules():
+    plain, same, other = result(), result(effects=[]), result(effects=[Effect()])
+    assert comparison.rules_of(plain) == comparison.rules_of(same)
+    assert comparison.rules_of(plain) != comparison.rules_of(other)
 
 
 def test_forces_read_at_another_time_have_other_rules():

@@ -19,7 +19,7 @@ from cathsim_dmc.tasks.config import NavigationConfig
 # Options that decide what a policy observes or is paid for, which no column shows.
 _NO_RULES = {
     "observation", "fluoroscopy", "cameras", "endoluminal_size", "reward",
-    "farthest_shift", "effects",
+    "farthest_shift",
 }  # fmt: skip
 SAFE = "0.5 N"
 CAPTION = (
