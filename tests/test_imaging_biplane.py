@@ -94,6 +94,17 @@ def farthest(anatomy, machine, goal="lcca"):
     return apart.min(axis=1).max()
 
 
+def test_the_hull_reaches_as_far_as_tall_images_show(anatomy):
+    found = []
+    for size, width in ((384, 0.36), ((384, 128), 0.12)):  # the same pixels and rows
+        options = {"view": "AP", "biplane": "LATERAL", "size": size}
+        options = FluoroscopyOptions(**options, detector_size=width)
+        found.append(Biplane(Angiograph(anatomy.surface, options).planes())._hull)
+    (low, square), (tall_low, tall) = found
+    np.testing.assert_allclose(tall_low[2], low[2], atol=biplane.HULL_SPACING)
+    assert abs(tall.shape[2] - square.shape[2]) <= 1
+
+
 def test_a_third_roadmap_tells_branches_apart(anatomy, planes, machine):
     """Those that lie side by side in two."""
     options = FluoroscopyOptions(view=(60, 0), biplane=(-30, 0), third="AP")

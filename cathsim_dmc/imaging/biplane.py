@@ -199,7 +199,7 @@ class Biplane:
     def _hull(self) -> tuple[np.ndarray, np.ndarray]:
         """First corner (3,) of a grid around the hull, and its depths (X, Y, Z), m."""
         arm = self._planes[0].carm
-        half = 0.5 * arm.resolution[1] * arm.source_isocentre / arm.focal_length
+        half = 0.5 * max(arm.resolution) * arm.source_isocentre / arm.focal_length
         low = np.asarray(arm.isocentre) - half
         number = np.arange(int(2 * half / HULL_SPACING) + 1) * HULL_SPACING
         x, y, z = low[:, None] + number
