@@ -96,6 +96,15 @@ def test_roadmap_lightens_the_vessel(fluoroscope, frames):
     np.testing.assert_allclose(b[mask] / a[mask], 0.875 / 0.75, atol=0.02)
 
 
+def test_a_roadmap_stays_where_the_vessel_moves():
+    rest = ball([0, 0, 0], 0.03)
+    scope = moved = Fluoroscope.from_surface(rest, contrast=0.0, roadmap=0.5)
+    for place in ([0.01, 0, 0], [0.02, 0, 0]):  # one movement after the other
+        moved = moved.around(ball(place, 0.03))
+        assert (moved.vessel_mask != scope.vessel_mask).any()
+        np.testing.assert_array_equal(moved.empty, scope.empty)
+
+
 def test_device_mask_covers_the_catheter(fluoroscope, frames):
     masks = fluoroscope.device_mask([Shadow(frames, RADIUS)])
     assert masks.shape == (20, 128, 128) and masks.dtype == bool

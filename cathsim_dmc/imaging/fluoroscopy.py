@@ -39,6 +39,7 @@ class Fluoroscope:
         vessel_mask: (rows, columns) bool, pixels whose central ray meets the lumen.
         contrast: iodine in the lumen, kg/m³ (mg/ml); 0 is contrast off.
         kerma, blur, gain, roadmap: Gy, m and two fractions, see `FluoroscopyOptions`.
+        overlay: (rows, columns) bool, vessel of the roadmap; None for `vessel_mask`.
     """
 
     carm: CArm
@@ -49,6 +50,7 @@ class Fluoroscope:
     blur: float = detector.DETECTOR_BLUR
     gain: float = detector.GAIN
     roadmap: float = 0.0
+    overlay: np.ndarray | None = None
 
     @classmethod
     def from_surface(
@@ -72,9 +74,14 @@ class Fluoroscope:
         return cls(carm, path, central > 0.0, **fields)
 
     def around(self, surface: Surface) -> "Fluoroscope":
-        """The same view of a lumen whose surface has moved."""
+        """The same view of a lumen whose surface has moved; the roadmap stays."""
         moved = Fluoroscope.from_surface(surface, self.carm)
-        return replace(self, vessel=moved.vessel, vessel_mask=moved.vessel_mask)
+        own = {"vessel": moved.vessel, "vessel_mask": moved.vessel_mask}
+        return replace(self, **own, overlay=self._overlay)
+
+    @property
+    def _overlay(self) -> np.ndarray:
+        return self.vessel_mask if self.overlay is None else self.overlay
 
     @cached_property
     def signal(self) -> np.ndarray:
@@ -135,7 +142,7 @@ class Fluoroscope:
     def _roadmap_gain(self) -> np.ndarray:
         # A factor, not a blend, so that a device in the vessel keeps its contrast.
         white = 1.0 + self.roadmap * (1.0 / self.gain - 1.0)
-        return np.where(self.vessel_mask, white, 1.0).astype(np.float32)
+        return np.where(self._overlay, white, 1.0).astype(np.float32)
 
     def device_mask(self, shadows: Sequence[Shadow]) -> np.ndarray:
         """Pixels (..., rows, columns) bool that show one of several devices."""

@@ -92,8 +92,8 @@ class FluoroscopyOptions:
         kerma: air kerma at the detector per frame, Gy; the noise decreases with it.
         gain: grey level of tissue without vessel or device as a fraction of white.
         blur: standard deviation of the detector's point spread, m.
-        roadmap: opacity of the roadmap over the live image, 0 for none; usually with
-            `contrast=False`.
+        roadmap: opacity of the roadmap, of the vessel at rest, over the live image, 0
+            for none; usually with `contrast=False`.
         source_detector: distance of source and detector, m.
         source_isocentre: distance of source and isocentre, m.
         detector_size: width of the detector, m.
