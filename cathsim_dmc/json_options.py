@@ -42,8 +42,14 @@ def as_texts(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _as_text(value: Any) -> str:
-    """Returns the representation without addresses, which differ between processes."""
-    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))
+    """Returns the representation without addresses, which differ between processes.
+
+    An object whose class has no representation of its own is told by its attributes.
+    """
+    text, plain = repr(value), type(value).__repr__ is object.__repr__
+    if plain and (own := getattr(value, "__dict__", {})):
+        text += f" {own}"
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
 
 
 def _as_plain(value: Any) -> Any:

@@ -198,9 +198,15 @@ def test_episodes_that_began_at_other_states_have_other_rules():
 
 
 def test_episodes_with_other_effects_have_other_rules():
-    plain, same, other = result(), result(effects=[]), result(effects=[Effect()])
-    assert comparison.rules_of(plain) == comparison.rules_of(same)
-    assert comparison.rules_of(plain) != comparison.rules_of(other)
+    class Wind(Effect):
+        def __init__(self, force):
+            self.force = force
+
+    chosen = [], [Wind(0.1)], [Wind(0.1)], [Wind(0.2)], [Wind(0.2), Effect()]
+    rules = [comparison.rules_of(result(effects=each)) for each in chosen]
+    assert rules[0] == comparison.rules_of(result()) and rules[1] == rules[2]
+    assert rules.index(rules[3]) == 3 and rules.index(rules[4]) == 4
+    assert rules.index(rules[1]) == 1
 
 
 def test_forces_read_at_another_time_have_other_rules():
