@@ -541,6 +541,16 @@ def test_episodes_are_distinct_where_all_draws_can_differ(
     assert protocols.distinct(task, options, episodes) == expected
 
 
+def test_an_evaluation_names_the_device_that_simulates_unless_it_is_the_cpu():
+    def make_env(*given, device="cpu", **options):
+        return evaluation.environments.make_env(*given, **options)
+
+    how = {"task_kwargs": {"max_steps": 2}, "make_env": make_env}
+    here = evaluate("push", "simple1_bca", 1, **how)
+    there = evaluate("push", "simple1_bca", 1, simulation_device="cuda:1", **how)
+    assert there.settings == {**here.settings, "simulated_on": "cuda:1"}
+
+
 def test_episodes_from_a_snapshot_are_distinct_where_its_states_are():
     drawn = {"friction": [0.05, 0.2], "gain": [0.9, 1.1], "start_radius": 0.0}
     snapshots = []

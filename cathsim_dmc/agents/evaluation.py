@@ -124,7 +124,7 @@ def evaluate(
         outcomes = _play_on_cluster(groups, observer)
     else:
         outcomes = [one for group in groups for one in _play(group, observer)]
-    result = plan.result(name, outcomes, start)
+    result = plan.result(name, outcomes, start, simulation_device)
     if out_dir is not None:
         files.require_folder(out_dir, make=True)
         files.write_json(Path(out_dir) / "evaluation.json", result.to_dict())
@@ -208,6 +208,7 @@ class _Plan:
         name: str | None,
         outcomes: Sequence[EpisodeOutcome],
         start: Snapshot | None,
+        simulated_on: str,
     ) -> EvaluationResult:
         """Returns the result of episodes that began at `start`, or from their seeds."""
         trained = getattr(self.player, "checkpoint", None)
@@ -229,6 +230,7 @@ class _Plan:
                 "frames": trained and trained.frames,
                 **({"started": start.digest} if start is not None else {}),
                 **({"lumens": self.lumens} if self.lumens else {}),
+                **({"simulated_on": simulated_on} if simulated_on != "cpu" else {}),
             },
             distinct=distinct,
             conditions=tuple(drawn),

@@ -37,8 +37,8 @@ class EvaluationResult:
         episodes: Episodes in the order of their seeds.
         settings: Protocol, observation, further task_kwargs, frames of a checkpoint,
             "started", the digest of the snapshot at which the episodes began, if they
-            did, and "lumens", name and digest of each anatomy that the option `anatomy`
-            names.
+            did, "lumens", name and digest of each anatomy that the option `anatomy`
+            names, and "simulated_on", the device, if it is not the CPU.
         distinct: Whether all episodes can differ by more than the jitter of the start.
             If not, no interval over them is given.
         conditions: What was drawn for each episode; empty without randomisation.
