@@ -579,6 +579,7 @@ def test_the_cursor_of_a_film_stands_at_the_time_of_the_state(pushed, monkeypatc
         (lambda env: cathsim_dmc.record(env, str, seed=1.5), ValueError, "an integer"),
         (lambda env: cathsim_dmc.fluoroscopy(env, "LAO45"), TypeError, "positional"),
         (lambda env: cathsim_dmc.fluoroscopy(env, vieww=1), TypeError, "vieww.*view"),
+        (lambda env: cathsim_dmc.fluoroscopy(env, biplane="AP"), TypeError, "biplane;"),
         (lambda env: cathsim_dmc.show(env, foo=1), TypeError, "foo.*views"),
         (lambda env: cathsim_dmc.show(env, "a.npz"), ValueError, "it must be an Ep"),
         (lambda env: cathsim_dmc.record(env, "push", "e.avi"), ValueError, "rrd, .npz"),

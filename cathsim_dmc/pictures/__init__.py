@@ -87,7 +87,8 @@ def fluoroscopy(env: Any, *, seed: int = 0, **options: Any) -> np.ndarray:
         env: What `cathsim_dmc.suite.load` returns, after a reset.
         seed: Seed of the quantum noise, used with `noise=True`.
         **options: Fields of `FluoroscopyOptions` that differ from the task's,
-            such as `view="LAO45"`, `size=512`, `contrast=False`.
+            such as `view="LAO45"`, `size=512`, `contrast=False`; not those of further
+            planes and roadmaps, but `biplane="best"` beside `view="best"`.
 
     Returns:
         (rows, columns) uint8, dark = opaque.
@@ -97,10 +98,15 @@ def fluoroscopy(env: Any, *, seed: int = 0, **options: Any) -> np.ndarray:
         ValueError: an option's value is not possible.
         RuntimeError: no episode has begun.
     """
+    from cathsim_dmc.imaging.options import is_best
     from cathsim_dmc.pictures.moment import Moment, xray
     from cathsim_dmc.recording.recorder import navigation_of
 
-    _check(options, vars(navigation_of(env).config.fluoroscopy))
+    other = {"biplane", "third", "roadmap_errors"}  # no part of this image
+    if is_best(options.get("biplane")):
+        other.remove("biplane")
+    own = vars(navigation_of(env).config.fluoroscopy)
+    _check(options, [name for name in own if name not in other])
     moment = Moment.of(env)
     return xray(moment, dataclasses.replace(moment.x_ray.options, **options), seed)
 
