@@ -549,6 +549,8 @@ def test_an_evaluation_names_the_device_that_simulates_unless_it_is_the_cpu():
     here = evaluate("push", "simple1_bca", 1, **how)
     there = evaluate("push", "simple1_bca", 1, simulation_device="cuda:1", **how)
     assert there.settings == {**here.settings, "simulated_on": "cuda:1"}
+    added = {"mujoco-warp", "warp-lang", "numba-cuda"}
+    assert there.versions.keys() - here.versions.keys() == added
 
 
 def test_episodes_from_a_snapshot_are_distinct_where_its_states_are():

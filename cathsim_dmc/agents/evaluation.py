@@ -234,7 +234,7 @@ class _Plan:
             },
             distinct=distinct,
             conditions=tuple(drawn),
-            versions=versions(),
+            versions=versions(simulated_on),
         )
 
 

@@ -19,11 +19,13 @@ from cathsim_dmc.analysis.intervals import success_interval
 # Largest sums of the force on the wall up to which success is called safe, N.
 SAFE_FORCES = (0.5, 1.0, 2.0)
 _DECIDING = ("mujoco", "dm-control", "numpy", "numba", "torch")
+_ON_GPU = ("mujoco-warp", "warp-lang", "numba-cuda")
 
 
-def versions() -> dict[str, str]:
-    """Returns the versions of the packages that determine the episodes."""
-    return {"cathsim-dmc": __version__, **{name: version(name) for name in _DECIDING}}
+def versions(simulated_on: str = "cpu") -> dict[str, str]:
+    """Returns the versions of the packages that determine the episodes on a device."""
+    names = _DECIDING if simulated_on == "cpu" else (*_DECIDING, *_ON_GPU)
+    return {"cathsim-dmc": __version__, **{name: version(name) for name in names}}
 
 
 @dataclass(frozen=True)
