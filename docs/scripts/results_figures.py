@@ -71,8 +71,6 @@ def learning_curves(by_task, looks, path):
                 )
         _by_frames(axes)
         axes.set_title(task, fontsize=10)
-        axes.set_xticks([1e4, 2e4, 5e4, 1e5, 2e5, 5e5])
-        axes.minorticks_off()
         axes.set_ylabel("success in training episodes, %")
     named = {
         label: line
@@ -121,6 +119,8 @@ def _by_frames(axes):
     """Makes axes of success, %, over frames."""
     axes.set_xscale("log")
     axes.set_ylim(-3, 103)
+    axes.set_xticks([1e4, 2e4, 5e4, 1e5, 2e5, 5e5])
+    axes.minorticks_off()
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_xlabel("frames")
     axes.grid(alpha=0.3)
