@@ -331,7 +331,8 @@ def _refuse_coarse(
     middles = (np.cumsum(lengths[::-1]) - lengths[::-1] / 2)[::-1]
     for device in devices:
         pairs = itertools.pairwise(middles.tolist())
-        angle = max((abs(device.rest_angle(*pair)) for pair in pairs), default=0.0)
+        angles = (abs(device.rest_angle(far, near)) for far, near in pairs)
+        angle = max(angles, default=0.0)
         if angle > SHARPEST:
             raise ValueError(
                 f"the tip_shape of device {device.name!r} bends by "

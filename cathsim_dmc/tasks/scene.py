@@ -213,8 +213,8 @@ def longest_tip(chosen: Sequence[devices.Device]) -> devices.Device:
 def _check_friction(chosen: Sequence[devices.Device], config: NavigationConfig) -> None:
     """Raise ValueError if the friction of a device on the wall can be out of range."""
     drawn = config.randomisation.friction
-    ends = drawn if isinstance(drawn, Sequence) else (0.0,)
-    friction = max(config.friction, *ends)
+    largest = max(drawn) if isinstance(drawn, Sequence) else 0.0
+    friction = max(config.friction, largest)
     for device in chosen:
         ratio = device.friction_ratio
         if ratio * friction > MOST_FRICTION:
