@@ -1,8 +1,11 @@
-"""What an interrupt or an error in the middle of a reset or control step leaves."""
+"""What an interrupt or an error in the middle of a reset or other work leaves."""
 
 import dataclasses
+import os
+import signal
 import subprocess
 import sys
+import time
 
 import mujoco
 import numpy as np
@@ -201,3 +204,31 @@ except KeyboardInterrupt:
 def test_an_interrupt_that_is_lost_comes_again_until_it_is_handled():
     done = subprocess.run([sys.executable, "-c", LOST], capture_output=True, text=True)
     assert done.stdout.split() == ["saved", "once", "True"], done.stderr
+
+
+OVER = """
+import sys, time
+from cathsim_dmc.recording import image_set
+if __name__ == "__main__":
+    for _ in image_set._over(time.sleep, [0, 0, 60, 60, 60], 2):
+        print("begun", flush=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="other signals")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_processes_of_a_dataset_end_with_the_one_that_began_them(tmp_path, number):
+    (tmp_path / "over.py").write_text(OVER)
+    run = subprocess.Popen(
+        [sys.executable, tmp_path / "over.py"], stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+    assert run.stdout.readline() == b"begun\n"
+    began = time.monotonic()
+    run.send_signal(number)
+    # All processes hold the pipe; it ends with the last one.
+    assert run.stdout.read().count(b"begun") < 2
+    run.wait()
+    assert time.monotonic() - began < 30

@@ -9,15 +9,20 @@ The file of an anatomy is complete or missing; an interrupted run continues with
 missing ones. The same options give the same files, byte by byte.
 """
 
+import _thread
 import concurrent.futures
 import contextlib
 import dataclasses
 import json
 import multiprocessing
 import os
+import signal
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+import types
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +38,7 @@ from cathsim_dmc.tasks.anatomies import load_anatomy
 SPLITS = {"train": "train", "val": "train", "test": "test"}  # split: set of arches
 _TRIES = 8  # candidates that are tried in turn until a device fits
 _FORMAT = "cathsim-image-set"
+_LAST = 1.0  # s that a process has to remove unfinished files
 Labels = dict[str, list[Any]]  # as `coco.labels` returns them
 
 
@@ -100,11 +106,12 @@ def write(
     shards, labels, new = _shards(out, options), [], 0
     if on_cluster:
         new += _simulate_on_cluster(shards, say)
-    for rows, line, own in _over(_write_shard, shards, count):
-        labels.append(own)
-        new += rows
-        if line:
-            say(line)
+    with contextlib.closing(_over(_write_shard, shards, count)) as written:
+        for rows, line, own in written:
+            labels.append(own)
+            new += rows
+            if line:
+                say(line)
     frames = _label(out, shards, labels)
     files.write_text(out / "README.md", _card(options, frames))
     took, spent = time.monotonic() - start, sum(os.times()[:4]) - used
@@ -248,14 +255,47 @@ def _entered(shard: _Shard, place: int, access: str) -> tuple[Anatomy, str]:
     return load_anatomy(shard.anatomy), "own"
 
 
-def _over(work: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterable[Any]:
+def _over(work: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterator[Any]:
+    """Yields results in order; processes end with the generator and with this one."""
     if processes == 1 or len(jobs) < 2:
         yield from map(work, jobs)
         return
     context = multiprocessing.get_context("spawn")
-    workers = min(processes, len(jobs))
-    with concurrent.futures.ProcessPoolExecutor(workers, context) as pool:
-        yield from pool.map(work, jobs)
+    workers, (end, held) = min(processes, len(jobs)), context.Pipe(duplex=False)
+    with (
+        end,
+        held,
+        concurrent.futures.ProcessPoolExecutor(
+            workers, context, _end_with, initargs=(end,)
+        ) as pool,
+    ):
+        try:
+            yield from pool.map(work, jobs)
+        except (KeyboardInterrupt, GeneratorExit):
+            held.close()  # the executor would wait for all that its processes have
+            raise
+
+
+def _end_with(end: connection.Connection) -> None:
+    """Ends this process when the other end of a pipe closes, as with its process.
+
+    Ctrl-C, which all processes of a terminal get, is left to that process.
+    """
+    closed = threading.Event()
+
+    def interrupt(_number: int, _frame: types.FrameType | None) -> None:
+        if closed.is_set():
+            raise KeyboardInterrupt
+
+    def watch() -> None:
+        connection.wait([end])
+        closed.set()
+        _thread.interrupt_main()  # removes unfinished files
+        time.sleep(_LAST)
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, interrupt)
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _simulate_on_cluster(shards: list[_Shard], say: Callable[[str], None]) -> int:
