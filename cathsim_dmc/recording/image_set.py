@@ -21,7 +21,7 @@ import tempfile
 import threading
 import time
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
@@ -255,7 +255,9 @@ def _entered(shard: _Shard, place: int, access: str) -> tuple[Anatomy, str]:
     return load_anatomy(shard.anatomy), "own"
 
 
-def _over(work: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterator[Any]:
+def _over(
+    work: Callable[[Any], Any], jobs: list[Any], processes: int
+) -> Generator[Any, None, None]:
     """Yields results in order; processes end with the generator and with this one."""
     if processes == 1 or len(jobs) < 2:
         yield from map(work, jobs)
@@ -276,7 +278,7 @@ def _over(work: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterat
             raise
 
 
-def _end_with(end: connection.Connection) -> None:
+def _end_with(end: Any) -> None:
     """Ends this process when the other end of a pipe closes, as with its process.
 
     Ctrl-C, which all processes of a terminal get, is left to that process.
