@@ -31,7 +31,8 @@ def start(folder: str) -> None:
     if alone or not enabled or not _expected or _started:
         return
     command = [sys.executable, "-m", "cathsim_dmc.first_load", *_expected, folder]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    path = os.pathsep.join(one for one in sys.path if isinstance(one, str))
+    environment = {**os.environ, "PYTHONPATH": path}
     none = subprocess.DEVNULL
     with contextlib.suppress(OSError):  # this process compiles everything then
         process = subprocess.Popen(
