@@ -1,5 +1,6 @@
 """Processes that are killed, disks that are full, folders that cannot be written."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -176,6 +177,24 @@ def test_a_folder_in_the_place_of_a_file_is_refused_before_the_work(tmp_path):
     with pytest.raises(IsADirectoryError, match="give a file name in it"):
         with files.atomic_path(tmp_path / "a.npz"):
             raise AssertionError
+
+
+@pytest.mark.parametrize("json", [True, False])
+def test_an_evaluation_that_cannot_be_written_is_printed(
+    tmp_path, monkeypatch, capsys, json
+):
+    def full(path, values):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(files, "write_json", full)
+    line = f"eval push --task simple1_bca --max-steps 1 --episodes 1 --out {tmp_path}"
+    words = [*line.split(), "--no-baseline", *["--json"] * json]
+    monkeypatch.setattr(sys, "argv", ["cathsim", *words])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    said = capsys.readouterr()
+    assert ended.value.code == 2 and "No space left on device" in said.err
+    assert '"episodes"' in said.out if json else "safe success" in said.out
 
 
 # Kills.

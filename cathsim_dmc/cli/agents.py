@@ -118,20 +118,22 @@ def evaluate(
         results["baseline"] = play("random")
     values: dict[str, Any] = {name: one.to_dict() for name, one in results.items()}
     values["seconds"] = round(time.monotonic() - began, 1)
-    if out is not None:
-        # Another process may have written there meanwhile.
-        written = [out / "evaluation.json", out / "heatmap.png"]
-        with told_of_replaced(written):
-            files.require_folder(out, make=True)
-            files.write_json(written[0], values)
-            contacts.draw(results["policy"], written[1])
-    if json:
-        # Figures of a policy have no bounds, so there are no checks.
-        print_json({"checks": [], **values})
-        return 0
-    print_results(list(results.values()))
-    if report:
-        print_episodes(results["policy"])
+    try:
+        if out is not None:
+            # Another process may have written there meanwhile.
+            written = [out / "evaluation.json", out / "heatmap.png"]
+            with told_of_replaced(written):
+                files.require_folder(out, make=True)
+                files.write_json(written[0], values)
+                contacts.draw(results["policy"], written[1])
+    finally:  # also on a full disk, where the episodes would be lost
+        if json:
+            # Figures of a policy have no bounds, so there are no checks.
+            print_json({"checks": [], **values})
+        else:
+            print_results(list(results.values()))
+            if report:
+                print_episodes(results["policy"])
     return 0
 
 
