@@ -175,8 +175,10 @@ def keep(made: Any, function: Any) -> None:
     keep_together()
     try:
         made._cache = _Cache(function)  # noqa: SLF001
-    except RuntimeError:  # neither the folder of the source nor the user's is writable
-        _tell_of_compiling()
+    except RuntimeError:
+        _told.add("compiling")
+        why = "neither it nor the user's cache folder can be written to"
+        _warn_of_no_place(str(_PACKAGE), why)
 
 
 def has_compiled() -> bool:

@@ -136,11 +136,16 @@ def test_code_that_an_index_names_by_mistake_is_not_run(
 
 
 @KINDS
-def test_without_a_folder_nothing_is_kept(run, caplog, monkeypatch):
+def test_without_a_folder_nothing_is_kept(run, folder, caplog, capsys, monkeypatch):
+    """As in a read-only installation of a user without a home."""
     monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
     compiled_cache.keep_together()
     assert run() == (42, 0) == run()
-    assert not caplog.records
+    (record,) = caplog.records
+    assert "neither it nor the user's cache folder" in record.getMessage()
+    assert "NUMBA_CACHE_DIR" in record.getMessage()
+    assert "the result is cached" not in capsys.readouterr().err
+    assert compiled_cache.has_compiled()
 
 
 def test_a_warning_is_one_line_on_standard_error(folder, capfd, monkeypatch):
