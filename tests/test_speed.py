@@ -42,12 +42,12 @@ def test_bare_steps_do_the_physics_of_the_control_steps(environment, policy):
 @pytest.mark.slow
 def test_the_account_adds_up_and_leaves_nothing_behind(environment):
     # The last part is a difference of two measurements: the median of several runs.
-    table = script.account("random", steps=20, runs=7)
+    # In 100 steps of a push the device comes to the wall: 0.78 is physics.
+    table = script.account("push", steps=100, runs=7)
     assert list(table)[-1] == "composer and observation"
     assert all(part > 0 for part in table.values()), table
     physics = sum(list(table.values())[:5])
-    # It is 0.53 to 0.58 of a free step; other programs of the machine take from it.
-    assert physics > 0.4 * sum(table.values())
+    assert physics > 0.5 * sum(table.values())
     assert mujoco.get_mjcb_time() is None
 
 
