@@ -23,6 +23,7 @@ _STRATA, _CANDIDATES = 10, 20
 _STEPS = dict.fromkeys(
     ("friction", "stiffness", "loss", "viscosity", "goal_shift", "roll"), 1e-9
 ) | {"delay": 1, "start_insertion": START_SPACING}
+_COMPARED = _STEPS.keys() - {"start_insertion"}  # as drawn; the rest as it is applied
 _NEAR = 2e-3  # m, displacement of the start within which episodes are nearly equal
 # Quantities that a start may reduce after the draw; a displacement may be redrawn.
 _REDUCED = "displacement", "insertion"
@@ -238,8 +239,7 @@ def distinct_states(start: Snapshot) -> bool:
     Two states differ if their heads are more than 2 mm apart, or if they are of another
     anatomy or have drawn other quantities, apart from noise and C-arm.
     """
-    names = {*_STEPS} - {"start_insertion"}
-    drawn = np.nan_to_num(drawn_in(start, names))
+    drawn = np.nan_to_num(drawn_in(start, _COMPARED))
     drawn = np.column_stack([drawn, start.arrays["rollout._case_of"]])
     heads = KDTree(start.arrays["rollout.readings.head"])
     one, other = heads.query_pairs(_NEAR, output_type="ndarray").T
@@ -256,7 +256,7 @@ def count_distinct(conditions: Iterable[Mapping[str, Any]]) -> int:
 
 
 def _compared(conditions: Mapping[str, Any]) -> dict[str, Any]:
-    names = {"device", "arch", "anatomy", *_STEPS} - {"start_insertion"}
+    names = {"device", "arch", "anatomy", *_COMPARED}
     found = {name: conditions.get(name) for name in names}
     inserted = conditions.get("insertion_drawn") or 0.0
     found["insertion"] = round(inserted / START_SPACING)

@@ -120,12 +120,7 @@ def evaluate(
     values["seconds"] = round(time.monotonic() - began, 1)
     try:
         if out is not None:
-            # Another process may have written there meanwhile.
-            written = [out / "evaluation.json", out / "heatmap.png"]
-            with told_of_replaced(written):
-                files.require_folder(out, make=True)
-                files.write_json(written[0], values)
-                contacts.draw(results["policy"], written[1])
+            _write_evaluation(out, values, results["policy"], contacts)
     finally:  # also on a full disk, where the episodes would be lost
         if json:
             # Figures of a policy have no bounds, so there are no checks.
@@ -135,6 +130,20 @@ def evaluate(
             if report:
                 print_episodes(results["policy"])
     return 0
+
+
+def _write_evaluation(
+    out: Path,
+    values: dict[str, Any],
+    result: EvaluationResult,
+    contacts: evaluation.ContactLog,
+) -> None:
+    # Another process may have written there meanwhile.
+    written = [out / "evaluation.json", out / "heatmap.png"]
+    with told_of_replaced(written):
+        files.require_folder(out, make=True)
+        files.write_json(written[0], values)
+        contacts.draw(result, written[1])
 
 
 @contextlib.contextmanager

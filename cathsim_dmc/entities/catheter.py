@@ -1,7 +1,5 @@
 """The catheter: a chain of rigid links with the bending stiffness of a real device."""
 
-import itertools
-
 import numpy as np
 
 from cathsim_dmc import bounds
@@ -54,7 +52,7 @@ class Catheter(Chain):
                 masses=(moved_mass(self.devices) * lengths).tolist(),
                 compliances=compliances.tolist(),
                 armatures=hinge_armatures(device, lengths).tolist(),
-                rest_angles=_rest_angles(device, lengths),
+                rest_angles=[(0.0, each) for each in device.rest_angles(lengths)],
                 axial_stiffness=device.axial_stiffness,
                 tip=first,
                 steering={index: torques[index - 1] for index in steered},
@@ -73,14 +71,6 @@ def _half_compliances(device: devices.Device, lengths: np.ndarray, of: str):
     in_tip = np.arange(len(lengths)) >= len(lengths) - device.tip_links
     stiffness = np.where(in_tip, getattr(device.tip, of), getattr(device.shaft, of))
     return lengths / 2 / stiffness
-
-
-def _rest_angles(device: devices.Device, lengths: np.ndarray):
-    """Angles of the hinges about x and y of the unloaded device, rad."""
-    middles = [lengths[n:].sum() - lengths[n] / 2 for n in range(len(lengths))]
-    return [
-        (0.0, device.rest_angle(far, near)) for far, near in itertools.pairwise(middles)
-    ]
 
 
 def _twists(device: devices.Device, lengths: np.ndarray, count: int):

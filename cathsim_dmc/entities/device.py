@@ -1,6 +1,7 @@
 """Catheters and guidewires: rods of two sections with a shape, in SI units."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -192,3 +193,12 @@ class Device:
                 total += math.copysign(overlap / arc.radius, arc.angle)
             distal = proximal
         return total
+
+    def rest_angles(self, lengths: np.ndarray) -> list[float]:
+        """Turning angles (n - 1) of the unloaded shape from link to link, rad.
+
+        Args:
+            lengths: (n,), lengths of the links from the base on, m.
+        """
+        middles = [lengths[n:].sum() - lengths[n] / 2 for n in range(len(lengths))]
+        return [self.rest_angle(far, near) for far, near in itertools.pairwise(middles)]

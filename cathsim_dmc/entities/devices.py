@@ -328,11 +328,8 @@ def _refuse_coarse(
     Args:
         tip_links: number of links of the longest tip.
     """
-    middles = (np.cumsum(lengths[::-1]) - lengths[::-1] / 2)[::-1]
     for device in devices:
-        pairs = itertools.pairwise(middles.tolist())
-        angles = (abs(device.rest_angle(far, near)) for far, near in pairs)
-        angle = max(angles, default=0.0)
+        angle = max(map(abs, device.rest_angles(lengths)), default=0.0)
         if angle > SHARPEST:
             raise ValueError(
                 f"the tip_shape of device {device.name!r} bends by "

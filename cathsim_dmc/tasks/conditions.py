@@ -91,9 +91,17 @@ def drawn_in(snapshot: Snapshot, names: Collection[str]) -> np.ndarray:
         NaN where nothing is drawn.
     """
     columns = np.repeat(list(_SIZES), list(_SIZES.values()))
-    unknown = np.full((len(snapshot), len(columns)), np.nan)
-    values = snapshot.arrays.get(_ARRAY, unknown)
-    return values[:, np.isin(columns, list(names))]
+    return completed(snapshot).arrays[_ARRAY][:, np.isin(columns, list(names))]
+
+
+def completed(snapshot: Snapshot) -> Snapshot:
+    """Returns a snapshot with unknown conditions, if it is from before there were.
+
+    They change no episode, so such a snapshot is restored all the same.
+    """
+    unknown = np.full((len(snapshot), sum(_SIZES.values())), np.nan)
+    arrays = {_ARRAY: unknown, **snapshot.arrays}
+    return dataclasses.replace(snapshot, arrays=arrays)
 
 
 class DrawnConditions:
@@ -126,15 +134,3 @@ class DrawnConditions:
         for effect in effects:
             drawn |= check_conditions(effect, effect.conditions(index))
         return Conditions(scene.anatomy.name, scene.goal.name, effects=drawn, **found)
-
-    def completed(self, snapshot: Snapshot) -> Snapshot:
-        """Returns a snapshot with unknown conditions, if it is from before there were.
-
-        They change no episode, so such a snapshot is restored all the same.
-        """
-        if _ARRAY in snapshot.arrays:
-            return snapshot
-        unknown = np.full((len(snapshot), self._values.shape[1]), np.nan)
-        return dataclasses.replace(
-            snapshot, arrays={**snapshot.arrays, _ARRAY: unknown}
-        )

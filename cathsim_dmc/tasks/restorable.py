@@ -21,7 +21,7 @@ from cathsim_dmc.physics.effect_checks import check_state
 from cathsim_dmc.physics.effects import Effect, Layout
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks.cases import Case
-from cathsim_dmc.tasks.conditions import Conditions, DrawnConditions
+from cathsim_dmc.tasks.conditions import Conditions, DrawnConditions, completed
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors
 from cathsim_dmc.tasks.progress import Progress
@@ -169,7 +169,7 @@ class Restorable:
                 "a Snapshot; read a file by Snapshot.load of cathsim_dmc.tasks.snapshot"
             )
             bounds.refuse("the snapshot", snapshot, kind)
-        snapshot = self._drawn.completed(snapshot)
+        snapshot = completed(snapshot)
         snapshot.require(self.snapshot(indices))
         numbers = snapshot.arrays["rollout._case_of"]
         if not ((numbers >= 0) & (numbers < len(self._cases))).all():

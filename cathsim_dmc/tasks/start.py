@@ -146,13 +146,15 @@ class StartPosture:
         for _ in range(_DRAWS):
             asked = posture.clear_of_wall(displacement)
             joints = posture.joints(asked, episode.roll)
-            if posture.stands_free(asked, joints, episode.roll):
+            points = posture.points(joints, episode.roll)
+            if posture.stands_free(asked, joints, points):
                 break
             displacement = start_displacement(random_state, self._radius)
         else:
             joints = posture.joints(np.zeros(3), episode.roll)
+            points = posture.points(joints, episode.roll)
         posture.write(qpos, joints)
-        return Started(posture.advance, posture.displaced(joints, episode.roll))
+        return Started(posture.advance, posture.displacement(points[-1]))
 
 
 class _Posture:
@@ -228,19 +230,22 @@ class _Posture:
         angles[self._free] += step[1:]
         return _Joints(max(self._inserted + step[0], 0.0), angles)
 
+    def points(self, joints: _Joints, roll: float | None) -> np.ndarray:
+        """Points (m, 3) of the axis, m, world frame, with a roll of the base, rad."""
+        return self._shape.points(joints, roll or 0.0)
+
     def stands_free(
-        self, displacement: np.ndarray, joints: _Joints, roll: float | None
+        self, displacement: np.ndarray, joints: _Joints, points: np.ndarray
     ) -> bool:
         """Whether joints displace the head as asked, and the device is in no wall.
 
         Args:
             displacement: (3,), m, frame of the inlet.
             joints: Joints of the device.
-            roll: Roll of the base, rad.
+            points: Their points, see `points`.
         """
         size = np.linalg.norm(displacement)
         slide = abs(joints.insertion - self._inserted)
-        points = self._shape.points(joints, roll or 0.0)
         miss = points[-1] - self._head - self._frame @ displacement
         if size and not (
             slide <= _LARGEST_SLIDE * size
@@ -249,9 +254,9 @@ class _Posture:
             return False
         return bool((self._shape.depths(points) <= self._deepest).all())
 
-    def displaced(self, joints: _Joints, roll: float | None) -> np.ndarray:
-        """Displacement (3,) of the head by joints, m, frame of the inlet."""
-        return (self._shape.points(joints, roll or 0.0)[-1] - self._head) @ self._frame
+    def displacement(self, head: np.ndarray) -> np.ndarray:
+        """Displacement (3,), m, frame of the inlet, of a head (3,), world frame."""
+        return (head - self._head) @ self._frame
 
     def write(self, qpos: np.ndarray, joints: _Joints) -> None:
         """Writes joints into the configuration (nq,)."""
