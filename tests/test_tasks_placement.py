@@ -292,6 +292,27 @@ def test_a_displaced_device_stands_in_no_wall():
     np.testing.assert_array_equal(environment.task.readings.centreline, places[0])
 
 
+@pytest.mark.parametrize("task", ["femoral_type1_lcca_wire", "type1_lcca_pair"])
+@pytest.mark.parametrize("roll", [-2.4, -0.8, 3.1])
+def test_a_rolled_device_starts_at_rest(task, roll):
+    """A bent tip that points elsewhere is laid on the wall before the episode."""
+    ranges = {"roll": (roll, roll), "start_radius": 0.0}
+    environment = suite.load("cathsim", task, task_kwargs={"randomisation": ranges})
+    environment.reset()
+    found = environment.task
+    heads, frame = [found.readings.head], found.readings.head_frame
+    for _ in range(10):
+        environment.step(np.zeros(environment.action_spec().shape))
+        heads.append(found.readings.head)
+    assert found.conditions.roll == roll
+    assert np.linalg.norm(np.array(heads) - heads[0], axis=1).max() < 0.5e-3
+    without = {"randomisation": ranges | {"roll": None}}
+    level = suite.load("cathsim", task, task_kwargs=without)
+    level.reset()
+    turned = level.task.readings.head_frame.T @ frame
+    assert np.arccos((np.trace(turned) - 1.0) / 2.0) > 0.3
+
+
 def test_an_ill_conditioned_displacement_is_not_written(shared_environment):
     """Joints that miss the place of the head by far leave the device at rest."""
     environment = shared_environment("type1_lcca")

@@ -54,6 +54,14 @@ def start_displacement(
     return radius * direction / np.linalg.norm(direction)
 
 
+def rolled(quaternion: np.ndarray, roll: float) -> np.ndarray:
+    """Orientation (4,) that is turned about its own z axis, rad."""
+    turn = np.array([np.cos(roll / 2), 0.0, 0.0, np.sin(roll / 2)])
+    found = np.empty(4)
+    mujoco.mju_mulQuat(found, quaternion, turn)
+    return found
+
+
 def check_drawn(options: Any, limits: Mapping[str, tuple[float, float, str]]) -> None:
     """Checks numbers and ranges against limits; ValueError names a field."""
     for name, (low, high, unit) in limits.items():
@@ -95,8 +103,7 @@ class Randomisation:
         goal_shift: shift of the goal along its branch, m, positive away from the
             ostium.
         roll: rotation of the device about its own axis at the start, rad. A shaped
-            device starts in the posture without roll and turns into its shape in the
-            first control steps, by millimetres.
+            device is at rest with it, for which each reset simulates 0.4 s.
         delay: shortest and longest delay of the action, whole control steps.
         start_insertion: additional insertion at the start, m, in steps of 5 mm; scaled
             down where its largest value is more than half of the way to the goal.
@@ -264,11 +271,8 @@ class RandomisedModel(Effect):
             ):
                 field(index, name)[where] = self._nominal[name][where] * stiffness
         if episode.roll is not None:
-            half = episode.roll / 2
-            turn = np.array([np.cos(half), 0.0, 0.0, np.sin(half)])
-            quaternion = np.empty(4)
-            mujoco.mju_mulQuat(quaternion, self._nominal["body_quat"][self._base], turn)
-            field(index, "body_quat")[self._base] = quaternion
+            level = self._nominal["body_quat"][self._base]
+            field(index, "body_quat")[self._base] = rolled(level, episode.roll)
 
 
 class ActionDelay(Effect):

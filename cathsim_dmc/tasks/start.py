@@ -1,27 +1,31 @@
 """Start posture of a device."""
 
 import contextlib
-import functools
+import copy
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from cathsim_dmc.entities.posture import bends_of, joints_along, nodes_of
-from cathsim_dmc.laws.field import FREE
+from cathsim_dmc.entities.posture import bends_of, joints_along
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.effects import Draw
 from cathsim_dmc.physics.held import Held
-from cathsim_dmc.physics.randomisation import START_JITTER, start_displacement
+from cathsim_dmc.physics.randomisation import (
+    START_JITTER,
+    rolled,
+    start_displacement,
+)
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.placement import matrix_of, past_sheath
+from cathsim_dmc.tasks.placement import past_sheath
 from cathsim_dmc.tasks.scene import AROUND_SHEATH, Scene
+from cathsim_dmc.tasks.start_shape import Joints, Shape, about_z
 
-_SETTLING_TIME = 2.0  # s, after which the device rests
+# Times after which the device rests, s: laid along a line, and turned by a roll.
+_SETTLING_TIME, _TURNING_TIME = 2.0, 0.4
 STARTS_ALONG_ROUTE = 16
 # Largest increase of the depth in the wall of the links behind a displaced head, m.
 _PRESSED = 2e-4
@@ -46,15 +50,6 @@ _DEEPEST_IN_SHEATH = AROUND_SHEATH - 0.1e-3
 # Beyond them the Jacobian is nearly singular, or the stroke ends.
 _LARGEST_SLIDE, _LARGEST_MISS = 4.0, 0.9
 _DRAWS = 20  # of a displacement at most, until the posture penetrates no wall
-_SAMPLES = 0.5e-3  # m, between points of a posture whose depth is checked
-_GUIDED = 0.02  # m of the shaft in the sheath that are checked, as they may turn
-
-
-class _Joints(NamedTuple):
-    """Insertion, m, and angles (n - 1, 2) of the bending hinges of a device, rad."""
-
-    insertion: float
-    bends: np.ndarray
 
 
 class Started(NamedTuple):
@@ -74,8 +69,8 @@ class StartPosture:
 
     The device is laid along the centreline of the vessel and settles once, with motors
     and base at rest, on the compiled model without randomisation. An episode starts in
-    the settled posture, at rest, with the head displaced as drawn. A drawn roll leaves
-    the posture as it is, so a shaped device then turns into its rolled shape.
+    the settled posture, at rest, with the head displaced as drawn. With a drawn roll, a
+    shaped device settles once more, with its base rolled; others keep their posture.
     """
 
     def __init__(
@@ -95,9 +90,12 @@ class StartPosture:
             ValueError: if the device does not come to rest, or outside the lumen or in
                 its wall, or nowhere in the range `start_along_route`.
         """
-        # The base cannot go back behind its start, so the stroke begins 1 mm later.
-        settle = functools.partial(_settle, scene, model, index, _Shape(scene))
-        rest = settle(0.0)
+        shaped = any(device.tip_shape for device in scene.catheter.devices)
+        self._rolls = shaped and config.randomisation.roll is not None
+        if self._rolls:
+            model = copy.copy(model)  # the simulation changes its own
+        self._rest = settle = _Settling(scene, model, index)
+        rest = settle.on_line(0.0)
         place = scene.placement
         way = np.linalg.norm(np.diff(place.line, axis=0), axis=-1).sum()
         way -= float(np.sum(scene.catheter.link_lengths)) + START_JITTER
@@ -105,7 +103,7 @@ class StartPosture:
         if (along_route := config.start_along_route) is not None:
             low, high = (share * way for share in along_route)
             advances = np.linspace(low, high, STARTS_ALONG_ROUTE)
-            self._ahead = _settled(settle, advances)
+            self._ahead = settle.on_lines(advances)
             if not self._ahead:
                 raise ValueError(
                     f"start_along_route is {tuple(along_route)}: "
@@ -117,7 +115,7 @@ class StartPosture:
         if farthest := config.randomisation.farthest_insertion:
             reach = min(farthest, _LARGEST_START * way)
             count = math.ceil(reach / START_SPACING)
-            self._starts += _settled(settle, np.linspace(reach / count, reach, count))
+            self._starts += settle.on_lines(np.linspace(reach / count, reach, count))
             self._scale = reach / farthest
 
     def write(
@@ -137,11 +135,12 @@ class StartPosture:
         """
         if self._ahead:
             number = random_state.randint(len(self._ahead))
-            posture = self._ahead[number]
+            posture = self._rolled(self._ahead[number], episode.roll)
             posture.write(qpos, posture.joints(np.zeros(3), episode.roll))
             return Started(posture.advance, np.zeros(3))
         wanted = self._scale * (episode.insertion or 0.0)
         posture = min(self._starts, key=lambda one: abs(one.advance - wanted))
+        posture = self._rolled(posture, episode.roll)
         displacement = episode.displacement
         for _ in range(_DRAWS):
             asked = posture.clear_of_wall(displacement)
@@ -156,20 +155,33 @@ class StartPosture:
         posture.write(qpos, joints)
         return Started(posture.advance, posture.displacement(points[-1]))
 
+    def _rolled(self, posture: "_Posture", roll: float | None) -> "_Posture":
+        """The posture at rest with a roll, rad; `posture` if that fits nowhere."""
+        if self._rolls and roll:
+            with contextlib.suppress(ValueError):
+                return self._rest.rolled(posture, roll)
+        return posture
+
 
 class _Posture:
-    """A device at rest at one advance (m), and the Jacobian that displaces its head."""
+    """A device at rest, and the Jacobian that displaces its head.
+
+    Attributes:
+        advance: Insertion beyond the task's own start, m.
+        roll: Roll of the base with which the device has settled, rad.
+    """
 
     def __init__(
         self,
         scene: Scene,
         model: mujoco.MjModel,
         index: ModelIndex,
-        shape: "_Shape",
+        shape: Shape,
         data: mujoco.MjData,
         advance: float,
+        roll: float,
     ):
-        self.advance, self._shape = advance, shape
+        self.advance, self.roll, self._shape = advance, roll, shape
         self._bends, self._insertion = index.bends_qpos, index.insertion_qpos
         data.qvel[:] = 0.0
         mujoco.mj_kinematics(model, data)
@@ -178,7 +190,7 @@ class _Posture:
         self._inserted = float(data.qpos[self._insertion])
         frames = data.xmat[index.links].reshape(-1, 3, 3)
         self._directions = frames[..., 2] @ frames[0]
-        self._frame = frames[0].copy()
+        self._frame = frames[0] @ about_z(roll).T  # of the inlet
         lengths = scene.catheter.link_lengths
         beyond = np.cumsum(lengths[::-1])[::-1]  # from joint i to the head
         inside = scene.placement.start_depth + advance
@@ -202,7 +214,7 @@ class _Posture:
         depth = scene.anatomy.lumen(self._nodes)
         self._least = np.minimum(depth, scene.catheter.device.outer_radius)
         self._least[:-1] -= _PRESSED
-        resting = shape.points(_Joints(self._inserted, self._angles))
+        resting = shape.points(Joints(self._inserted, self._angles), roll)
         self._head, deepest = resting[-1], shape.depths(resting) + _PRESSED
         self._deepest = np.maximum(deepest, (forces.DEEPEST, _DEEPEST_IN_SHEATH))
 
@@ -215,27 +227,27 @@ class _Posture:
                 return factor * displacement
         return np.zeros(3)
 
-    def joints(self, displacement: np.ndarray, roll: float | None) -> _Joints:
+    def joints(self, displacement: np.ndarray, roll: float | None) -> Joints:
         """Joints that displace the head by (3,) m in the inlet's frame, linearised.
 
-        With a roll of the base, rad, the hinge angles differ and the shape is the same.
+        With another roll of the base, rad, than that of the posture the hinge angles
+        differ and the shape is the same.
         """
         angles, step = self._angles.copy(), self._steps @ displacement
-        if roll:
-            c, s = np.cos(-roll), np.sin(-roll)
-            turn, directions = np.array([[c, -s], [s, c]]), self._directions.copy()
+        if further := (roll or 0.0) - self.roll:
+            turn, directions = about_z(-further)[:2, :2], self._directions.copy()
             directions[:, :2] = self._directions[:, :2] @ turn.T
             angles = bends_of(directions)
             step = np.concatenate([step[:1], turn @ step[1:]])
         angles[self._free] += step[1:]
-        return _Joints(max(self._inserted + step[0], 0.0), angles)
+        return Joints(max(self._inserted + step[0], 0.0), angles)
 
-    def points(self, joints: _Joints, roll: float | None) -> np.ndarray:
+    def points(self, joints: Joints, roll: float | None) -> np.ndarray:
         """Points (m, 3) of the axis, m, world frame, with a roll of the base, rad."""
         return self._shape.points(joints, roll or 0.0)
 
     def stands_free(
-        self, displacement: np.ndarray, joints: _Joints, points: np.ndarray
+        self, displacement: np.ndarray, joints: Joints, points: np.ndarray
     ) -> bool:
         """Whether joints displace the head as asked, and the device is in no wall.
 
@@ -258,95 +270,70 @@ class _Posture:
         """Displacement (3,), m, frame of the inlet, of a head (3,), world frame."""
         return (head - self._head) @ self._frame
 
-    def write(self, qpos: np.ndarray, joints: _Joints) -> None:
+    def write(self, qpos: np.ndarray, joints: Joints) -> None:
         """Writes joints into the configuration (nq,)."""
         qpos[self._insertion], qpos[self._bends] = joints
 
 
-class _Shape:
-    """Points of a device with given joints, and their depths in the walls."""
+class _Settling:
+    """Lets a device come to rest, with motors and base at rest."""
 
-    def __init__(self, scene: Scene):
-        """Takes the device, the field of the vessel and the bore of the sheath."""
-        place, lengths = scene.placement, scene.catheter.link_lengths
-        self._lengths, self._inlet = lengths, place.inlet
-        self._base = place.start_depth - float(np.sum(lengths))
-        self._frame = matrix_of(place.quaternion)
-        counts = np.ceil(lengths / _SAMPLES).astype(int)
-        shares = [np.arange(count) / count for count in counts]
-        self._links = np.repeat(np.arange(len(lengths)), counts)
-        self._shares = np.concatenate(shares)[:, None]
-        self._radius = scene.catheter.device.outer_radius
-        self._bore, self._lumen = scene.sheath.bore_radius, scene.anatomy.lumen
-        self._hole = self._bore + AROUND_SHEATH
-        self._walled = self._lumen.with_hole(self._hole)
+    def __init__(self, scene: Scene, model: mujoco.MjModel, index: ModelIndex):
+        """Takes a model without randomisation."""
+        self._scene, self._model, self._index = scene, model, index
+        self._shape = Shape(scene)
 
-    def points(self, joints: _Joints, roll: float = 0.0) -> np.ndarray:
-        """Points (m, 3) of the axis, m, world frame, the head last.
+    def on_line(self, advance: float) -> _Posture:
+        """Lays the device along the line at an advance (m), and lets it settle.
 
-        Args:
-            joints: Joints of the device.
-            roll: Rotation of the base about its axis, rad.
+        Raises:
+            ValueError: if it does not come to rest inside the lumen.
         """
-        nodes = nodes_of(self._lengths, joints.bends)
-        c, s = np.cos(roll), np.sin(roll)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        nodes = nodes @ turn.T + (0.0, 0.0, self._base + joints.insertion)
-        along = np.diff(nodes, axis=0)[self._links]
-        points = np.vstack([nodes[self._links] + self._shares * along, nodes[-1:]])
-        return self._inlet + points @ self._frame.T
+        # The base cannot go back behind its start, so the stroke begins 1 mm later.
+        at, scene = START_JITTER + advance, self._scene
+        lengths, line = scene.catheter.link_lengths, scene.placement.line
+        joints = Joints(at, joints_along(lengths, line, at))
+        return self._settled(joints, advance, 0.0, _SETTLING_TIME)
 
-    def depths(self, points: np.ndarray) -> np.ndarray:
-        """Largest depths (2,), m, of points in the walls of vessel and sheath."""
-        local = (points - self._inlet) @ self._frame
-        near = local[:, 2] > -_GUIDED
-        points, (x, y, level) = points[near], local[near].T
-        clear, guided = self._walled(points, free=True), level <= 0.0
-        bore = self._bore - np.hypot(x[guided], y[guided])
-        # A vessel may bend back beside the sheath.
-        inside = self._lumen(points[guided])
-        bore = np.where(inside > 0.0, np.maximum(bore, inside), bore)
-        # Beside the sheath, outside the lumen, the physics has no wall.
-        outside = (clear >= FREE) & (level > self._hole)
-        clear[outside] = self._lumen(points[outside])
-        return self._radius - np.array([clear.min(), bore.min(initial=np.inf)])
+    def on_lines(self, advances: np.ndarray) -> list[_Posture]:
+        """Postures at advances (m), without those that do not come to rest inside."""
+        settled = []
+        for advance in advances.tolist():
+            with contextlib.suppress(ValueError):
+                settled.append(self.on_line(advance))
+        return settled
 
+    def rolled(self, posture: _Posture, roll: float) -> _Posture:
+        """Lets the device settle from a posture with its base rolled, rad.
 
-def _settle(
-    scene: Scene,
-    model: mujoco.MjModel,
-    index: ModelIndex,
-    shape: _Shape,
-    advance: float,
-) -> _Posture:
-    """Lays the device along the line at an advance (m), and lets it settle."""
-    data = mujoco.MjData(model)
-    at = START_JITTER + advance
-    data.qpos[index.insertion_qpos] = at
-    data.qpos[index.bends_qpos] = joints_along(
-        scene.catheter.link_lengths, scene.placement.line, at
-    )
-    hold(model, data, index.driven)
-    depth = scene.placement.start_depth
-    with contextlib.ExitStack() as stack:
-        if not scene.sheath.touches:
-            held = Held(model, scene.catheter, index.bends_qpos)
-            stack.enter_context(held.at(model, depth, at))
-        for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
-            mujoco.mj_step(model, data)
-    _refuse_outside(scene, index, data)
-    return _Posture(scene, model, index, shape, data, advance)
+        Raises:
+            ValueError: if it does not come to rest inside the lumen.
+        """
+        base = self._model.body_quat[self._index.links.start]
+        level = base.copy()
+        base[:] = rolled(level, roll)
+        try:
+            joints = posture.joints(np.zeros(3), roll)
+            return self._settled(joints, posture.advance, roll, _TURNING_TIME)
+        finally:
+            base[:] = level
 
-
-def _settled(
-    settle: Callable[[float], _Posture], advances: np.ndarray
-) -> list[_Posture]:
-    """Postures at advances (m), without those that do not come to rest inside."""
-    settled = []
-    for advance in advances.tolist():
-        with contextlib.suppress(ValueError):
-            settled.append(settle(advance))
-    return settled
+    def _settled(
+        self, joints: Joints, advance: float, roll: float, time: float
+    ) -> _Posture:
+        """The posture after a time, s, in which the device moves freely."""
+        scene, model, index = self._scene, self._model, self._index
+        data, depth = mujoco.MjData(model), scene.placement.start_depth
+        data.qpos[index.insertion_qpos], data.qpos[index.bends_qpos] = joints
+        hold(model, data, index.driven)
+        with contextlib.ExitStack() as stack:
+            if not scene.sheath.touches:
+                held = Held(model, scene.catheter, index.bends_qpos)
+                stack.enter_context(held.at(model, depth, joints.insertion))
+            for _ in range(round(time / model.opt.timestep)):
+                mujoco.mj_step(model, data)
+        _refuse_outside(scene, index, data)
+        return _Posture(scene, model, index, self._shape, data, advance, roll)
 
 
 def _refuse_outside(scene: Scene, index: ModelIndex, data: mujoco.MjData) -> None:
