@@ -6,9 +6,10 @@ import json
 import math
 import os
 import shutil
+import tempfile
 import uuid
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -270,6 +271,41 @@ def write_text(path: str | os.PathLike[str], text: str) -> Path:
 def write_json(path: str | os.PathLike[str], values: Any) -> Path:
     """Write values as JSON atomically, see `atomic_path`; return its path."""
     return write_text(path, json.dumps(values, indent=2) + "\n")
+
+
+def write_result(path: Path, write: Callable[[Path], Any], result: str) -> None:
+    """Call `write(path)`, and where that fails `write` in a new temporary folder.
+
+    For results of long computations. The folder around `path` is created.
+
+    Args:
+        write: Function that writes a file or directory at a path.
+        result: What is written, for the error: "the anatomy of a.stl".
+
+    Raises:
+        OSError: that of `write(path)`, with a note that says where the result is.
+    """
+    try:
+        require_folder(path.parent, make=True)
+        write(path)
+    except OSError as error:
+        error.add_note(_kept(path, write, result))
+        raise
+
+
+def _kept(path: Path, write: Callable[[Path], Any], result: str) -> str:
+    """Write a result in a temporary folder; return what to tell of it."""
+    folder: str | None = None
+    try:
+        folder = tempfile.mkdtemp(prefix="cathsim-")
+        write(Path(folder, path.name))
+    except OSError as error:
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        return (
+            f"{result} is not kept, not as a temporary file either: {error}"
+        )
+    return f"{result} is kept in {folder}; move it to {path.parent}"
 
 
 def fill(path: str | os.PathLike[str], size: int) -> None:

@@ -5,7 +5,9 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from recording_samples import make_episode, make_tube
 from test_agents_training import run, small_ppo
 
 import cathsim_dmc
-from cathsim_dmc import cli, files, style, suite
+from cathsim_dmc import agents, cli, files, style, suite
 from cathsim_dmc.agents import ConfigError, evaluate, evaluation, submission, training
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.training_log import read_metrics
@@ -25,6 +27,7 @@ from cathsim_dmc.cli.agents import record
 from cathsim_dmc.cli.task_options import TaskOptions
 from cathsim_dmc.pictures import animation
 from cathsim_dmc.recording import dataset, image_set, rerun_log
+from cathsim_dmc.validation import rig
 
 
 @pytest.mark.parametrize("kind", ["a file", "under a file"])
@@ -195,6 +198,88 @@ def test_an_evaluation_that_cannot_be_written_is_printed(
     said = capsys.readouterr()
     assert ended.value.code == 2 and "No space left on device" in said.err
     assert '"episodes"' in said.out if json else "safe success" in said.out
+
+
+@pytest.fixture
+def full_disk(tmp_path, monkeypatch):
+    """Folders `data`, where nothing can be written to its end, and `temporary`."""
+    data, temporary = tmp_path / "data", tmp_path / "temporary"
+    data.mkdir(), temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    for name in "replace", "rename":
+        real = getattr(os, name)
+
+        def moved(source, target, real=real):
+            if data in Path(target).parents:
+                raise OSError(errno.ENOSPC, "No space left on device", str(target))
+            real(source, target)
+
+        monkeypatch.setattr(os, name, moved)
+    return data, temporary
+
+
+SHORT = {"max_steps": 2}
+LATE = {
+    "evaluation.json": lambda path: agents.evaluate(
+        "push", "simple1_bca", 1, task_kwargs=SHORT, out_dir=path.parent
+    ),
+    "sub.json": lambda path: submission.submit("push", path, "simple1_bca", episodes=1),
+    "actions.npz": lambda path: agents.record_actions(
+        "push", path, "simple1_bca", episodes=1, task_kwargs=SHORT
+    ),
+    "demos-v0": lambda path: agents.record_demonstrations(
+        "simple1_bca", path, 1, task_kwargs=SHORT
+    ),
+    "anatomy": lambda path: phantoms._save(rig.tube(0.06, 4e-3), path),
+}
+
+
+@pytest.mark.parametrize("name", LATE)
+def test_a_result_that_cannot_be_written_is_kept_elsewhere(full_disk, name):
+    data, temporary = full_disk
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        LATE[name](data / name)
+    (folder,) = temporary.iterdir()
+    (note,) = caught.value.__notes__
+    assert note.endswith(f" is kept in {folder}; move it to {data}")
+    assert (folder / name).exists()
+    assert not [one for one in data.rglob("*") if one.is_file()]
+
+
+def test_a_result_that_is_kept_nowhere_is_told(full_disk, monkeypatch, cathsim):
+    data, temporary = full_disk
+
+    def full(path):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    def command(*_, **options):
+        files.write_result(data / "a", full, "the anatomy of a.stl")
+
+    monkeypatch.setattr(phantoms, "import_scan", command)
+    code, _, error = cathsim("phantom", "import", "a.stl", "--out", str(data / "b"))
+    assert code == 2 and "data/a'. the anatomy of a.stl is not kept" in error
+    assert not list(temporary.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("line", "file"),
+    [
+        ("eval push --task simple1_bca --out OUT", "evaluation.json"),
+        ("eval push --task simple1_bca --out OUT", "heatmap.png"),
+        ("phantom generate simple1 --out OUT", "anatomy.npz"),
+        ("submit push --task simple1_bca --out OUT/a.json", "a.npz"),
+    ],
+)
+def test_a_folder_with_the_name_of_a_result_is_refused_before_the_work(
+    tmp_path, monkeypatch, cathsim, line, file
+):
+    monkeypatch.setattr(agents, "evaluate", work)
+    monkeypatch.setattr(evaluation, "evaluate", work)
+    monkeypatch.setattr(phantoms.shipped, "load", work)
+    monkeypatch.setattr(submission, "ships", lambda policy: False)
+    (tmp_path / file).mkdir()
+    code, _, error = cathsim(*line.replace("OUT", str(tmp_path)).split())
+    assert code == 2 and f"{file} is a directory" in error
 
 
 # Kills.

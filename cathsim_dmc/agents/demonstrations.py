@@ -118,9 +118,9 @@ def record_demonstrations(
             say(f"{len(buffers)} of {episodes} episodes")
     single = np.dtype("float32")
     action = specs.BoundedArray((simulation.num_actions,), single, -1.0, 1.0)
-    dataset.write(
-        out,
-        buffers,
+    write = functools.partial(
+        dataset.write,
+        buffers=buffers,
         env_spec=spec,
         observation_space=gymnasium.space_of(made.observation_specs, single),
         action_space=gymnasium.space(action, single),
@@ -128,7 +128,9 @@ def record_demonstrations(
         description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
         f"seeds from {seed}",
     )
-    return _summary(out, buffers)
+    done = _summary(out, buffers)
+    files.write_result(out, write, repr(done))
+    return done
 
 
 def _summary(path: Path, buffers: Sequence[Any]) -> Demonstrations:

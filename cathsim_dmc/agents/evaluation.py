@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
 from cathsim_dmc import bounds, cluster, files
-from cathsim_dmc.agents import protocols
+from cathsim_dmc.agents import evaluation_files, protocols
 from cathsim_dmc.agents.contact_log import ContactLog
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.policies import (
@@ -115,19 +115,22 @@ def evaluate(
         cluster.connect()
     environments.require_factory(make_env)
     make = functools.partial(make_env, **place)
+    target = None
     if out_dir is not None:
         # Checked first: an evaluation that cannot be written would be lost.
-        files.require_place(files.as_path("out_dir", out_dir))
-        error_dir = error_dir or Path(out_dir) / "errors"
+        target = files.as_path("out_dir", out_dir) / evaluation_files.FILE
+        files.require_file(target, later=True)
+        error_dir = error_dir or target.parent / "errors"
     groups = plan.groups(num_threads, error_dir, make, start)
     if on_cluster:
         outcomes = _play_on_cluster(groups, observer)
     else:
         outcomes = [one for group in groups for one in _play(group, observer)]
     result = plan.result(name, outcomes, start, simulation_device)
-    if out_dir is not None:
-        files.require_folder(out_dir, make=True)
-        files.write_json(Path(out_dir) / "evaluation.json", result.to_dict())
+    if target is not None:
+        values = result.to_dict()
+        write = functools.partial(files.write_json, values=values)
+        files.write_result(target, write, repr(result))
     return result
 
 

@@ -67,24 +67,30 @@ def submit(
     elif not ships(policy):
         player = _Recorder(load_policy(policy, EVALUATION_SEED))
     files.require_file(out, later=True)
+    if not isinstance(player, str):
+        files.require_file(out.with_suffix(RECORDED), later=True)
     result = evaluation.evaluate(
         player, task, episodes, protocol=PROTOCOL, num_threads=num_threads
     )
-    files.require_file(out, make=True)
-    ours: dict[str, Any] = {
-        "policy_sha256": weights, "package": __version__, "commit": _commit(),
-    }  # fmt: skip
-    if not isinstance(player, str):
-        beside = out.with_suffix(RECORDED)
-        if isinstance(player, _Recorder):
-            player.write(beside, result)
-        elif not (beside.exists() and beside.samefile(policy)):
-            files.write_bytes(beside, Path(policy).read_bytes())
-        ours["actions_sha256"] = file_digest(beside)
-    values = {**ours, **result.to_dict()}
-    submission = json.loads(json.dumps(values, default=str))
-    submission["sha256"] = seal(submission)
-    files.write_text(out, text(submission))
+    submission: dict[str, Any] = {}
+
+    def write(path: Path) -> None:
+        ours: dict[str, Any] = {
+            "policy_sha256": weights, "package": __version__, "commit": _commit(),
+        }  # fmt: skip
+        if not isinstance(player, str):
+            beside = path.with_suffix(RECORDED)
+            if isinstance(player, _Recorder):
+                player.write(beside, result)
+            elif not (beside.exists() and beside.samefile(policy)):
+                files.write_bytes(beside, Path(policy).read_bytes())
+            ours["actions_sha256"] = file_digest(beside)
+        values = {**ours, **result.to_dict()}
+        submission.update(json.loads(json.dumps(values, default=str)))
+        submission["sha256"] = seal(submission)
+        files.write_text(path, text(submission))
+
+    files.write_result(out, write, repr(result))
     return submission
 
 
@@ -262,5 +268,6 @@ def record_actions(
     if files.require_file(out).suffix != RECORDED:
         raise ValueError(f"the actions are to be written to {out}; give a .npz file")
     result = evaluation.evaluate(recorder, task, protocol=PROTOCOL, **options)
-    recorder.write(Path(out), result)
+    write = functools.partial(recorder.write, result=result)
+    files.write_result(Path(out), write, repr(result))
     return result

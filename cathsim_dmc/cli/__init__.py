@@ -80,7 +80,8 @@ def _interrupted(interrupts: Interrupts) -> int:
 
 
 def _refused(error: Exception) -> int:
-    text = " ".join(str(error).split()) or "no message"
+    told = ". ".join([str(error), *getattr(error, "__notes__", ())])
+    text = " ".join(told.split()) or "no message"
     if len(text) > _LONGEST:  # as a name of thousands of characters makes it
         text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
     print(f"cathsim: {type(error).__name__}: {text}", file=sys.stderr)

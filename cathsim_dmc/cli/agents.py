@@ -1,6 +1,7 @@
 """`cathsim eval`, `submit`, `record`, `demos` and `play`."""
 
 import contextlib
+import functools
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -14,7 +15,7 @@ from cathsim_dmc import agents  # isort: skip
 
 from cathsim_dmc import bounds, files, suite
 from cathsim_dmc import play as by_hand
-from cathsim_dmc.agents import evaluation, protocols, submission
+from cathsim_dmc.agents import evaluation, evaluation_files, protocols, submission
 from cathsim_dmc.agents.demonstrations import DEMONSTRATION_SEED
 from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.agents.policies import require_actions, task_and_options
@@ -112,7 +113,8 @@ def evaluate(
             return agents.evaluate(who, observer=observer, error_dir=error_dir, **asked)
 
     if out is not None:
-        files.require_place(out)  # checked first: the evaluation would be lost
+        for path in _written(out):  # checked first: the evaluation would be lost
+            files.require_file(path, later=True)
     results = {"policy": play(player, None if out is None else out / "errors")}
     if baseline and policy != "random":
         results["baseline"] = play("random")
@@ -139,11 +141,16 @@ def _write_evaluation(
     contacts: evaluation.ContactLog,
 ) -> None:
     # Another process may have written there meanwhile.
-    written = [out / "evaluation.json", out / "heatmap.png"]
-    with told_of_replaced(written):
-        files.require_folder(out, make=True)
-        files.write_json(written[0], values)
-        contacts.draw(result, written[1])
+    target, picture = _written(out)
+    with told_of_replaced([target, picture]):
+        write = functools.partial(files.write_json, values=values)
+        files.write_result(target, write, "the evaluation")
+        contacts.draw(result, picture)
+
+
+def _written(out: Path) -> tuple[Path, Path]:
+    """Returns the files of an evaluation: its figures and its picture."""
+    return out / evaluation_files.FILE, out / "heatmap.png"
 
 
 @contextlib.contextmanager

@@ -121,13 +121,13 @@ def _require_place(out: Path) -> None:
             f"the directory would be called {str(out)!r}, as a phantom is, which tasks "
             f"would take instead; give another one (--out), such as patients/{out}"
         )
-    files.require_place(out)
+    files.require_file(out / _FILE, later=True)
 
 
 def _save(anatomy: Anatomy, out: Path) -> None:
     with told_of_replaced([out / _FILE]):
         (out / _PICTURE).unlink(missing_ok=True)  # of what was there before
-        anatomy.save(out)
+        files.write_result(out, anatomy.save, f"the anatomy {anatomy.name}")
 
 
 def _next_commands(anatomy: Anatomy, out: Path, device: str | None) -> list[str]:
