@@ -302,9 +302,7 @@ def _kept(path: Path, write: Callable[[Path], Any], result: str) -> str:
     except OSError as error:
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
-        return (
-            f"{result} is not kept, not as a temporary file either: {error}"
-        )
+        return f"{result} is not kept, not as a temporary file either: {error}"
     return f"{result} is kept in {folder}; move it to {path.parent}"
 
 

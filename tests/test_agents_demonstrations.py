@@ -7,12 +7,14 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from recording_samples import make_episode
 
 from cathsim_dmc.agents import make_env, record_demonstrations
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, load_transitions
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import Teacher, View
 from cathsim_dmc.policies.expert import ExpertPolicy
+from cathsim_dmc.recording import dataset
 from cathsim_dmc.recording.dataset import DatasetError, read_episodes
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.suite import make_task
@@ -140,6 +142,29 @@ def test_a_full_disk_is_told_before_hdf5_meets_it(tmp_path, small_disk):
     with small_disk(50_000), pytest.raises(OSError, match="too large.*full-v0"):
         record_demonstrations(TASK, tmp_path / "full-v0", 1, task_kwargs=OPTIONS)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_second_writer_of_a_dataset_is_refused_before_the_work(tmp_path):
+    out = tmp_path / "one-v0"
+    episode = make_episode(task=TASK, seed=1)
+    writers = {
+        "demos": lambda: record_demonstrations(TASK, out, 1, say=work),
+        "export": lambda: dataset.export([episode], out),
+    }
+
+    def work(text):
+        raise AssertionError("work was begun")
+
+    def second(text):
+        for write in writers.values():
+            words = f"another process writes {out}; wait for its end, or choose another"
+            with pytest.raises(FileExistsError, match=words):
+                write()
+        called.append(True)
+
+    called = []
+    record_demonstrations(TASK, out, 1, task_kwargs=OPTIONS, say=second)
+    assert called and [one.name for one in tmp_path.iterdir()] == ["one-v0"]
 
 
 def test_reading_a_dataset_runs_nothing_that_it_names(copied, shapes):

@@ -19,6 +19,7 @@ NAME = "cathsim_dmc"
 BELOW = {
     "files",
     "file_maps",
+    "locks",
     "bounds",
     "json_options",
     "style",
@@ -40,6 +41,7 @@ ALLOWED = {
     # how loops are compiled and kept, how work is spread over machines and cores.
     "files": set(),
     "file_maps": set(),
+    "locks": set(),
     "bounds": set(),
     "json_options": set(),
     "style": set(),

@@ -12,7 +12,7 @@ import torch
 from dm_env import specs
 from tensordict import TensorDict, TensorDictBase
 
-from cathsim_dmc import bounds, extras, files, suite
+from cathsim_dmc import bounds, extras, files, locks, suite
 from cathsim_dmc.agents import hub
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import View
@@ -90,7 +90,7 @@ def record_demonstrations(
     Raises:
         ValueError: a number is out of range, the task or an option is unknown, or the
             task's device cannot be steered.
-        FileExistsError: `out` exists.
+        FileExistsError: `out` exists, or another process records it.
         FileNotFoundError: the directory around `out` does not exist.
         ModuleNotFoundError: minari is not installed.
     """
@@ -99,38 +99,39 @@ def record_demonstrations(
     bounds.seeds("seed", seed, episodes)
     bounds.number("noise", noise, 0.0, 1.0)
     bounds.option_threads(num_threads)
-    dataset.check_free(out)
     extras.require("gym", "gymnasium", "minari", "h5py")
     from cathsim_dmc.simulation import gymnasium
 
     names = observation if isinstance(observation, str) else list(observation)
     options: dict[str, Any] = bounds.options("task_kwargs", task_kwargs)
     options |= {"observation": names}
-    count, spec = min(episodes, _SIMULATIONS), gymnasium.env_spec(task, **options)
-    made = suite.make_task(task, **options)
-    simulation = BatchSimulation(made, count, num_threads=num_threads or 0)
-    buffers: list[Any] = []
-    while len(buffers) < episodes:
-        seeds = np.arange(count) + seed + len(buffers)
-        played = _play(simulation, seeds, noise)
-        buffers += played[: episodes - len(buffers)]
-        if say is not None:
-            say(f"{len(buffers)} of {episodes} episodes")
-    single = np.dtype("float32")
-    action = specs.BoundedArray((simulation.num_actions,), single, -1.0, 1.0)
-    write = functools.partial(
-        dataset.write,
-        buffers=buffers,
-        env_spec=spec,
-        observation_space=gymnasium.space_of(made.observation_specs, single),
-        action_space=gymnasium.space(action, single),
-        algorithm=f"scripted expert, noise {noise:g}",
-        description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
-        f"seeds from {seed}",
-    )
-    done = _summary(out, buffers)
-    files.write_result(out, write, repr(done))
-    return done
+    with locks.only_writer(out):
+        dataset.check_free(out)
+        count, spec = min(episodes, _SIMULATIONS), gymnasium.env_spec(task, **options)
+        made = suite.make_task(task, **options)
+        simulation = BatchSimulation(made, count, num_threads=num_threads or 0)
+        buffers: list[Any] = []
+        while len(buffers) < episodes:
+            seeds = np.arange(count) + seed + len(buffers)
+            played = _play(simulation, seeds, noise)
+            buffers += played[: episodes - len(buffers)]
+            if say is not None:
+                say(f"{len(buffers)} of {episodes} episodes")
+        single = np.dtype("float32")
+        action = specs.BoundedArray((simulation.num_actions,), single, -1.0, 1.0)
+        write = functools.partial(
+            dataset.write,
+            buffers=buffers,
+            env_spec=spec,
+            observation_space=gymnasium.space_of(made.observation_specs, single),
+            action_space=gymnasium.space(action, single),
+            algorithm=f"scripted expert, noise {noise:g}",
+            description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
+            f"seeds from {seed}",
+        )
+        done = _summary(out, buffers)
+        files.write_result(out, write, repr(done))
+        return done
 
 
 def _summary(path: Path, buffers: Sequence[Any]) -> Demonstrations:

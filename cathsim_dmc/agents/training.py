@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -12,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock, Timeout
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
 
-from cathsim_dmc import bounds, files
+from cathsim_dmc import bounds, files, locks
 from cathsim_dmc.agents.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -162,19 +160,17 @@ def _environment(config: TrainingConfig, make_env: EnvFactory, frames: int) -> E
 def _only_process(run: Path) -> Iterator[None]:
     """Make and lock the directory of a run; a killed process releases the lock."""
     files.require_folder(run, make=True)
-    lock = FileLock(run / ".lock")
+    lock_file = run / ".lock"
     text = f"another process trains in {run}; wait for its end, or choose a new folder"
-    with files.refused(ConfigError, text, Timeout):
-        lock.acquire(blocking=False)
-    try:
-        yield
-    finally:
-        # If no run was begun, the lock and an empty directory are removed.
-        if not (run / CONFIG_FILE).exists():
-            with contextlib.suppress(OSError):
-                os.unlink(lock.lock_file)
-                run.rmdir()
-        lock.release()
+    with locks.only_process(lock_file, ConfigError, text):
+        try:
+            yield
+        finally:
+            # If no run was begun, the lock and an empty directory are removed.
+            if not (run / CONFIG_FILE).exists():
+                with contextlib.suppress(OSError):
+                    lock_file.unlink()
+                    run.rmdir()
 
 
 def no_run(path: str | Path) -> str:

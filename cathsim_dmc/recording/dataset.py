@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import bounds, extras, suite
+from cathsim_dmc import bounds, extras, locks, suite
 from cathsim_dmc.files import (
     as_path,
     atomic_directory,
@@ -237,10 +237,11 @@ def export(
 
     Raises:
         ValueError: the episodes do not belong together, or do not repeat.
-        FileExistsError: the directory exists.
+        FileExistsError: the directory exists, or another process writes it.
         ModuleNotFoundError: gymnasium or minari is not installed.
     """
-    check_free(as_path("path", path))
+    path = as_path("path", path)
+    check_free(path)
     extras.require("gym", "gymnasium", "minari", "h5py")
     from minari.data_collector import EpisodeBuffer
 
@@ -257,7 +258,10 @@ def export(
         options["observation"] = observation
     single = all((e.action == e.action.astype(np.float32)).all() for e in episodes)
     kind = np.dtype("float32" if single else "float64")
-    with contextlib.closing(suite.load(suite.DOMAIN, task, options)) as environment:
+    with (
+        locks.only_writer(path),
+        contextlib.closing(suite.load(suite.DOMAIN, task, options)) as environment,
+    ):
         seen = environment.task.observation_specs
         return write(
             path,

@@ -1,0 +1,48 @@
+"""Locks that keep other processes from writing the same folder or file."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from cathsim_dmc import files
+
+
+@contextlib.contextmanager
+def only_process(
+    lock_file: str | os.PathLike[str], kind: type[Exception], text: str
+) -> Iterator[None]:
+    """Hold a lock for the block; a killed process releases it.
+
+    Args:
+        lock_file: File of the lock, which stays.
+        kind: Error that is raised where another process holds the lock.
+        text: Its message.
+    """
+    lock = FileLock(lock_file)
+    with files.refused(kind, text, Timeout):
+        lock.acquire(blocking=False)
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextlib.contextmanager
+def only_writer(path: Path) -> Iterator[None]:
+    """Reserve the path of a directory that the block writes at its end.
+
+    Raises:
+        FileExistsError: another process has reserved it.
+        OSError: the directory around it is missing or read-only.
+    """
+    files.require_folder(path.parent)
+    lock_file = path.with_name(f".{path.name}.lock")
+    text = f"another process writes {path}; wait for its end, or choose another name"
+    with only_process(lock_file, FileExistsError, text):
+        try:
+            yield
+        finally:
+            lock_file.unlink(missing_ok=True)
