@@ -102,6 +102,16 @@ def test_a_policy_of_ones_own_needs_one_class_and_one_line(monkeypatch):
     assert [which.tolist() for which in mine.begun] == [[True, True]]
 
 
+def test_a_policy_of_another_observation_is_refused_before_an_episode():
+    """Two observations may have arrays of one size, which tell nothing."""
+    player = load_policy("pretrained:type1_bca")
+    env = suite.load("cathsim", TASK, {"observation": ["force", "goal"], **SHORT})
+    words = "reads the observation .*, and the environment has force, goal; make it"
+    with pytest.raises(ValueError, match=f"^{player.name} {words}"):
+        record(env, player)
+    assert not env.task.rollout.begun
+
+
 def test_a_policy_is_told_which_simulations_begin_anew():
     """The shorter episodes go on with further ones until the longest has ended."""
     begun = []

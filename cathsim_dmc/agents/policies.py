@@ -2,7 +2,7 @@
 
 import contextlib
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,6 +18,7 @@ from cathsim_dmc.agents import pretrained
 from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError
 from cathsim_dmc.policies import POLICIES, Policy, View, make_policy
 from cathsim_dmc.simulation import environments
+from cathsim_dmc.tasks import observations
 
 # Function from the standard observations (N, ...) to the actions (N, A), or to a
 # TensorDict with "action".
@@ -178,6 +179,16 @@ class TrainedPolicy(FunctionPolicy):
     def reset(self, view: View, which: np.ndarray) -> None:
         """Raises ValueError if the simulations have another number of actions."""
         _require(self, "has actions of", self.shapes.actions, view.num_actions)
+
+    def require_observations(self, names: Sequence[str]) -> None:
+        """Raises ValueError if `names` lack an observation of the training."""
+        own, given = map(observations.plain_keys, (self.config.observation, names))
+        if not {*own} <= {*given}:
+            raise ValueError(
+                f"{self.name} reads the observation {self.observation!r}, and the "
+                f"environment has {', '.join(names)}; make it with the option "
+                f"observation={self.observation!r}"
+            )
 
     def _answer(self, observation: TensorDictBase) -> TensorDictBase:
         # In training the critic alone may have read the vector.

@@ -273,7 +273,7 @@ def take_over(
         )
     pairs = {n: (getattr(source.config, n), getattr(config, n)) for n in _ALIKE}
     seen = source.config.observation, config.observation
-    known, wanted = map(_entries, seen)
+    known, wanted = map(observations.plain_keys, seen)
     same = known == wanted
     pairs["sizes"] = source.shapes, shapes
     if not same and source.shapes.vector:  # the rest must agree
@@ -324,16 +324,6 @@ def _widened(
         start = {"squares": _COIN**2 * float(count), "scale": 1.0 / _COIN}
         wide[..., known:] = start.get(name, 0.0)
     return wide
-
-
-def _entries(names: str | tuple[str, ...]) -> list[str]:
-    """Return the entries in the order of the networks.
-
-    Those of "route" and of "biplane", its reconstruction, have the same names.
-    """
-    rows = observations.entries(observations.resolve(names))
-    keys = sorted(entry.key for entry in rows)
-    return [key.removeprefix("route_").removeprefix("biplane_") for key in keys]
 
 
 def _loop(

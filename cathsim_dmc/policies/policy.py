@@ -65,6 +65,15 @@ class Policy:
             which: (N,) bool, the simulations that begin a new episode.
         """
 
+    def require_observations(self, names: Sequence[str]) -> None:
+        """Raise ValueError if a composer environment lacks what the policy reads.
+
+        By default any observations will do; `observation` is that of evaluations.
+
+        Args:
+            names: Names of the observations of the environment.
+        """
+
     def among(self, first: int, count: int) -> "Policy":
         """Returns the policy for a part of the episodes of an evaluation.
 
@@ -100,8 +109,12 @@ def in_environment(
     """Returns a function from a composer environment's time step to an action (A,).
 
     The policy is reset where an episode begins, and after a restored snapshot.
+
+    Raises:
+        ValueError: see `Policy.require_observations`.
     """
     view, known = View(environment), None
+    policy.require_observations(view.task.observation_names)
 
     def act(timestep: dm_env.TimeStep) -> np.ndarray:
         nonlocal known

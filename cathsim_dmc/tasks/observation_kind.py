@@ -304,6 +304,14 @@ class ObservationTable(dict[str, ObservationKind]):
         """Entries of the named rows."""
         return [entry for name in names for entry in self[name].entries]
 
+    def plain_keys(self, names: str | Sequence[str]) -> list[str]:
+        """Keys of the entries of rows, in the order of the networks.
+
+        Those of "route" and of "biplane", its reconstruction, have the same keys.
+        """
+        keys = sorted(entry.key for entry in self.entries(self.resolve(names)))
+        return [key.removeprefix("route_").removeprefix("biplane_") for key in keys]
+
     def entry_specs(self, names: Sequence[str], sizes: Sizes) -> dict[str, specs.Array]:
         """Specs of the entries of the named rows, for one simulation."""
         return {entry.key: entry.spec(sizes) for entry in self.entries(names)}

@@ -359,3 +359,4 @@ def devices(frame: Frame) -> Observation:
 resolve, observe, needs = OBSERVATIONS.resolve, OBSERVATIONS.observe, OBSERVATIONS.needs
 check, with_images = OBSERVATIONS.check, OBSERVATIONS.with_images
 entries, entry_specs = OBSERVATIONS.entries, OBSERVATIONS.entry_specs
+plain_keys = OBSERVATIONS.plain_keys
