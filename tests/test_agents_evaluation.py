@@ -253,6 +253,7 @@ def test_an_episode_that_the_objective_ended_is_not_one_given_up(failed):
     assert evaluation_files.outcome(row) == episode
     assert evaluation_files.outcome({**row, "failed": False}).given_up
     assert result.summary().get("failed") == (1.0 if failed else None)
+    assert result.summary().get("given_up") == (None if failed else 1.0)
 
 
 def test_force_figures_are_those_of_the_steps():

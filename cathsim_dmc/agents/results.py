@@ -158,7 +158,8 @@ class EvaluationResult:
     def summary(self) -> dict[str, Any]:
         """Return means with deviations over the episodes, success with its interval.
 
-        The interval is None where the episodes are not distinct. Forces in N, by
+        The interval is None where the episodes are not distinct. The shares of episodes
+        that failed or were given up are there where there are any. Forces in N, by
         quantity and statistic as docs/forces.md defines them.
         """
         count, successes = len(self.episodes), self.successes
@@ -177,8 +178,9 @@ class EvaluationResult:
             mean, deviation = self.mean_sd(f"forces.{quantity}.{name}")
             result["forces"][quantity][name] = {"mean": mean, "sd": deviation}
         result["physics_errors"] = sum(e.physics_error for e in self.episodes)
-        if failed := sum(e.failed for e in self.episodes):
-            result["failed"] = failed / count
+        for name in "failed", "given_up":
+            if found := sum(getattr(e, name) for e in self.episodes):
+                result[name] = found / count
         result |= {"success": successes / count, "success_ci95": interval}
         result["safe_success"] = {
             f"{limit:g} N": self.safe_success(limit) for limit in SAFE_FORCES
