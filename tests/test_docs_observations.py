@@ -76,6 +76,39 @@ def test_an_own_row_returns_what_it_declares(environment):
         table.row(entry)(own)
 
 
+@pytest.mark.parametrize(
+    ("given", "dtype", "fits"),
+    [
+        (np.array([[0.0, 1.0]]), np.float64, True),
+        (np.array([[-1e-9, 1.0 + 1e-9]]), np.float64, True),
+        (np.array([[-1e-3, 1.0]]), np.float64, False),
+        (np.array([[0.0, 57.3]]), np.float64, False),
+        (np.full((1, 2, 2, 1), 2, np.uint8), np.uint8, False),
+    ],
+)
+def test_an_own_row_starts_in_the_range_that_it_declares(
+    environment, given, dtype, fits
+):
+    table = observations.OBSERVATIONS
+    entry = Entry("own", given.shape[1:], "1", "shares", 0.0, 1.0, dtype)
+
+    def own(frame):
+        return {"own": given}
+
+    try:
+        table.row(entry)(own)
+        task = twin(environment.task, observation="own")
+        if fits:
+            shown = suite.environment(task).reset().observation["own"]
+            assert shown.tolist() == given[0].tolist()
+        else:
+            words = "'own' .* at the start of an episode; .* numbers from 0 to 1"
+            with pytest.raises(ValueError, match=words):
+                suite.environment(task).reset()
+    finally:
+        table.pop("own", None)
+
+
 def test_an_own_row_reads_images_that_the_task_does_not_observe(environment):
     table, seen = observations.OBSERVATIONS, []
     entry = Entry("darkest", 1, "grey level", "least grey level of the image", 0, 255)

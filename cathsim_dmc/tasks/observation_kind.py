@@ -19,6 +19,7 @@ from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.route import Ahead
 
 _IMAGES = np.uint8, np.float32  # types of images
+_ROUNDING = 1e-6  # by which a number may exceed its range, relative above 1
 Observation = dict[str, np.ndarray]
 Shape = int | tuple[int, ...]
 
@@ -166,6 +167,16 @@ def flat(array: np.ndarray, axes: int) -> np.ndarray:
     return array.reshape(array.shape[:-axes] + (-1,))
 
 
+def _within(numbers: np.ndarray, spec: specs.Array) -> bool:
+    """Whether numbers are in the range of a spec, if it has one, but for rounding."""
+    if not (isinstance(spec, specs.BoundedArray) and numbers.size):
+        return True
+    low, high = float(spec.minimum), float(spec.maximum)
+    return numbers.min() >= low - _ROUNDING * max(
+        1.0, abs(low)
+    ) and numbers.max() <= high + _ROUNDING * max(1.0, abs(high))
+
+
 class HeldImages(dict[str, np.ndarray]):
     """Images by name; ValueError for one that the sensors do not hold."""
 
@@ -276,7 +287,8 @@ class ObservationTable(dict[str, ObservationKind]):
 
         Args:
             begun: (K,) numbers of the simulations that begin an episode, whose entries
-                must be finite; the others may have diverged.
+                must be finite and in the declared range, but for rounding; the others
+                may have diverged.
         """
         for key in sorted(observation.keys() | wanted.keys()):
             value, entry = observation.get(key), f"entry {key!r} of an observation"
@@ -294,10 +306,16 @@ class ObservationTable(dict[str, ObservationKind]):
                     f"{entry} is of {value.dtype}, and its row declares "
                     f"{wanted[key].dtype}; return what it declares"
                 )
-            if value.dtype.kind == "f" and not np.isfinite(value[begun]).all():
+            numbers, fault = value[begun], ""
+            if value.dtype.kind == "f" and not np.isfinite(numbers).all():
+                fault = "its numbers must be finite"
+            elif not _within(numbers, wanted[key]):
+                low, high = wanted[key].minimum, wanted[key].maximum
+                fault = f"its row declares numbers from {low:g} to {high:g}"
+            if fault:
                 raise ValueError(
-                    f"{entry} is {bounds.shown(value[begun])} at the start of an "
-                    "episode; its numbers must be finite"
+                    f"{entry} is {bounds.shown(numbers)} at the start of an episode; "
+                    f"{fault}"
                 )
 
     def entries(self, names: Iterable[str]) -> list[Entry]:
