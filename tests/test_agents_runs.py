@@ -1,5 +1,6 @@
 """The folder of a run: one process writes it, and what is lost is named."""
 
+import functools
 import shutil
 import signal
 import subprocess
@@ -23,6 +24,7 @@ from cathsim_dmc.agents import (
     evaluate,
     pretrained,
 )
+from cathsim_dmc.agents.checkpoint import CheckpointError
 from cathsim_dmc.agents.learners import make_config
 from cathsim_dmc.agents.networks import NetworkShapes, make_policy
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
@@ -104,6 +106,31 @@ def test_a_full_disk_names_the_file(tmp_path, trained, small_disk, name, full):
         run(small_ppo(total_frames=2_048), tmp_path / "run", resume=True)
     assert Checkpoint.open(tmp_path / "run") == before
     assert run(small_ppo(), tmp_path / "run", resume=True).frames == 1_024
+
+
+@pytest.mark.parametrize("name", ["checkpoint.json", "policy.pt"])
+def test_a_checkpoint_that_is_deleted_while_it_is_read_is_read_from_the_next(
+    tmp_path, trained, monkeypatch, name
+):
+    run_folder = shutil.copytree(trained / "ppo", tmp_path / "run")
+    (old,) = (run_folder / "checkpoints").iterdir()
+    new = old.with_name(f"{10**6:010d}")
+
+    def saved(self, *given, read, **options):
+        if self == old / name and not new.exists():
+            shutil.move(shutil.copytree(old, old.with_name("copy")), new)
+            shutil.rmtree(old)  # as keep_checkpoints=1 does
+        return read(self, *given, **options)
+
+    for method in "read_text", "read_bytes":
+        read = getattr(Path, method)
+        monkeypatch.setattr(Path, method, functools.partialmethod(saved, read=read))
+    assert load_policy(str(run_folder)).checkpoint.path == new
+    (new / "policy.pt").write_bytes(b"damaged")
+    with pytest.raises(CheckpointError, match="policy.pt is damaged"):
+        load_policy(str(run_folder))
+    with pytest.raises(CheckpointError, match="no checkpoint in"):
+        load_policy(str(run_folder / "checkpoints"))
 
 
 def test_what_is_no_function_is_refused_before_the_work(tmp_path):

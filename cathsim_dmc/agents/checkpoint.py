@@ -8,7 +8,7 @@ import pickletools
 import re
 import shutil
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -208,6 +208,25 @@ def checkpoints_in(run: Path) -> list[Path]:
     found = (Path(run) / _DIRECTORY).glob(f"*/{_DESCRIPTION}")
     complete = (file.parent for file in found if file.parent.name.isdecimal())
     return sorted(complete, key=lambda child: int(child.name))
+
+
+def read_newest(path: str | Path, read: Callable[[Checkpoint], Any]) -> Any:
+    """Return what a function reads from a checkpoint, or from the newest of a run.
+
+    It is called again where a training has deleted the checkpoint meanwhile, as with
+    `keep_checkpoints=1`, and has a newer one.
+
+    Raises:
+        CheckpointError: see `Checkpoint.open`, or raised by `read`.
+    """
+    newest = checkpoints_in(Path(path))[-1:]
+    while True:
+        try:
+            return read(Checkpoint.open(path))
+        except CheckpointError:
+            before, newest = newest, checkpoints_in(Path(path))[-1:]
+            if newest == before:
+                raise
 
 
 def save_checkpoint(

@@ -15,7 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc import files, suite
 from cathsim_dmc.agents import pretrained
-from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError
+from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError, read_newest
 from cathsim_dmc.policies import POLICIES, Policy, View, make_policy
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.tasks import observations
@@ -263,7 +263,7 @@ def load_policy(policy: PolicyLike, seed: int = 0, scripted: bool = True) -> Pol
             f"no policy {policy}: it is no file or directory, and none of "
             f"{', '.join(named)}{_OWN if scripted else ''}"
         )
-    return TrainedPolicy(Checkpoint.open(policy) if path is None else path)
+    return read_newest(policy, TrainedPolicy) if path is None else TrainedPolicy(path)
 
 
 # Options of a task that say which devices a policy drives.
