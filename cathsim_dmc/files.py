@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import glob
 import json
 import math
 import os
@@ -322,6 +323,12 @@ def fill(path: str | os.PathLike[str], size: int) -> None:
 
 def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}{_PARTIAL}")
+
+
+def unfinished(path: Path) -> list[Path]:
+    """Return temporary files and directories of writers of `path`, alive or dead."""
+    digits = "[0-9a-f]" * 12
+    return [*path.parent.glob(f".{glob.escape(path.name)}.{digits}{_PARTIAL}")]
 
 
 def require_room(unpacked: int, stored: int) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,6 +35,8 @@ def only_process(
 def only_writer(path: Path) -> Iterator[None]:
     """Reserve the path of a directory that the block writes at its end.
 
+    What a process that was killed has left of it is removed.
+
     Raises:
         FileExistsError: another process has reserved it.
         OSError: the directory around it is missing or read-only.
@@ -43,6 +46,8 @@ def only_writer(path: Path) -> Iterator[None]:
     text = f"another process writes {path}; wait for its end, or choose another name"
     with only_process(lock_file, FileExistsError, text):
         try:
+            for left in files.unfinished(path):  # of a process that was killed
+                shutil.rmtree(left)
             yield
         finally:
             lock_file.unlink(missing_ok=True)

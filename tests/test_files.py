@@ -5,13 +5,15 @@ import errno
 import io
 import os
 import re
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cathsim_dmc import agents, files, suite
+from cathsim_dmc import agents, files, locks, suite
 from cathsim_dmc.agents.comparison import Comparison
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.scan.importer import import_scan
@@ -159,6 +161,26 @@ def test_a_directory_appears_whole_or_not_at_all(tmp_path):
         with files.atomic_directory(tmp_path / "data") as path:
             (path / "other").write_text("other")
     assert names(tmp_path) == ["data"] and names(tmp_path / "data") == ["whole"]
+
+
+def test_the_next_writer_removes_what_a_killed_one_has_left(tmp_path):
+    (tmp_path / "data-v0").mkdir()  # other names
+    killed = f"""
+import os
+from pathlib import Path
+from cathsim_dmc import files, locks
+path = Path({str(tmp_path / "data")!r})
+with locks.only_writer(path), files.atomic_directory(path) as folder:
+    with files.atomic_directory(f"{{path}}.b"):
+        (folder / "half").write_text("half")
+        os.kill(os.getpid(), 9)
+"""
+    assert subprocess.run([sys.executable, "-c", killed]).returncode == -9
+    assert len(names(tmp_path)) == 4
+    with locks.only_writer(tmp_path / "data"):
+        assert not files.unfinished(tmp_path / "data")
+    (other,) = files.unfinished(tmp_path / "data.b")
+    assert names(tmp_path) == [other.name, "data-v0"]
 
 
 def test_a_full_disk_names_what_was_being_written(tmp_path, small_disk):
