@@ -542,6 +542,18 @@ def test_episodes_are_distinct_where_all_draws_can_differ(
     assert protocols.distinct(task, options, episodes) == expected
 
 
+def test_starts_are_counted_where_the_episodes_began():
+    """The range of the draw is more than the half of the way that a start may take."""
+    drawn = {"randomisation": {"start_insertion": [0.0, 0.2]}, "max_steps": 1}
+    found = evaluate("push", "type1_bca", 20, task_kwargs=drawn)
+    began = {one.start_insertion for one in found.episodes}
+    assert found.num_conditions == len(began) <= 9 < len(found.episodes)
+    assert max(began) < 0.04 and not found.distinct
+    assert protocols.distinct("type1_bca", drawn, 20)
+    old = [dataclasses.replace(one, start_insertion=None) for one in found.episodes]
+    assert dataclasses.replace(found, episodes=tuple(old)).num_conditions > len(began)
+
+
 def test_an_evaluation_names_the_device_that_simulates_unless_it_is_the_cpu():
     def make_env(*given, device="cpu", **options):
         return evaluation.environments.make_env(*given, **options)

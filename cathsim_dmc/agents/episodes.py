@@ -26,6 +26,8 @@ class EpisodeOutcome:
         path_ratio: Length of the head's path divided by the shortest way to the goal;
             below 1 where the head cuts the corner of the route at an ostium.
         failed: Whether the objective ended it without success, as at a limit of force.
+        start_insertion: Insertion at its start beyond the task's own start, m; None
+            where it is not known.
     """
 
     env: int
@@ -37,6 +39,7 @@ class EpisodeOutcome:
     physics_error: bool
     path_ratio: float
     failed: bool = False
+    start_insertion: float | None = None
 
     @property
     def given_up(self) -> bool:

@@ -22,6 +22,7 @@ from cathsim_dmc.agents.policies import (
     PolicyLike,
     load_policy,
     require_actions,
+    start_insertions,
     task_and_options,
     view_of,
 )
@@ -217,7 +218,8 @@ class _Plan:
         trained = getattr(self.player, "checkpoint", None)
         first, count = self.parts[0].task_kwargs, sum(len(p.seeds) for p in self.parts)
         if start is None:
-            distinct = protocols.distinct(self.task, first, count)
+            starts = len({one.start_insertion for one in outcomes} - {None})
+            distinct = protocols.distinct(self.task, first, count, starts)
             drawn = [one for part in self.parts for one in part.conditions]
         else:
             distinct, drawn = protocols.distinct_states(start), []
@@ -355,7 +357,7 @@ def _first_episodes(
             f"the episodes of start have ended in its simulations {over}; choose "
             "others with start[...], or take the snapshot before their end"
         )
-    running = begun
+    running, places = begun, start_insertions(env)
     while running.any():
         state = env.maybe_reset(state)
         if begun.any():
@@ -366,7 +368,8 @@ def _first_episodes(
             failed = stepped["next", "info", "physics_error"].reshape(-1).numpy() > 0
             observer(env, running & ~failed)
         for outcome in tracker.add(stepped.unsqueeze(1)):
-            outcomes.setdefault(outcome.env, outcome)
+            began = replace(outcome, start_insertion=places[outcome.env])
+            outcomes.setdefault(outcome.env, began)
         begun = stepped["next", "done"].reshape(-1).numpy()
         running = running & ~begun
         state = step_mdp(stepped)

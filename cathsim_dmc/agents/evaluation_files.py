@@ -99,6 +99,7 @@ def outcome(
     forces = bounds.instance("forces", row["forces"], dict)
     known = {name: forces.get(name) for name in QUANTITIES}
     switches = "terminated", "success", "physics_error"
+    began = row.get("start_insertion")  # not in files from before 0.3
     return EpisodeOutcome(
         env=bounds.whole("env", row["env"], 0),
         reward=number("reward", row["reward"]),
@@ -113,6 +114,7 @@ def outcome(
         path_ratio=number("path_ratio", row["path_ratio"], 0.0),
         # Older files count episodes that the objective ended as given up.
         failed=bounds.switch("failed", row.get("failed", False)),
+        start_insertion=None if began is None else number("start_insertion", began),
         **{name: bounds.switch(name, row[name]) for name in switches},
     )
 

@@ -326,3 +326,14 @@ def view_of(env: EnvBase) -> View:
     sizes = {"num_simulations": env.batch_size[0]}
     sizes["num_actions"] = env.action_spec.shape[-1]
     return cast(View, types.SimpleNamespace(**sizes))
+
+
+def start_insertions(env: EnvBase) -> list[float | None]:
+    """Returns where the episodes began, see `EpisodeOutcome.start_insertion`.
+
+    For an environment of another package it is None.
+    """
+    base = getattr(env, "base_env", env)
+    if not hasattr(base, "simulation"):
+        return [None] * env.batch_size[0]
+    return base.simulation.rollout.start_insertions

@@ -213,11 +213,17 @@ def _bins(ranges: Randomisation, episode: Draw) -> np.ndarray:
     return np.minimum((np.array(shares) * _STRATA).astype(int), _STRATA - 1)
 
 
-def distinct(task: str, task_kwargs: Mapping[str, Any], episodes: int) -> bool:
+def distinct(
+    task: str, task_kwargs: Mapping[str, Any], episodes: int, starts: int | None = None
+) -> bool:
     """Whether all episodes can differ by more than the jitter of the start.
 
     Differences in noise and C-arm do not count. For tasks outside the suite the answer
     is True.
+
+    Args:
+        starts: Number of different insertions at which the episodes began; None for
+            those of `start_insertion` at steps of 5 mm.
     """
     definition = suite.TASKS.get(task)
     if definition is None:
@@ -227,7 +233,8 @@ def distinct(task: str, task_kwargs: Mapping[str, Any], episodes: int) -> bool:
     for name, step in _STEPS.items():
         if (chosen := getattr(ranges, name)) is not None:
             low, high = chosen if isinstance(chosen, Sequence) else (0.0, 1.0)
-            values *= 1 + (high - low) // step
+            most = 1 + (high - low) // step
+            values *= starts if starts and name == "start_insertion" else most
     if along := task_kwargs.get("start_along_route"):
         values *= STARTS_ALONG_ROUTE if along[1] > along[0] else 1
     return values >= max(episodes, 2) or (not along and ranges.start_radius > _NEAR)
@@ -250,7 +257,8 @@ def count_distinct(conditions: Iterable[Mapping[str, Any]]) -> int:
     """Return how many conditions of episodes differ, by the rule of `distinct`.
 
     Args:
-        conditions: Of each episode, as in `Part.conditions`.
+        conditions: Of each episode, as in `Part.conditions`; with "insertion" where the
+            insertion at its start is known, which the draw is scaled and rounded to.
     """
     return len({json.dumps(_compared(one), sort_keys=True) for one in conditions})
 
@@ -258,8 +266,8 @@ def count_distinct(conditions: Iterable[Mapping[str, Any]]) -> int:
 def _compared(conditions: Mapping[str, Any]) -> dict[str, Any]:
     names = {"device", "arch", "anatomy", *_COMPARED}
     found = {name: conditions.get(name) for name in names}
-    inserted = conditions.get("insertion_drawn") or 0.0
-    found["insertion"] = round(inserted / START_SPACING)
+    drawn = conditions.get("insertion_drawn") or 0.0
+    found["insertion"] = conditions.get("insertion", round(drawn / START_SPACING))
     displacement = conditions.get("displacement_drawn") or (0.0,)
     if np.linalg.norm(displacement) > _NEAR:
         found["displacement"] = displacement

@@ -100,7 +100,10 @@ class EvaluationResult:
         number of episodes if all can differ, and 1 otherwise.
         """
         if self.conditions:
-            return count_distinct(self.conditions)
+            places = [episode.start_insertion for episode in self.episodes]
+            began = [{} if x is None else {"insertion": x} for x in places]
+            pairs = zip(self.conditions, began, strict=True)
+            return count_distinct([{**drawn, **own} for drawn, own in pairs])
         return len(self.episodes) if self.distinct else 1
 
     def values(self, name: str) -> np.ndarray:

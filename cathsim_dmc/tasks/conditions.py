@@ -119,6 +119,12 @@ class DrawnConditions:
         numbers = [np.nan if found[n] is None else found[n] for n in _SIZES]
         self._values[index] = np.hstack(numbers)
 
+    @property
+    def insertions(self) -> list[float | None]:
+        """Insertion at the start of each episode, m, see `Conditions`."""
+        place = list(_SIZES).index("insertion")
+        return [None if np.isnan(x) else float(x) for x in self._values[:, place]]
+
     def of(self, index: int, scene: Scene, effects: Sequence[Effect]) -> Conditions:
         """Returns the conditions of one simulation, which is in a scene."""
         found: dict[str, Any] = {}

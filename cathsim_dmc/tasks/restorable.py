@@ -216,6 +216,11 @@ class Restorable:
             raise RuntimeError("no episode has begun; call reset() first")
         return self._drawn.of(index, self.case(index).scene, self.effects)
 
+    @property
+    def start_insertions(self) -> list[float | None]:
+        """Insertion at the start of each simulation's episode, m, see `Conditions`."""
+        return self._drawn.insertions
+
     def case(self, index: int = 0) -> Case:
         """Anatomy and objective of the episode of one simulation."""
         return self._cases[self._case_of[index]]
