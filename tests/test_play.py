@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_play_coaxial import Screen, held
 
+from cathsim_dmc import suite
 from cathsim_dmc.physics.forces import WallForce
 from cathsim_dmc.play import play, session, window
 from cathsim_dmc.play.controls import BEND_RATE, HELD, ONCE, Controls
@@ -206,13 +207,38 @@ def test_the_goal_is_a_ring_of_its_size_in_both_planes(monkeypatch, shared_envir
         env.task.goal_position,
     )
     shown.show(env.task)
-    for number, (ring, plane) in enumerate(zip(Wide.rings, shown._planes, strict=True)):
+    planes = shown._planes(env.task)
+    for number, (ring, plane) in enumerate(zip(Wide.rings, planes, strict=True)):
         arm, radius = plane.carm, env.task.objective.goal_radius
         places = goal + radius * np.array([-arm.axes[0], -arm.axes[1], *arm.axes[:2]])
         (left, _), (_, top), (right, _), (_, bottom) = arm.project(places)[0]
         beside = 512 * number
         wanted = left + beside, top, right + beside, bottom
         np.testing.assert_allclose(ring, wanted, atol=1e-6)
+
+
+def test_the_window_shows_the_vessel_and_the_view_of_the_episode(monkeypatch):
+    """As the image of a policy with as many pixels."""
+    shown = []
+    monkeypatch.setitem(sys.modules, "tkinter", Screen([]))
+    images = window.angiograph.images
+    monkeypatch.setattr(
+        window.angiograph, "images",
+        lambda machines, *rest: shown.append(machines[0]) or images(machines, *rest),
+    )  # fmt: skip
+    options = {
+        "anatomy": ["simple1", "simple2"], "goal": "bca", "observation": "tracking",
+        "fluoroscopy": {"size": 512}, "randomisation": {"view": (-20, 20)}, "random": 0,
+    }  # fmt: skip
+    env = suite.load("cathsim", "navigate", options)
+    screen, vessels = window.FluoroscopyWindow(env.task, Controls(10)), set()
+    while len(vessels) < 2:
+        env.reset()
+        screen.show(env.task)
+        rollout = env.task.rollout
+        (wanted,) = rollout.case().angiograph.planes(rollout.deviations[0])
+        np.testing.assert_array_equal(shown[-1][0].vessel_mask, wanted.vessel_mask)
+        vessels.add(rollout.case().scene.anatomy.name)
 
 
 def test_a_policy_is_watched_in_the_vessel_of_its_training(cathsim, monkeypatch):
@@ -224,6 +250,12 @@ def test_a_policy_is_watched_in_the_vessel_of_its_training(cathsim, monkeypatch)
     cathsim("play", "femoral_type1_lcca", "--policy", policy, "--max-steps", 5)
     assert asked["task_kwargs"]["vessel"]["wall"] is True
     assert asked["task_kwargs"]["max_steps"] == 5
+
+
+@pytest.mark.parametrize("policy", ["expert", lambda many: many])
+def test_a_name_or_a_function_is_no_policy_to_watch(policy):
+    with pytest.raises(ValueError, match="policy is .* agents.load_policy"):
+        play("simple1_bca", policy=policy)
 
 
 def test_without_a_display_the_message_says_so(monkeypatch):

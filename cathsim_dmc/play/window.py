@@ -48,11 +48,12 @@ class FluoroscopyWindow:
         with files.refused(ValueError, text, tk.TclError):
             root = tk.Tk(className="cathsim")
         self._tk, self._root, self._controls = tk, root, controls
-        self._planes = _planes(task)
         self._random = np.random.RandomState(0)
         self._released: dict[str, float] = {}
-        rows, columns = self._planes[0].carm.resolution
-        width = columns * len(self._planes)
+        self._case: Any = None
+        planes = self._planes(task)
+        rows, columns = planes[0].carm.resolution
+        width = columns * len(planes)
         root.configure(background="black")
         root.resizable(False, False)
         root.protocol("WM_DELETE_WINDOW", lambda: setattr(self, "closed", True))
@@ -88,17 +89,18 @@ class FluoroscopyWindow:
 
     def show(self, task: Any, message: str = "", until: float = 0.0) -> None:
         """Draws the state of a task; reads keys until a time of `time.monotonic`, s."""
-        machine = task.rollout.around(self._planes)
-        planes = angiograph.images([machine], task.rollout.shadows, [self._random])
-        image = np.concatenate(list(np.moveaxis(planes[0], -1, 0)), axis=1)
+        planes = self._planes(task)
+        machine = task.rollout.around(planes)
+        images = angiograph.images([machine], task.rollout.shadows, [self._random])
+        image = np.concatenate(list(np.moveaxis(images[0], -1, 0)), axis=1)
         rows, columns = image.shape
         data = b"P5 %d %d 255 " % (columns, rows) + image.tobytes()
         self._image = self._tk.PhotoImage(data=data, format="PPM", master=self._root)
         self._screen.delete("all")
         self._screen.create_image(0, 0, image=self._image, anchor="nw")
-        for number, plane in enumerate(self._planes):
+        for number, plane in enumerate(planes):
             (x, y), depth = plane.carm.project(task.goal_position)
-            x += number * columns / len(self._planes)
+            x += number * columns / len(planes)
             radius = task.objective.goal_radius * plane.carm.focal_length / float(depth)
             box = x - radius, y - radius, x + radius, y + radius
             self._screen.create_oval(box, outline="green2")
@@ -121,14 +123,18 @@ class FluoroscopyWindow:
         """Closes the window."""
         self._root.destroy()
 
-
-def _planes(task: Any) -> angiograph.Planes:
-    options = task.rollout.case().fluoroscopy  # with the angles that a policy sees
-    rows, columns = options.resolution
-    factor = max(1, round(SIZE / max(rows, columns)))
-    options = dataclasses.replace(options, size=(rows * factor, columns * factor))
-    surface = task.scene.anatomy.surface
-    return angiograph.Angiograph(surface, options).planes()
+    def _planes(self, task: Any) -> angiograph.Planes:
+        """Returns the planes of the present episode, as a policy sees them."""
+        case = task.rollout.case()
+        if case is not self._case:
+            self._case, options = case, case.fluoroscopy
+            rows, columns = options.resolution
+            factor = max(1, round(SIZE / max(rows, columns)))
+            size = rows * factor, columns * factor
+            self._machine = angiograph.Angiograph(
+                case.scene.anatomy.surface, dataclasses.replace(options, size=size)
+            )
+        return self._machine.planes(task.rollout.deviations[0])
 
 
 def _name(keysym: str) -> str:
