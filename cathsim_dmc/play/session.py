@@ -40,7 +40,8 @@ def play(
         seed: Seed of the first episode; the others count up.
         episodes: Number of episodes, None until the operator quits.
         speed: Speed of the simulation, in multiples of real time.
-        policy: Policy that plays while the operator watches; None for the operator.
+        policy: Policy that plays while the operator watches, such as
+            `agents.load_policy` returns; None for the operator.
         hands: Input device, one of `hands.HANDS`; the keys act too, and a gamepad
             vibrates with the largest contact force.
 
@@ -57,6 +58,8 @@ def play(
     if episodes is not None:
         bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
     bounds.choice("hands", hands, HANDS)
+    if policy is not None and not isinstance(policy, Policy):
+        bounds.refuse("policy", policy, "what agents.load_policy returns, or None")
     options = bounds.options("task_kwargs", task_kwargs)
     if out is not None:
         files.require_place(out)
