@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from synthetic_scans import marched, write_markup, write_obj, y_tree
-from test_anatomy_scan_files import ball, poly_data, written
+from test_anatomy_scan_files import ball, meta, poly_data, written
 
 from cathsim_dmc.anatomy.scan import bodies, topology
 from cathsim_dmc.anatomy.scan.curves import read_curve, read_curves
@@ -87,6 +87,22 @@ def test_a_label_map_without_orientation_asks(tmp_path):
     bare = {"space": None, "space dimension": 3}
     notes = label_surface(nrrd_map(tmp_path / "bare.nrrd", 1.0, **bare)).notes
     assert notes[1].startswith("question: its header names no space")
+
+
+def test_a_metaimage_without_orientation_asks_and_without_size_is_refused(tmp_path):
+    pytest.importorskip("vtkmodules")
+    path = meta(tmp_path / "map.mha", ball())
+    (note,) = label_surface(path).notes
+    assert note.endswith("frame is the file's")
+    head, body = path.read_bytes().split(b"ElementDataFile")
+    lines = [line for line in head.splitlines(True) if b"TransformMatrix" not in line]
+    path.write_bytes(b"".join(lines) + b"ElementDataFile" + body)
+    notes = label_surface(path).notes
+    assert notes[1].startswith("question: its header has no TransformMatrix")
+    lines = [line for line in lines if b"ElementSpacing" not in line]
+    path.write_bytes(b"".join(lines) + b"ElementDataFile" + body)
+    with pytest.raises(ValueError, match="lacks the size of its voxels; add"):
+        label_surface(path)
 
 
 @pytest.mark.parametrize(("turned", "asks"), [(0.0, False), (0.3, True)])

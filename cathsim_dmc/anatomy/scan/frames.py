@@ -49,6 +49,26 @@ def of_nrrd(header: Mapping[str, Any]) -> tuple[str, str]:
     )
 
 
+def of_meta(entries: Mapping[str, Any]) -> str:
+    """Question about the orientation of a MetaImage by its header, or "".
+
+    Raises:
+        ValueError: if the header has no size of the voxels.
+    """
+    if not {"ElementSpacing", "ElementSize"} & set(entries):
+        raise ValueError(
+            "its header lacks the size of its voxels; add it, for voxels of 1 mm the "
+            "line 'ElementSpacing = 1 1 1' before ElementDataFile"
+        )
+    if {"TransformMatrix", "Rotation", "Orientation"} & set(entries):
+        return ""
+    return (
+        "question: its header has no TransformMatrix, so its axes are taken as left, "
+        "back and head (LPS). If they are others, the patient is turned or mirrored: "
+        "set it and import again"
+    )
+
+
 def directions(header: Mapping[str, Any]) -> np.ndarray:
     """Steps (3, 3) from voxel to voxel of a NRRD file, a row for each of its axes.
 

@@ -333,6 +333,7 @@ def _meta(path: Path) -> _Voxels:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     entries = _meta_header(path)
+    frame = frames.of_meta(entries)
 
     def numbers(names: str, default: np.ndarray) -> np.ndarray:
         given = [entries[name] for name in names.split() if name in entries]
@@ -359,7 +360,7 @@ def _meta(path: Path) -> _Voxels:
     data = vtk_to_numpy(image.GetPointData().GetScalars())
     voxels = data.reshape(image.GetDimensions()[::-1]).transpose()
     matrix = 1e-3 * turn.reshape(3, 3).T * spacing
-    return _Voxels(voxels, matrix, 1e-3 * origin, {})
+    return _Voxels(voxels, matrix, 1e-3 * origin, {}, frame=frame)
 
 
 _READERS = {
