@@ -89,6 +89,22 @@ def test_the_command_records_from_a_snapshot(tmp_path, cathsim):
     assert rest.time[0] == pytest.approx(0.12) and rest.seed is None
 
 
+@pytest.mark.parametrize("name", ["start.npz", "start.rrd"])
+def test_a_record_does_not_replace_the_snapshot_that_it_starts_from(
+    name, tmp_path, cathsim, shared_environment
+):
+    env, start = shared_environment("simple1_bca"), tmp_path / "start.npz"
+    env.reset()
+    env.snapshot().save(start)
+    before = start.read_bytes()
+    code, _, err = cathsim(
+        *("record", "push", "--task", "simple1_bca", "--max-steps", 2),
+        *("--start", start, "--out", tmp_path / name),
+    )
+    assert code == 2 and "would replace the snapshot" in err
+    assert start.read_bytes() == before and list(tmp_path.iterdir()) == [start]
+
+
 def test_a_record_names_the_options_that_are_objects(episode, tmp_path):
     """Without them the task is another one, which repeats nothing."""
     assert set(episode.meta["objects"]) == {"anatomy"}

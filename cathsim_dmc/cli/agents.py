@@ -255,6 +255,10 @@ def record(
     for path in targets:
         files.require_file(path, later=True)
     begin = None if start is None else Snapshot.load(start)
+    if start is not None and any(p.exists() and p.samefile(start) for p in targets):
+        raise ValueError(
+            f"--out {out} would replace the snapshot {start}; give another name"
+        )
     episode, env = _played(player, task, task_kwargs, seed, begin)
     for path in targets:
         files.require_file(path, make=True)
