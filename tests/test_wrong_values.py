@@ -189,6 +189,11 @@ def test_wrong_arguments_of_play_are_refused_before_a_task_is_loaded(wrong):
         play("no such task", **wrong)
 
 
+def test_the_seed_of_the_last_episode_of_play_is_one():
+    with pytest.raises(ValueError, match=f"seed is .*from 0 to {2**32 - 3}"):
+        play("no such task", seed=2**32 - 2, episodes=3)
+
+
 def test_before_a_reset_there_is_nothing_to_see():
     env = suite.load("cathsim", TASK, {"random": 0})
     for look in (cathsim_dmc.forces, cathsim_dmc.show, cathsim_dmc.fluoroscopy):

@@ -54,9 +54,9 @@ def play(
         ModuleNotFoundError: the extra `hands` is not installed.
     """
     bounds.number("speed", speed, high=_FASTEST, positive=True)
-    bounds.seed("seed", seed)
     if episodes is not None:
         bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
+    bounds.whole("seed", seed, 0, bounds.MOST_SEED + 1 - (episodes or 1))
     bounds.choice("hands", hands, HANDS)
     if policy is not None and not isinstance(policy, Policy):
         bounds.refuse("policy", policy, "what agents.load_policy returns, or None")
