@@ -196,6 +196,12 @@ def test_a_replay_compares_every_figure_of_every_episode(played, tmp_path):
         entries.replay(entries.read(sealed(path, summed(values))))
     other = {**values, "versions": {**values["versions"], "mujoco": "3.0.0"}}
     assert entries.replay(entries.read(sealed(path, summed(other)))).equal == 99
+    # Another processor rounds otherwise; files from before name none.
+    other = {**values, "processor": "another one"}
+    assert entries.replay(entries.read(sealed(path, summed(other)))).equal == 99
+    del other["processor"]
+    with pytest.raises(ValueError, match="1 of its 100"):
+        entries.replay(entries.read(sealed(path, summed(other))))
     values["policy_sha256"] = "a" * 64
     with pytest.raises(ValueError, match="its weights are not those of push"):
         entries.replay(entries.read(sealed(path, summed(values))))

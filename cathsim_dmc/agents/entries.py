@@ -87,7 +87,7 @@ def replay(entry: Entry, num_threads: int | None = None) -> Replay | None:
 
     Raises:
         ValueError: the actions are not those submitted, or an episode differs although
-            the versions are the same.
+            versions and processor are the same.
     """
     with files.refused(ValueError, f"{entry.path.name} is not listed", _WRONG):
         player = _player(entry)
@@ -102,7 +102,9 @@ def replay(entry: Entry, num_threads: int | None = None) -> Replay | None:
         )  # fmt: skip
         pairs = zip(entry.result.episodes, result.episodes, strict=True)
         equal = [_same(one, other) for one, other in pairs]
-        if entry.result.versions == versions() and not all(equal):
+        here = submission.processor()
+        alike = entry.values.get("processor", here) == here  # none in older files
+        if alike and entry.result.versions == versions() and not all(equal):
             seeds = [s for s, one in zip(result.seeds, equal, strict=True) if not one]
             raise ValueError(
                 f"{len(seeds)} of its {len(equal)} episodes are others when they are "

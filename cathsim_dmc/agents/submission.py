@@ -4,6 +4,8 @@ import copy
 import functools
 import hashlib
 import json
+import platform
+import re
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
@@ -77,6 +79,7 @@ def submit(
     def write(path: Path) -> None:
         ours: dict[str, Any] = {
             "policy_sha256": weights, "package": __version__, "commit": _commit(),
+            "processor": processor(),
         }  # fmt: skip
         if not isinstance(player, str):
             beside = path.with_suffix(RECORDED)
@@ -144,6 +147,14 @@ def digest_of(policy: str) -> str | None:
         return file_digest(path)
     sums = json.dumps(dict(Checkpoint.open(policy).sha256), sort_keys=True)
     return hashlib.sha256(sums.encode()).hexdigest()
+
+
+def processor() -> str:
+    """Returns the name of this machine's processor; another one may round otherwise."""
+    listed = Path("/proc/cpuinfo")
+    text = listed.read_text(errors="replace") if listed.is_file() else ""
+    found = re.search(r"(?m)^model name\s*: *(.+)$", text)
+    return found[1] if found else platform.processor() or platform.machine()
 
 
 def _commit() -> str | None:
