@@ -62,6 +62,25 @@ def test_surfaces_in_the_old_format_of_vtk(tmp_path):
         read_triangles(volume)
 
 
+@pytest.mark.parametrize("share", [0.8, 0.9, 0.99])
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_surface_of_vtk_that_is_cut_off_is_refused(tmp_path, binary, share, capfd):
+    data = poly_data(*marched(y_tree(), 3e-3))
+    from vtkmodules import vtkIOLegacy
+
+    writer, path = vtkIOLegacy.vtkPolyDataWriter(), tmp_path / "lumen.vtk"
+    writer.SetFileName(str(path))
+    writer.SetInputData(data)
+    (writer.SetFileTypeToBinary if binary else writer.SetFileTypeToASCII)()
+    writer.Write()
+    read_triangles(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ValueError, match="damaged or cut off"):
+        read_triangles(path)
+    assert not capfd.readouterr().err
+
+
 @pytest.mark.parametrize("ending", [".vtp", ".vtk"])
 def test_the_centrelines_of_vmtk(tmp_path, ending):
     """A file holds all ways; those that are split at forks are joined again."""

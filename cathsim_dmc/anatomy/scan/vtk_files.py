@@ -1,9 +1,32 @@
 """Triangles and lines of VTK's PolyData files, .vtp and .vtk."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+
+def _reported(reader: Any) -> str:
+    """Reads the file of a reader; returns the errors and warnings of VTK.
+
+    Of a cut binary array VTK reports a warning alone, and leaves its end undefined.
+    """
+    from vtkmodules import vtkCommonCore
+
+    window, log = vtkCommonCore.vtkOutputWindow, vtkCommonCore.vtkLogger
+    told, before = vtkCommonCore.vtkStringOutputWindow(), window.GetInstance()
+    verbosity = log.GetCurrentVerbosityCutoff()
+    window.SetInstance(told)
+    log.SetStderrVerbosity(log.VERBOSITY_OFF)  # it would print them, too
+    vtkCommonCore.vtkObject.GlobalWarningDisplayOn()
+    try:
+        reader.Update()
+    finally:
+        vtkCommonCore.vtkObject.GlobalWarningDisplayOff()
+        log.SetStderrVerbosity(verbosity)
+        window.SetInstance(before)
+    return told.GetOutput()
 
 
 def _poly_data(path: Path) -> Any:
@@ -23,7 +46,8 @@ def _poly_data(path: Path) -> Any:
     else:
         reader = vtkIOXML.vtkXMLPolyDataReader()
         reader.SetFileName(str(path))
-    reader.Update()
+    if re.search(r"(?m)^(ERROR:|Error reading)", _reported(reader)):
+        raise ValueError("it is damaged or cut off, or no PolyData")
     read = reader.GetOutput()
     for cells in (read.GetVerts(), read.GetLines(), read.GetPolys(), read.GetStrips()):
         # VTK does not check its indices, and would read beyond the arrays.
