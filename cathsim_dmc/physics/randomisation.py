@@ -103,7 +103,7 @@ class Randomisation:
         goal_shift: shift of the goal along its branch, m, positive away from the
             ostium.
         roll: rotation of the device about its own axis at the start, rad. A shaped
-            device is at rest with it, for which each reset simulates 0.4 s.
+            device is at rest with it, which each reset simulates.
         delay: shortest and longest delay of the action, whole control steps.
         start_insertion: additional insertion at the start, m, in steps of 5 mm; scaled
             down where its largest value is more than half of the way to the goal.
