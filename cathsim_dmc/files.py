@@ -300,7 +300,7 @@ def _kept(path: Path, write: Callable[[Path], Any], result: str) -> str:
     try:
         folder = tempfile.mkdtemp(prefix="cathsim-")
         write(Path(folder, path.name))
-    except OSError as error:
+    except Exception as error:
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
         return f"{result} is not kept, not as a temporary file either: {error}"

@@ -35,7 +35,8 @@ def only_process(
 def only_writer(path: Path) -> Iterator[None]:
     """Reserve the path of a directory that the block writes at its end.
 
-    What a process that was killed has left of it is removed.
+    What a process that was killed has left of it is removed, and what one that does
+    not reserve the path is writing there.
 
     Raises:
         FileExistsError: another process has reserved it.
@@ -46,8 +47,9 @@ def only_writer(path: Path) -> Iterator[None]:
     text = f"another process writes {path}; wait for its end, or choose another name"
     with only_process(lock_file, FileExistsError, text):
         try:
-            for left in files.unfinished(path):  # of a process that was killed
+            for left in filter(Path.is_dir, files.unfinished(path)):
                 shutil.rmtree(left)
             yield
         finally:
-            lock_file.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                lock_file.unlink()

@@ -550,6 +550,11 @@ def test_starts_are_counted_where_the_episodes_began():
     assert found.num_conditions == len(began) <= 9 < len(found.episodes)
     assert max(began) < 0.04 and not found.distinct
     assert protocols.distinct("type1_bca", drawn, 20)
+    # Those of several anatomies are not the same in each.
+    both = drawn | {"anatomy": ["simple1", "type2"], "goal": "bca"}
+    count = 2 * 41
+    assert protocols.distinct("navigate", both, count, 16)
+    assert not protocols.distinct("navigate", both, count + 1, 16)
     old = [dataclasses.replace(one, start_insertion=None) for one in found.episodes]
     assert dataclasses.replace(found, episodes=tuple(old)).num_conditions > len(began)
 

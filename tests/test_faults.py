@@ -257,7 +257,7 @@ def test_a_result_that_is_kept_nowhere_is_told(full_disk, monkeypatch, cathsim):
 
     monkeypatch.setattr(phantoms, "import_scan", command)
     code, _, error = cathsim("phantom", "import", "a.stl", "--out", str(data / "b"))
-    assert code == 2 and "data/a'. the anatomy of a.stl is not kept" in error
+    assert code == 2 and "data/a'; the anatomy of a.stl is not kept" in error
     assert not list(temporary.iterdir())
 
 

@@ -293,11 +293,21 @@ def test_a_displaced_device_stands_in_no_wall():
 
 
 @pytest.mark.parametrize(
-    ("task", "roll"), [("femoral_type1_lcca_wire", 3.1), ("type1_lcca_pair", -2.4)]
+    ("task", "roll", "farther", "largest"),
+    [
+        ("femoral_type1_lcca_wire", 3.1, 0.0, 0.1e-3),
+        ("type1_lcca_pair", -2.4, 0.0, 0.5e-3),
+        ("type1_lcca_pair", 0.8, 0.04, 2e-3),
+    ],
 )
-def test_a_rolled_device_starts_at_rest(task, roll):
-    """A bent tip that points elsewhere is laid on the wall before the episode."""
+def test_a_rolled_device_starts_at_rest(task, roll, farther, largest):
+    """A bent tip that points elsewhere is laid on the wall before the episode.
+
+    What is left is its twist.
+    """
     ranges = {"roll": (roll, roll), "start_radius": 0.0}
+    if farther:
+        ranges["start_insertion"] = (farther, farther)
     environment = suite.load("cathsim", task, task_kwargs={"randomisation": ranges})
     environment.reset()
     found = environment.task
@@ -306,7 +316,7 @@ def test_a_rolled_device_starts_at_rest(task, roll):
         environment.step(np.zeros(environment.action_spec().shape))
         heads.append(found.readings.head)
     assert found.conditions.roll == roll
-    assert np.linalg.norm(np.array(heads) - heads[0], axis=1).max() < 0.5e-3
+    assert np.linalg.norm(np.array(heads) - heads[0], axis=1).max() < largest
     without = {"randomisation": ranges | {"roll": None}}
     level = suite.load("cathsim", task, task_kwargs=without)
     level.reset()

@@ -216,6 +216,10 @@ def read_newest(path: str | Path, read: Callable[[Checkpoint], Any]) -> Any:
     It is called again where a training has deleted the checkpoint meanwhile, as with
     `keep_checkpoints=1`, and has a newer one.
 
+    Args:
+        path: Directory of a checkpoint or of a run.
+        read: Function of the open checkpoint.
+
     Raises:
         CheckpointError: see `Checkpoint.open`, or raised by `read`.
     """

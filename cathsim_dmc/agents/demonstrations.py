@@ -105,8 +105,9 @@ def record_demonstrations(
     names = observation if isinstance(observation, str) else list(observation)
     options: dict[str, Any] = bounds.options("task_kwargs", task_kwargs)
     options |= {"observation": names}
+    dataset.check_free(out)
     with locks.only_writer(out):
-        dataset.check_free(out)
+        dataset.check_free(out)  # another process may have written it meanwhile
         count, spec = min(episodes, _SIMULATIONS), gymnasium.env_spec(task, **options)
         made = suite.make_task(task, **options)
         simulation = BatchSimulation(made, count, num_threads=num_threads or 0)
@@ -130,7 +131,7 @@ def record_demonstrations(
             f"seeds from {seed}",
         )
         done = _summary(out, buffers)
-        files.write_result(out, write, repr(done))
+        files.write_result(out, write, "the dataset")
         return done
 
 

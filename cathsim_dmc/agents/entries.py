@@ -133,7 +133,10 @@ def _player(entry: Entry) -> str | RecordedActions | None:
 
 
 def _same(one: EpisodeOutcome, other: EpisodeOutcome) -> bool:
-    return dataclasses.replace(one, env=other.env) == other
+    own: dict[str, Any] = {"env": other.env}
+    if one.start_insertion is None:  # not in older files
+        own["start_insertion"] = other.start_insertion
+    return dataclasses.replace(one, **own) == other
 
 
 def _result(values: Mapping[str, Any]) -> EvaluationResult:

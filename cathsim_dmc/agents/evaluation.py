@@ -131,7 +131,7 @@ def evaluate(
     if target is not None:
         values = result.to_dict()
         write = functools.partial(files.write_json, values=values)
-        files.write_result(target, write, repr(result))
+        files.write_result(target, write, "the evaluation")
     return result
 
 

@@ -329,7 +329,7 @@ def view_of(env: EnvBase) -> View:
 
 
 def start_insertions(env: EnvBase) -> list[float | None]:
-    """Returns where the episodes began, see `EpisodeOutcome.start_insertion`.
+    """Returns where the episodes began, m, see `EpisodeOutcome.start_insertion`.
 
     For an environment of another package it is None.
     """

@@ -222,19 +222,22 @@ def distinct(
     is True.
 
     Args:
-        starts: Number of different insertions at which the episodes began; None for
-            those of `start_insertion` at steps of 5 mm.
+        starts: Number of different insertions at which the episodes began. It counts in
+            a task of one anatomy; in others, and with None, those of `start_insertion`
+            at steps of 5 mm do.
     """
     definition = suite.TASKS.get(task)
     if definition is None:
         return True
     ranges = Randomisation.make(task_kwargs.get("randomisation", False))
-    values = max(len(_drawn_from(definition, task_kwargs)), 1)
+    values = anatomies = max(len(_drawn_from(definition, task_kwargs)), 1)
     for name, step in _STEPS.items():
         if (chosen := getattr(ranges, name)) is not None:
             low, high = chosen if isinstance(chosen, Sequence) else (0.0, 1.0)
             most = 1 + (high - low) // step
-            values *= starts if starts and name == "start_insertion" else most
+            if name == "start_insertion" and starts and anatomies == 1:
+                most = starts
+            values *= most
     if along := task_kwargs.get("start_along_route"):
         values *= STARTS_ALONG_ROUTE if along[1] > along[0] else 1
     return values >= max(episodes, 2) or (not along and ranges.start_radius > _NEAR)
@@ -257,8 +260,8 @@ def count_distinct(conditions: Iterable[Mapping[str, Any]]) -> int:
     """Return how many conditions of episodes differ, by the rule of `distinct`.
 
     Args:
-        conditions: Of each episode, as in `Part.conditions`; with "insertion" where the
-            insertion at its start is known, which the draw is scaled and rounded to.
+        conditions: Of each episode, as in `Part.conditions`; with "insertion", m, where
+            that of its start is known, which the draw is scaled and rounded to.
     """
     return len({json.dumps(_compared(one), sort_keys=True) for one in conditions})
 

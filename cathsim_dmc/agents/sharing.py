@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cathsim_dmc.agents import hub, pretrained
-from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.agents.checkpoint import read_newest
 from cathsim_dmc.analysis.force_statistics import millinewtons
 from cathsim_dmc.recording.dataset import DatasetError, recordings_in
 
@@ -87,8 +87,8 @@ def _write_policy(source: str | Path, folder: Path, name: str) -> dict[str, Any]
         for part in ("format", "name", "sha256"):
             card.pop(part)
     else:
-        one = Checkpoint.open(source)
-        state, judged = one.policy_state(), Path(source) / "evaluation.json"
+        one, state = read_newest(source, lambda read: (read, read.policy_state()))
+        judged = Path(source) / "evaluation.json"
         evaluation = {}
         if judged.is_file():
             found = json.loads(judged.read_text())

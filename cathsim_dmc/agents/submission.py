@@ -59,15 +59,22 @@ def submit(
         raise ValueError(f"the submission is to be written to {out}; give a .json file")
     if task is not None:
         bounds.choice("task", task, suite.SUITE)
-    weights = digest_of(policy)
     player: str | RecordedActions | _Recorder = policy
+    recorded = b""
     if policy.endswith(RECORDED):
-        player = RecordedActions(policy)
+        player, recorded = RecordedActions(policy), Path(policy).read_bytes()
         if task not in (None, player.task):
             raise ValueError(f"{policy} holds actions of {player.task}, not of {task}")
         player.require(bounds.choice("task", player.task, suite.SUITE), episodes)
     elif not ships(policy):
         player = _Recorder(load_policy(policy, EVALUATION_SEED))
+    # The run of the policy may have a newer checkpoint than the one that plays.
+    checkpoint = getattr(player, "checkpoint", None)
+    weights = _digest(checkpoint) if checkpoint else digest_of(policy)
+    ours: dict[str, Any] = {
+        "policy_sha256": weights, "package": __version__, "commit": _commit(),
+        "processor": processor(),
+    }  # fmt: skip
     files.require_file(out, later=True)
     if not isinstance(player, str):
         files.require_file(out.with_suffix(RECORDED), later=True)
@@ -77,23 +84,19 @@ def submit(
     submission: dict[str, Any] = {}
 
     def write(path: Path) -> None:
-        ours: dict[str, Any] = {
-            "policy_sha256": weights, "package": __version__, "commit": _commit(),
-            "processor": processor(),
-        }  # fmt: skip
         if not isinstance(player, str):
             beside = path.with_suffix(RECORDED)
             if isinstance(player, _Recorder):
                 player.write(beside, result)
             elif not (beside.exists() and beside.samefile(policy)):
-                files.write_bytes(beside, Path(policy).read_bytes())
+                files.write_bytes(beside, recorded)
             ours["actions_sha256"] = file_digest(beside)
         values = {**ours, **result.to_dict()}
         submission.update(json.loads(json.dumps(values, default=str)))
         submission["sha256"] = seal(submission)
         files.write_text(path, text(submission))
 
-    files.write_result(out, write, repr(result))
+    files.write_result(out, write, "the submission")
     return submission
 
 
@@ -145,7 +148,11 @@ def digest_of(policy: str) -> str | None:
         path = files.require_source(policy, "a file of agents.record_actions")
     if path is not None:
         return file_digest(path)
-    sums = json.dumps(dict(Checkpoint.open(policy).sha256), sort_keys=True)
+    return _digest(Checkpoint.open(policy))
+
+
+def _digest(checkpoint: Checkpoint) -> str:
+    sums = json.dumps(dict(checkpoint.sha256), sort_keys=True)
     return hashlib.sha256(sums.encode()).hexdigest()
 
 
@@ -276,9 +283,9 @@ def record_actions(
         Result of the evaluation.
     """
     recorder = _Recorder(load_policy(policy, EVALUATION_SEED))
-    if files.require_file(out).suffix != RECORDED:
+    if files.require_file(out, later=True).suffix != RECORDED:
         raise ValueError(f"the actions are to be written to {out}; give a .npz file")
     result = evaluation.evaluate(recorder, task, protocol=PROTOCOL, **options)
     write = functools.partial(recorder.write, result=result)
-    files.write_result(Path(out), write, repr(result))
+    files.write_result(Path(out), write, "the file of actions")
     return result

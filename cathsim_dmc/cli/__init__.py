@@ -80,7 +80,7 @@ def _interrupted(interrupts: Interrupts) -> int:
 
 
 def _refused(error: Exception) -> int:
-    told = ". ".join([str(error), *getattr(error, "__notes__", ())])
+    told = "; ".join([str(error), *getattr(error, "__notes__", ())])
     text = " ".join(told.split()) or "no message"
     if len(text) > _LONGEST:  # as a name of thousands of characters makes it
         text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"

@@ -126,8 +126,8 @@ def _require_place(out: Path) -> None:
 
 def _save(anatomy: Anatomy, out: Path) -> None:
     with told_of_replaced([out / _FILE]):
-        (out / _PICTURE).unlink(missing_ok=True)  # of what was there before
         files.write_result(out, anatomy.save, f"the anatomy {anatomy.name}")
+        (out / _PICTURE).unlink(missing_ok=True)  # of what was there before
 
 
 def _next_commands(anatomy: Anatomy, out: Path, device: str | None) -> list[str]:

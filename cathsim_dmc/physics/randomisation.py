@@ -55,7 +55,11 @@ def start_displacement(
 
 
 def rolled(quaternion: np.ndarray, roll: float) -> np.ndarray:
-    """Orientation (4,) that is turned about its own z axis, rad."""
+    """Orientation (4,), wxyz, that is turned by a roll, rad, about its own z axis.
+
+    Args:
+        quaternion: (4,) float64, wxyz.
+    """
     turn = np.array([np.cos(roll / 2), 0.0, 0.0, np.sin(roll / 2)])
     found = np.empty(4)
     mujoco.mju_mulQuat(found, quaternion, turn)
@@ -103,7 +107,8 @@ class Randomisation:
         goal_shift: shift of the goal along its branch, m, positive away from the
             ostium.
         roll: rotation of the device about its own axis at the start, rad. A shaped
-            device is at rest with it, which each reset simulates.
+            device starts in its rest posture with this roll, which each reset
+            simulates.
         delay: shortest and longest delay of the action, whole control steps.
         start_insertion: additional insertion at the start, m, in steps of 5 mm; scaled
             down where its largest value is more than half of the way to the goal.

@@ -56,7 +56,7 @@ def play(
     bounds.number("speed", speed, high=_FASTEST, positive=True)
     if episodes is not None:
         bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
-    bounds.whole("seed", seed, 0, bounds.MOST_SEED + 1 - (episodes or 1))
+    bounds.seeds("seed", bounds.seed("seed", seed), episodes or 1)
     bounds.choice("hands", hands, HANDS)
     if policy is not None and not isinstance(policy, Policy):
         bounds.refuse("policy", policy, "what agents.load_policy returns, or None")
@@ -83,11 +83,11 @@ def _play(
     # The operator observes the window, so the task needs only a cheap observation.
     observation = (policy and policy.observation) or "tracking"
     env = suite.load(suite.DOMAIN, task, {"observation": observation, **options})
+    chosen = policy and in_environment(policy, env)
     controls = Controls.of(env.task.scene, watching=policy is not None, hand=held)
     window = FluoroscopyWindow(env.task, controls)
     if out is not None:
         files.require_folder(out, make=True)
-    chosen = policy and in_environment(policy, env)
     due = time.monotonic()
 
     def quits() -> bool:

@@ -262,6 +262,7 @@ def export(
         locks.only_writer(path),
         contextlib.closing(suite.load(suite.DOMAIN, task, options)) as environment,
     ):
+        check_free(path)  # another process may have written it meanwhile
         seen = environment.task.observation_specs
         return write(
             path,

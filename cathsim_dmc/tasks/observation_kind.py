@@ -89,8 +89,9 @@ class Entry:
             sizes that returns it.
         unit: of its numbers, by part where parts differ.
         meaning: layout and frame.
-        low: least value, -inf if there is no bound.
-        high: greatest value.
+        low: least value, -inf if there is no bound; numbers below are refused at the
+            start of an episode.
+        high: greatest value, likewise.
         dtype: numpy.float64 for numbers, uint8 or float32 for images.
 
     Raises:
@@ -172,9 +173,8 @@ def _within(numbers: np.ndarray, spec: specs.Array) -> bool:
     if not (isinstance(spec, specs.BoundedArray) and numbers.size):
         return True
     low, high = float(spec.minimum), float(spec.maximum)
-    return numbers.min() >= low - _ROUNDING * max(
-        1.0, abs(low)
-    ) and numbers.max() <= high + _ROUNDING * max(1.0, abs(high))
+    below, above = (_ROUNDING * max(1.0, abs(end)) for end in (low, high))
+    return numbers.min() >= low - below and numbers.max() <= high + above
 
 
 class HeldImages(dict[str, np.ndarray]):

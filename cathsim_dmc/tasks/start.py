@@ -70,7 +70,8 @@ class StartPosture:
     The device is laid along the centreline of the vessel and settles once, with motors
     and base at rest, on the compiled model without randomisation. An episode starts in
     the settled posture, at rest, with the head displaced as drawn. With a drawn roll, a
-    shaped device settles once more, with its base rolled; others keep their posture.
+    shaped device settles once more, with its base rolled and without twist; others, and
+    one that fits nowhere with this roll, keep their posture.
     """
 
     def __init__(
@@ -91,10 +92,11 @@ class StartPosture:
                 its wall, or nowhere in the range `start_along_route`.
         """
         shaped = any(device.tip_shape for device in scene.catheter.devices)
-        self._rolls = shaped and config.randomisation.roll is not None
-        if self._rolls:
-            model = copy.copy(model)  # the simulation changes its own
-        self._rest = settle = _Settling(scene, model, index)
+        rolls = shaped and config.randomisation.roll is not None
+        if rolls:
+            model = copy.copy(model)  # the simulation changes its model in episodes
+        settle = _Settling(scene, model, index)
+        self._settling = settle if rolls else None
         rest = settle.on_line(0.0)
         place = scene.placement
         way = np.linalg.norm(np.diff(place.line, axis=0), axis=-1).sum()
@@ -157,9 +159,9 @@ class StartPosture:
 
     def _rolled(self, posture: "_Posture", roll: float | None) -> "_Posture":
         """The posture at rest with a roll, rad; `posture` if that fits nowhere."""
-        if self._rolls and roll:
+        if self._settling and roll:
             with contextlib.suppress(ValueError):
-                return self._rest.rolled(posture, roll)
+                return self._settling.rolled(posture, roll)
         return posture
 
 
@@ -321,7 +323,16 @@ class _Settling:
     def _settled(
         self, joints: Joints, advance: float, roll: float, time: float
     ) -> _Posture:
-        """The posture after a time, s, in which the device moves freely."""
+        """The posture after a time, s, in which the device moves freely.
+
+        Args:
+            joints: Joints at its beginning.
+            advance: Of the posture, m.
+            roll: Of the base, rad, which the model has.
+
+        Raises:
+            ValueError: if the device does not come to rest inside the lumen.
+        """
         scene, model, index = self._scene, self._model, self._index
         data, depth = mujoco.MjData(model), scene.placement.start_depth
         data.qpos[index.insertion_qpos], data.qpos[index.bends_qpos] = joints

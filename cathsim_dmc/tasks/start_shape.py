@@ -52,7 +52,11 @@ class Shape:
         return self._inlet + points @ self._frame.T
 
     def depths(self, points: np.ndarray) -> np.ndarray:
-        """Largest depths (2,), m, of points in the walls of vessel and sheath."""
+        """Largest depths (2,), m, of points in the walls of vessel and sheath.
+
+        Args:
+            points: (m, 3), m, world frame.
+        """
         local = (points - self._inlet) @ self._frame
         near = local[:, 2] > -_GUIDED
         points, (x, y, level) = points[near], local[near].T

@@ -341,7 +341,7 @@ def _meta(path: Path) -> _Voxels:
 
     # A row is the direction of an axis.
     turn = numbers("TransformMatrix Rotation Orientation", np.eye(3).ravel())
-    spacing = numbers("ElementSpacing ElementSize", np.ones(3))
+    spacing = numbers("ElementSpacing ElementSize", np.zeros(3))
     origin = numbers("Offset Position Origin", np.zeros(3))
     reader = vtkIOImage.vtkMetaImageReader()
     reader.SetFileName(str(path))

@@ -17,13 +17,14 @@ def _reported(reader: Any) -> str:
     window, log = vtkCommonCore.vtkOutputWindow, vtkCommonCore.vtkLogger
     told, before = vtkCommonCore.vtkStringOutputWindow(), window.GetInstance()
     verbosity = log.GetCurrentVerbosityCutoff()
+    displayed = vtkCommonCore.vtkObject.GetGlobalWarningDisplay()
     window.SetInstance(told)
     log.SetStderrVerbosity(log.VERBOSITY_OFF)  # it would print them, too
     vtkCommonCore.vtkObject.GlobalWarningDisplayOn()
     try:
         reader.Update()
     finally:
-        vtkCommonCore.vtkObject.GlobalWarningDisplayOff()
+        vtkCommonCore.vtkObject.SetGlobalWarningDisplay(displayed)
         log.SetStderrVerbosity(verbosity)
         window.SetInstance(before)
     return told.GetOutput()
