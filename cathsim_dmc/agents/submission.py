@@ -15,7 +15,7 @@ import numpy as np
 
 from cathsim_dmc import __version__, bounds, files, suite
 from cathsim_dmc.agents import evaluation, pretrained, protocols
-from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.agents.checkpoint import Checkpoint, read_newest
 from cathsim_dmc.agents.policies import PolicyLike, load_policy
 from cathsim_dmc.policies import POLICIES, Policy, View
 from cathsim_dmc.tasks.config import EVALUATION_SEED, MAX_STEPS
@@ -60,7 +60,7 @@ def submit(
     if task is not None:
         bounds.choice("task", task, suite.SUITE)
     player: str | RecordedActions | _Recorder = policy
-    recorded = b""
+    weights, recorded = digest_of(policy), b""
     if policy.endswith(RECORDED):
         player, recorded = RecordedActions(policy), Path(policy).read_bytes()
         if task not in (None, player.task):
@@ -68,9 +68,9 @@ def submit(
         player.require(bounds.choice("task", player.task, suite.SUITE), episodes)
     elif not ships(policy):
         player = _Recorder(load_policy(policy, EVALUATION_SEED))
-    # The run of the policy may have a newer checkpoint than the one that plays.
-    checkpoint = getattr(player, "checkpoint", None)
-    weights = _digest(checkpoint) if checkpoint else digest_of(policy)
+    # A training may have saved a newer one meanwhile.
+    if checkpoint := getattr(player, "checkpoint", None):
+        weights = _digest(checkpoint)
     ours: dict[str, Any] = {
         "policy_sha256": weights, "package": __version__, "commit": _commit(),
         "processor": processor(),
@@ -148,7 +148,7 @@ def digest_of(policy: str) -> str | None:
         path = files.require_source(policy, "a file of agents.record_actions")
     if path is not None:
         return file_digest(path)
-    return _digest(Checkpoint.open(policy))
+    return read_newest(policy, _digest)
 
 
 def _digest(checkpoint: Checkpoint) -> str:
