@@ -392,6 +392,8 @@ def test_a_set_is_resumed_and_refused_where_it_must_be(tmp_path, monkeypatch, pa
         interrupted.setattr(image_set, "SPLITS", ("train", 0))
         with pytest.raises(TypeError):
             image_set.write(out, options, processes=1)
+    # Processor time is counted in steps of 10 ms.
+    monkeypatch.setattr(image_set.os, "times", lambda: (0.0,) * 5)
     done = image_set.write(out, options, processes=1)
     assert done["frames"] == {"train": 16, "val": 8, "test": 8} and done["new"] == 32
     assert "| train | 2 | 16 |" in (out / "README.md").read_text()

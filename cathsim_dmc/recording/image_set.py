@@ -38,6 +38,7 @@ from cathsim_dmc.tasks.anatomies import load_anatomy
 SPLITS = {"train": "train", "val": "train", "test": "test"}  # split: set of arches
 _TRIES = 8  # candidates that are tried in turn until a device fits
 _FORMAT = "cathsim-image-set"
+_TICK = 0.01  # s, resolution of `os.times`
 _LAST = 1.0  # s that a process has to remove unfinished files
 Labels = dict[str, list[Any]]  # as `coco.labels` returns them
 
@@ -118,7 +119,7 @@ def write(
     return {
         "path": str(out), "frames": frames, "new": new, "seconds": took,
         "processor": spent, "frames_per_second": new / took,
-        "frames_per_processor_second": new / spent,
+        "frames_per_processor_second": new / max(spent, _TICK),
     }  # fmt: skip
 
 
