@@ -12,7 +12,7 @@ import torch
 from dm_env import specs
 from tensordict import TensorDict, TensorDictBase
 
-from cathsim_dmc import bounds, extras, files, locks, suite
+from cathsim_dmc import bounds, extras, files, suite
 from cathsim_dmc.agents import hub
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import View
@@ -105,9 +105,7 @@ def record_demonstrations(
     names = observation if isinstance(observation, str) else list(observation)
     options: dict[str, Any] = bounds.options("task_kwargs", task_kwargs)
     options |= {"observation": names}
-    dataset.check_free(out)
-    with locks.only_writer(out):
-        dataset.check_free(out)  # another process may have written it meanwhile
+    with dataset.reserved(out):
         count, spec = min(episodes, _SIMULATIONS), gymnasium.env_spec(task, **options)
         made = suite.make_task(task, **options)
         simulation = BatchSimulation(made, count, num_threads=num_threads or 0)

@@ -129,9 +129,7 @@ def evaluate(
         outcomes = [one for group in groups for one in _play(group, observer)]
     result = plan.result(name, outcomes, start, simulation_device)
     if target is not None:
-        values = result.to_dict()
-        write = functools.partial(files.write_json, values=values)
-        files.write_result(target, write, "the evaluation")
+        evaluation_files.write(target, result.to_dict())
     return result
 
 

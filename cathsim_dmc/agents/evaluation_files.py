@@ -1,5 +1,6 @@
-"""Reading of evaluations from the files that `cathsim eval` and `evaluate` write."""
+"""The files of evaluations that `cathsim eval` and `evaluate` write."""
 
+import functools
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -21,6 +22,13 @@ _WANTED = (
     f"an {FILE} that `cathsim eval --out` or `agents.evaluate(out_dir=...)` has written"
 )
 _WRONG = LookupError, TypeError, ValueError, AttributeError, RecursionError
+
+
+def write(path: Path, values: Mapping[str, Any]) -> None:
+    """Writes a file, or keeps it elsewhere where that fails, see `write_result`."""
+    files.write_result(
+        path, functools.partial(files.write_json, values=values), "the evaluation"
+    )
 
 
 def read(path: str | Path) -> dict[str, dict[str, Any]]:

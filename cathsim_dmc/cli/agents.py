@@ -1,7 +1,6 @@
 """`cathsim eval`, `submit`, `record`, `demos` and `play`."""
 
 import contextlib
-import functools
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -143,8 +142,7 @@ def _write_evaluation(
     # Another process may have written there meanwhile.
     target, picture = _written(out)
     with told_of_replaced([target, picture]):
-        write = functools.partial(files.write_json, values=values)
-        files.write_result(target, write, "the evaluation")
+        evaluation_files.write(target, values)
         contacts.draw(result, picture)
 
 

@@ -213,6 +213,15 @@ def check_free(path: Path) -> None:
     require_folder(path.parent)
 
 
+@contextlib.contextmanager
+def reserved(path: Path) -> Iterator[None]:
+    """Reserves a path for a dataset that the block writes at its end, see `write`."""
+    check_free(path)
+    with locks.only_writer(path):
+        check_free(path)  # another process may have written it meanwhile
+        yield
+
+
 def export(
     episodes: Iterable[Episode],
     path: str | os.PathLike[str],
@@ -259,10 +268,9 @@ def export(
     single = all((e.action == e.action.astype(np.float32)).all() for e in episodes)
     kind = np.dtype("float32" if single else "float64")
     with (
-        locks.only_writer(path),
+        reserved(path),
         contextlib.closing(suite.load(suite.DOMAIN, task, options)) as environment,
     ):
-        check_free(path)  # another process may have written it meanwhile
         seen = environment.task.observation_specs
         return write(
             path,
