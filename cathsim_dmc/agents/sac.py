@@ -27,10 +27,11 @@ from cathsim_dmc.agents.replay import ReplayMemory
 REPLAY_BYTES = 2 * 1024**3
 
 # The weight of the entropy must start near the size of a step's reward (0.05): at 0.1
-# and above the actions stay random for tens of thousands of frames.
+# and above the actions stay random for tens of thousands of frames. An overestimated
+# value of standing still decays in 1 / (tau * (1 - gamma)) gradient steps: 5,000.
 _TUNED: Mapping[str, Any] = {
     **TUNED_TRAINING, "updates_per_frame": 0.25, "hidden": (256, 256),
-    "activation": "relu", "initial_alpha": 1e-3, "total_frames": 60_000,
+    "activation": "relu", "initial_alpha": 1e-3, "tau": 0.02, "total_frames": 40_000,
 }  # fmt: skip
 _TERMS = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy")
 
