@@ -163,6 +163,19 @@ def read_result(path):
     return Result(path, values, cell, training, evaluation, success, speed)
 
 
+def differences(result, cell):
+    """Names of the settings in which a result differs from a cell as it is now.
+
+    Settings of the preset count, those that one of the two does not have do not.
+    """
+    asked, there = cell.to_dict(), result.cell
+    changed = [k for k in asked if k != "label" and there.get(k) != asked[k]]
+    now = json.loads(json.dumps(cell.config().to_dict()))
+    then = result.values["config"]
+    found = [k for k in now if then.get(k, now[k]) != now[k] and k not in asked]
+    return changed + found
+
+
 def standing(cell, runs, results):
     """State of a cell, and a remark.
 
@@ -176,8 +189,7 @@ def standing(cell, runs, results):
         except ValueError as error:
             remark = str(error)
         else:
-            there, asked = found.cell, cell.to_dict()
-            changed = [k for k in asked if k != "label" and there.get(k) != asked[k]]
+            changed = differences(found, cell)
             if changed:
                 differ = f"{', '.join(changed)} differ; move {path} away"
                 return "other settings", differ

@@ -103,6 +103,11 @@ def test_a_finished_cell_tells_how_it_came_about(folders, synthetic):
     assert trainings.standing(changed(label="other"), *folders)[0] == "finished"
     state, remark = trainings.standing(changed(total_frames=1024), *folders)
     assert state == "other settings" and "total_frames differ; move" in remark
+    # The preset has changed since.
+    values = {**done.values, "config": {**done.values["config"], "clip": 0.3}}
+    result_of(folders).write_text(json.dumps(values))
+    state, remark = trainings.standing(CELL, *folders)
+    assert state == "other settings" and "clip differ; move" in remark
 
 
 def test_the_evaluation_is_the_published_one_whatever_was_trained(folders, synthetic):
