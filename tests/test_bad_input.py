@@ -189,7 +189,8 @@ TRAINING = {
 }
 CRITIC = {
     "critic_observation": st.sampled_from(["", 1, [], [1], {}, 1.5, (), True]),
-    "torch_compile": st.sampled_from(["", 1, [], 0, None, "yes", 1.5]),
+    "torch_compile": flag(),
+    "anneal": flag(),
 }
 PPO = CRITIC | {
     "steps_per_update": whole(1),
@@ -204,7 +205,6 @@ PPO = CRITIC | {
     "initial_deviation": POSITIVE,
     "noise_correlation": number(0, 1),
     "noise_shared": number(0, 1),
-    "anneal": flag(),
 }
 SAC = CRITIC | {
     "batch_size": whole(1),

@@ -314,10 +314,18 @@ class ActorCriticConfig(TrainingConfig):
             needs them. None for those of the policy.
         torch_compile: Whether torch compiles the loss and its gradient, for faster
             gradient steps (docs/training.md); needs a C++ compiler and up to a minute.
+        anneal: Whether to decrease the learning rate linearly to zero over
+            total_frames.
     """
 
     critic_observation: str | tuple[str, ...] | None = None
     torch_compile: bool = False
+    anneal: bool = False
+
+    @property
+    def resumable(self) -> frozenset[str]:
+        """All but the length of a run over which the learning rate falls."""
+        return super().resumable - ({"total_frames"} if self.anneal else set())
 
     @property
     def collected_observation(self) -> str | tuple[str, ...]:

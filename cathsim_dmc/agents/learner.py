@@ -98,6 +98,13 @@ class Learner(abc.ABC):
         # Samples of the entropy are then those of the loss that is not compiled.
         return torch.compile(loss, options={"fallback_random": True})
 
+    def anneal(self, progress: float) -> None:
+        """Decrease the learning rate to (1 - progress) of it if the settings say so."""
+        if not self.config.anneal:
+            return
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.config.learning_rate * (1.0 - progress)
+
     def descend(self, loss: torch.Tensor, max_norm: float = math.inf) -> torch.Tensor:
         """Take a gradient step; return the norm before clipping, 0 without a limit."""
         self.optimiser.zero_grad()

@@ -73,8 +73,6 @@ class PPOConfig(ActorCriticConfig):
             steps; 0 for white noise.
         noise_shared: Fraction of the variance of the exploration noise that is common
             to the motors of one bending axis; 0 for independent motors.
-        anneal: Whether to decrease the learning rate linearly to zero over
-            total_frames.
     """
 
     algorithm: ClassVar[str] = "ppo"
@@ -97,7 +95,6 @@ class PPOConfig(ActorCriticConfig):
     initial_deviation: float = positive(1.0)
     noise_correlation: float = within(0.0, low=0, high=0.999)
     noise_shared: float = within(0.0, low=0, high=0.999)
-    anneal: bool = False
 
     def __post_init__(self):
         """Validate the algorithm's own fields after the shared ones."""
@@ -113,11 +110,6 @@ class PPOConfig(ActorCriticConfig):
     def frames_per_batch(self) -> int:
         """Frames per update, over all environments."""
         return self.steps_per_update
-
-    @property
-    def resumable(self) -> frozenset[str]:
-        """All but the length of a run over which the learning rate falls."""
-        return super().resumable - ({"total_frames"} if self.anneal else set())
 
 
 class PPO(Learner):
@@ -184,9 +176,7 @@ class PPO(Learner):
     @override
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         config = self.config
-        if config.anneal:
-            for group in self.optimiser.param_groups:
-                group["lr"] = config.learning_rate * (1.0 - progress)
+        self.anneal(progress)
         batch = batch.to(self.device)
         explained = self._add_advantages(batch)
         frames = batch.select(*self.loss_keys).reshape(-1)

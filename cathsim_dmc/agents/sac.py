@@ -105,7 +105,9 @@ class SAC(Learner):
     when sampled, so old and new transitions agree.
     """
 
-    metrics: ClassVar[tuple[str, ...]] = (*_TERMS, "replay_frames", "gradient_steps")
+    metrics: ClassVar[tuple[str, ...]] = (
+        *_TERMS, "replay_frames", "gradient_steps", "learning_rate",
+    )  # fmt: skip
 
     def __init__(self, config: SACConfig, shapes: NetworkShapes, directory: Path):
         own, critic_shapes = shapes.split(config)
@@ -149,6 +151,7 @@ class SAC(Learner):
 
     @override
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+        self.anneal(progress)
         transitions = batch.select(*self.replay_keys).reshape(-1)
         self.replay.extend(transitions)
         self.observe(batch)
@@ -160,6 +163,7 @@ class SAC(Learner):
             **means([self._step() for _ in range(steps)]),
             "replay_frames": float(len(self.replay)),
             "gradient_steps": float(self.gradient_steps),
+            "learning_rate": self.optimiser.param_groups[0]["lr"],
         }
 
     def _step(self) -> dict[str, torch.Tensor]:
