@@ -39,7 +39,7 @@ def values(task, label, algorithm, observation, seed, rate, episodes=30):
         "cell": {
             "name": name, "label": label, "task": task, "algorithm": algorithm,
             "preset": "tuned", "observation": observation, "seed": seed,
-            "total_frames": 400_000,
+            "total_frames": 400_000, "settings": {}, "variant": "", "evaluation": {},
         },
         "config": {"algorithm": algorithm, "seed": seed},
         "training": {

@@ -68,6 +68,8 @@ def test_ours_stands_beside_the_published(page, script, tmp_path):
     assert "2 of the 38 cells" in text or re.search(r"\n2 of the \d+ cells", text)
     missing = line_of(text, "- PPO-Internal: type1_lcca (seed 0, 1, 2)")[0]
     assert "type1_bca (seed 2)" in missing
+    # The grid trains it for another number of frames.
+    assert line_of(text, "- PPO-Internal: total_frames") and "Trained with" in text
     assert line_of(text, "PPO-Sequential (missing)", "97 %")
     short = ["PPO-Internal", "2", "95 % † / 53 %", "– / 7 %", "– / 50 %", "– / 87 %"]
     assert line_of(main, "| PPO-Internal | 2 |")[:6] == short

@@ -21,7 +21,7 @@ from cathsim_dmc import files
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 import results_figures as drawings
 import results_tables as tables
-from trainings import HERE, read_grid, read_result
+from trainings import HERE, differences, read_grid, read_result
 
 DOCS = Path(__file__).parents[1]
 PAGE, DETAIL_PAGE = "results.md", "results_detail.md"
@@ -123,7 +123,7 @@ def arranged(results, cells):
 
 
 def standing(results, broken, cells):
-    """Section on missing cells of the grid and missing published agents."""
+    """Section on missing or outdated cells of the grid and missing published agents."""
     missing = [cell for cell in cells if cell.name not in results]
     lines = [
         "## What is missing",
@@ -139,6 +139,15 @@ def standing(results, broken, cells):
     for label, tasks in rows.items():
         of = (f"{task} (seed {', '.join(seeds)})" for task, seeds in tasks.items())
         lines.append(f"- {label}: {'; '.join(of)}")
+    outdated = {}
+    for cell in cells:
+        if found := results.get(cell.name):
+            names = dict.fromkeys(differences(found, cell))
+            outdated.setdefault(cell.label, {}).update(names)
+    outdated = [f"- {k}: {', '.join(names)}" for k, names in outdated.items() if names]
+    if outdated:
+        text = "Trained with other settings than the grid and its presets have now:"
+        lines += ["", text, "", *outdated]
     planned = tables.in_grid(cells)
     beyond = [
         f"- {name}: {', '.join(left)}"
