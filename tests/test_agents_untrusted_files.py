@@ -35,9 +35,9 @@ def transitions(count, size=3):
     )
 
 
-def replay(folder, capacity=8, max_bytes=2**20):
+def replay(folder, capacity=8, max_bytes=2**20, expected=None):
     keys = ["observation_vector", "pixels", ("next", "done")]
-    return ReplayMemory(folder, keys, capacity, max_bytes)
+    return ReplayMemory(folder, keys, capacity, max_bytes, expected or capacity)
 
 
 def written_replay(folder, capacity=8, count=10):
@@ -71,6 +71,17 @@ def test_a_replay_takes_its_room_on_the_disk_at_once(tmp_path):
     size = (tmp_path / "replay" / "observation_vector.npy").stat()
     assert size.st_size > 1_000 * 64 * 4
     assert size.st_blocks * 512 >= size.st_size
+    # A short run takes less, and more when it is resumed to be longer.
+    sparse = {"folder": tmp_path / "short", "capacity": 100_000, "max_bytes": 2**30}
+    short = replay(**sparse, expected=1_000)
+    short.extend(transitions(1, size=64))
+    path = tmp_path / "short" / "observation_vector.npy"
+    assert 1_000 * 64 * 4 <= path.stat().st_blocks * 512 < 2_000 * 64 * 4
+    assert path.stat().st_size > 100_000 * 64 * 4
+    longer = replay(**sparse, expected=2_000)
+    longer.load(short.state())
+    assert 2_000 * 64 * 4 <= path.stat().st_blocks * 512 < 3_000 * 64 * 4
+    assert (longer.sample(1)["pixels"] == 0).all()
     huge = replay(tmp_path / "other", 2**45, 2**60)
     with pytest.raises(OSError, match="lower replay_bytes"):
         huge.extend(transitions(1))

@@ -33,12 +33,19 @@ class ReplayMemory:
         keys: Entries of a transition, nested ones as tuples.
         capacity: Largest number of transitions.
         max_bytes: Largest size of all files together; lowers the capacity if need be.
+        expected: Largest number of transitions of the run; disk space is reserved for
+            no more.
     """
 
     def __init__(
-        self, directory: Path, keys: Sequence[Any], capacity: int, max_bytes: int
+        self,
+        directory: Path,
+        keys: Sequence[Any],
+        capacity: int,
+        max_bytes: int,
+        expected: int,
     ):
-        self.directory, self.capacity = directory, capacity
+        self.directory, self.capacity, self.expected = directory, capacity, expected
         self.max_bytes, self.cursor, self.size = max_bytes, 0, 0
         names = {key: key if isinstance(key, str) else ".".join(key) for key in keys}
         self._paths = {key: self.directory / f"{n}.npy" for key, n in names.items()}
@@ -101,10 +108,11 @@ class ReplayMemory:
                     raise ValueError("they are those of another process")
         self._storage, self.capacity = storage, capacity
         self.cursor, self.size = cursor, size
+        self._reserve(storage)
 
     def _create(self, like: TensorDictBase) -> TensorDictBase:
-        """Create files for `capacity` transitions and reserve their disk space."""
-        needed = self.capacity * like[:1].bytes()
+        """Create files for `capacity` transitions, with disk space for `expected`."""
+        needed = min(self.capacity, self.expected) * like[:1].bytes()
         shutil.rmtree(self.directory, ignore_errors=True)
         self.directory.mkdir(parents=True)
         free = shutil.disk_usage(self.directory).free
@@ -121,10 +129,19 @@ class ReplayMemory:
             dtype = example[:0].cpu().numpy().dtype
             with files.naming(path):
                 array = open_memmap(path, mode="w+", dtype=dtype, shape=shape)
-                if hasattr(os, "posix_fallocate"):
-                    with open(path, "rb+") as stream:
-                        os.posix_fallocate(stream.fileno(), 0, path.stat().st_size)
             storage[key] = torch.from_numpy(array)
+        self._reserve(storage)
         self._digest = digest.hexdigest()
         files.write_text(self.directory / _DIGEST, self._digest)
         return storage
+
+    def _reserve(self, storage: TensorDictBase) -> None:
+        """Reserve the disk space of `expected` transitions; the rest stays a hole."""
+        if not hasattr(os, "posix_fallocate"):
+            return
+        beyond = max(0, self.capacity - self.expected)
+        for key, path in self._paths.items():
+            rows = storage[key][:beyond]
+            size = path.stat().st_size - rows.numel() * rows.element_size()
+            with files.naming(path), open(path, "rb+") as stream:
+                os.posix_fallocate(stream.fileno(), 0, size)
