@@ -65,11 +65,8 @@ class SACConfig(ActorCriticConfig):
         "published": {},
         "demo": {"num_envs": 32, "updates_per_frame": 0.25},
         "tuned": _TUNED,
-        "tuned_image": {
-            **_TUNED, **TUNED_IMAGES, "batch_size": 128, "anneal": True,
-            "total_frames": 60_000,
-        },
-    }  # fmt: skip
+        "tuned_image": {**_TUNED, **TUNED_IMAGES, "batch_size": 128, "gamma": 0.95},
+    }
 
     batch_size: int = positive(256)
     tau: float = positive(0.005, high=1)
