@@ -28,7 +28,8 @@ REPLAY_BYTES = 2 * 1024**3
 
 # The weight of the entropy must start near the size of a step's reward (0.05): at 0.1
 # and above the actions stay random for tens of thousands of frames. An overestimated
-# value of standing still decays in 1 / (tau * (1 - gamma)) gradient steps: 5,000.
+# value of standing still decays in 1 / (tau * (1 - gamma)) gradient steps: 5,000, and
+# 1,000 with images.
 _TUNED: Mapping[str, Any] = {
     **TUNED_TRAINING, "updates_per_frame": 0.25, "hidden": (256, 256),
     "activation": "relu", "initial_alpha": 1e-3, "tau": 0.02, "total_frames": 40_000,
