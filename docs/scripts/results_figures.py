@@ -53,12 +53,16 @@ def learning_curves(by_task, looks, path):
         path: Path of the PNG.
     """
     figure, panels = _panels(len(by_task))
+    counts: dict[str, set[int]] = {}
+    for agents in by_task.values():
+        for label, results in agents.items():
+            counts.setdefault(label, set()).add(len(results))
     for axes, (task, agents) in zip(panels, by_task.items(), strict=False):
         for label, results in agents.items():
             frames, success = _common(results)
             if frames is None:
                 continue
-            line = {**looks[label], "label": f"{label} ({_seeds(len(results))})"}
+            line = {**looks[label], "label": f"{label} ({_seeds(*counts[label])})"}
             axes.plot(frames, 100 * success.mean(0), lw=1.6, **line)
             if len(success) > 1:
                 axes.fill_between(
@@ -71,14 +75,14 @@ def learning_curves(by_task, looks, path):
                 )
         _by_frames(axes)
         axes.set_title(task, fontsize=10)
-        axes.set_ylabel("success in training episodes, %")
+        axes.set_ylabel("success in training, %")
     named = {
         label: line
         for axes in figure.axes
         for line, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     lines, labels = named.values(), named.keys()
-    figure.legend(lines, labels, fontsize=8, loc="outside lower center", ncols=3)
+    figure.legend(lines, labels, fontsize=7, loc="outside lower center", ncols=3)
     style.save(figure, path, DPI)
     return path
 
@@ -281,8 +285,10 @@ def _panels(count, columns=2, width=PANEL[0], height=PANEL[1]):
     return figure, panels
 
 
-def _seeds(count):
-    return f"{count} seed" + "s" * (count != 1)
+def _seeds(*counts):
+    least, most = min(counts), max(counts)
+    count = f"{most}" if least == most else f"{least}–{most}"
+    return f"{count} seed" + "s" * (most != 1)
 
 
 def drawn(table, reference, compared, images):
