@@ -110,13 +110,7 @@ class DAgger(CloningLearner):
     def __init__(self, config: DAggerConfig, shapes: NetworkShapes, directory: Path):
         super().__init__(config, shapes, directory)
         self._keys = [*shapes.raw_keys, EXPERT_ACTION]
-        self.replay = ReplayMemory(
-            directory / "replay",
-            self._keys,
-            config.replay_frames,
-            config.replay_bytes,
-            config.total_frames + config.frames_per_batch,
-        )
+        self.replay = ReplayMemory.of(config, directory, self._keys)
 
     @override
     def attach(self, env: EnvBase) -> None:

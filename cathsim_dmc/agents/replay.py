@@ -52,6 +52,13 @@ class ReplayMemory:
         self._storage: TensorDictBase | None = None
         self._digest: str | None = None
 
+    @classmethod
+    def of(cls, config: Any, directory: Path, keys: Sequence[Any]) -> "ReplayMemory":
+        """Memory of a run in its directory, with the limits of its settings."""
+        most, size = config.replay_frames, config.replay_bytes
+        expected = config.total_frames + config.frames_per_batch
+        return cls(directory / "replay", keys, most, size, expected)
+
     def __len__(self) -> int:
         """Number of transitions that can be sampled."""
         return self.size

@@ -135,13 +135,7 @@ class SAC(Learner):
         )
         after = [*shapes.raw_keys, "reward", "done", "terminated"]
         self.replay_keys = [*shapes.raw_keys, "action", *[("next", k) for k in after]]
-        self.replay = ReplayMemory(
-            directory / "replay",
-            self.replay_keys,
-            config.replay_frames,
-            config.replay_bytes,
-            config.total_frames + config.frames_per_batch,
-        )
+        self.replay = ReplayMemory.of(config, directory, self.replay_keys)
         self.demonstrations: TensorDictBase | None = None
         if config.demonstrations is not None:
             shown = load_transitions(
