@@ -170,8 +170,7 @@ def differences(result, cell):
     """
     asked, there = cell.to_dict(), result.cell
     changed = [k for k in asked if k != "label" and there.get(k) != asked[k]]
-    now = json.loads(json.dumps(cell.config().to_dict()))
-    then = result.values["config"]
+    now, then = cell.config().to_dict(), result.values["config"]
     found = [k for k in now if then.get(k, now[k]) != now[k] and k not in asked]
     return changed + found
 

@@ -57,7 +57,7 @@ def without_clocks(rows):
 @pytest.mark.slow
 def test_ppo_learns_to_reach(tmp_path):
     run(small_ppo(total_frames=10_240, epochs=6), tmp_path)
-    rewards = [row["episode_reward"] for row in read_metrics(tmp_path / "metrics.csv")]
+    rewards = column(tmp_path, "episode_reward")
     assert rewards[-1] > rewards[1] + 15
 
 
@@ -256,7 +256,7 @@ def test_what_a_kill_leaves_behind_does_not_count(tmp_path):
     goal = saved.frames + 512
     result = run(small_sac(total_frames=goal), tmp_path, resume=True)
     assert result.frames == goal
-    frames = [row["frames"] for row in read_metrics(tmp_path / "metrics.csv")]
+    frames = column(tmp_path, "frames")
     assert frames == sorted(set(frames))
     assert saved.frames + 64 not in frames
     assert frames[-1] == goal

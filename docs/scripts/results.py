@@ -46,7 +46,8 @@ Every policy acts deterministically in 30 episodes with different seeds, or in o
 episode on each of the 98 test arches, by the published rule: 2,000 control steps at
 most, success within 8 mm of the goal and inside the target branch. Agents have the
 preset `tuned`, or `tuned_image`, unless their row states another
-([settings](training.md)).
+([settings](training.md)) or [what is missing](results_detail.md#what-is-missing) names
+settings that have changed since.
 [Results in detail](results_detail.md) has all columns, seeds and times of training;
 `python docs/scripts/results.py` writes both pages from `results/`.
 """
@@ -141,13 +142,12 @@ def standing(results, broken, cells):
         lines.append(f"- {label}: {'; '.join(of)}")
     outdated = {}
     for cell in cells:
-        if found := results.get(cell.name):
-            names = dict.fromkeys(differences(found, cell))
-            outdated.setdefault(cell.label, {}).update(names)
-    outdated = [f"- {k}: {', '.join(names)}" for k, names in outdated.items() if names]
+        if cell.name in results and (found := differences(results[cell.name], cell)):
+            outdated.setdefault(cell.label, {}).update(dict.fromkeys(found))
     if outdated:
         text = "Trained with other settings than the grid and its presets have now:"
-        lines += ["", text, "", *outdated]
+        lines += ["", text, ""]
+        lines += [f"- {label}: {', '.join(names)}" for label, names in outdated.items()]
     planned = tables.in_grid(cells)
     beyond = [
         f"- {name}: {', '.join(left)}"

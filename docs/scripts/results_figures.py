@@ -285,10 +285,13 @@ def _panels(count, columns=2, width=PANEL[0], height=PANEL[1]):
     return figure, panels
 
 
+def span(counts):
+    """Text of the least and the largest of some whole numbers, once if they agree."""
+    return "–".join(map(str, sorted({min(counts), max(counts)})))
+
+
 def _seeds(*counts):
-    least, most = min(counts), max(counts)
-    count = f"{most}" if least == most else f"{least}–{most}"
-    return f"{count} seed" + "s" * (most != 1)
+    return f"{span(counts)} seed" + "s" * (max(counts) != 1)
 
 
 def drawn(table, reference, compared, images):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from figures import grid
-from results_figures import rate_of, values_of
+from results_figures import rate_of, span, values_of
 
 from cathsim_dmc.analysis.intervals import success_interval
 
@@ -128,8 +128,7 @@ def successes(table):
             t: table[t][label] for t in PUBLISHED_TASKS if label in table.get(t, {})
         }
         repeated.add(label)
-        seeds = sorted({len(one) for one in of_task.values()})
-        count = "–".join(map(str, (seeds[0], seeds[-1]) if len(seeds) > 1 else seeds))
+        count = span([len(one) for one in of_task.values()])
         rows.append(success_row(label, count, of_task, published.get(label, {})))
     for name, theirs in published.items():
         if name not in repeated:
